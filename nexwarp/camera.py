@@ -1,0 +1,103 @@
+"""Pinhole cameras: world to camera, x right, y down, z forward (OpenCV, as COLMAP writes them)."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from nexwarp.checks import check_finite, check_range, check_tensors
+
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5); the ray through pixel coordinates (x, y) has
+    the camera-frame direction ((x - cx) / fx, (y - cy) / fy, 1), so that depths along it are z-depths.
+
+    Attributes:
+        viewmat: (4, 4) float, world to camera, a rigid motion. Rendering is differentiable with respect to it.
+        K: (3, 3) float, intrinsics in pixels, no skew; the principal point may lie anywhere.
+        width: image width in pixels.
+        height: image height in pixels.
+        near: hits with a z-depth of at most this (world units) are ignored.
+
+    Raises:
+        TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
+        ValueError: wrong shapes, values that are not finite, a `viewmat` whose rotation is further than 1e-3 from
+            orthonormal or mirrors, a `K` with skew or a focal length <= 0, sizes < 1, `near` < 0.
+    """
+
+    viewmat: torch.Tensor
+    K: torch.Tensor
+    width: int
+    height: int
+    near: float = 0.01
+    fx: float = field(init=False)
+    fy: float = field(init=False)
+    cx: float = field(init=False)
+    cy: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        check_tensors({"viewmat": (self.viewmat, (4, 4))})
+        check_tensors({"K": (self.K, (3, 3))})
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+            check_range(name, value, 1)
+        check_range("near", float(self.near), 0.0)
+        viewmat, intrinsics = self.viewmat.detach().double().cpu(), self.K.detach().double().cpu()
+        check_finite("viewmat", viewmat)
+        check_finite("K", intrinsics)
+        _check_rigid(viewmat)
+        _check_intrinsics(intrinsics)
+        (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+        for name, value in zip(("fx", "fy", "cx", "cy"), (fx, fy, cx, cy), strict=True):
+            object.__setattr__(self, name, value)
+
+    @property
+    def focal(self) -> float:
+        """Geometric mean of the focal lengths, in pixels (the f of the paper's Eq. 2, down-weighting)."""
+        return (self.fx * self.fy) ** 0.5
+
+    @property
+    def device(self) -> torch.device:
+        """Device of `viewmat`."""
+        return self.viewmat.device
+
+    @property
+    def position(self) -> torch.Tensor:
+        """(3,) centre of projection in the world frame, differentiable with respect to `viewmat`."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(self, *args: Any, **kwargs: Any) -> "Camera":
+        """Return this camera with `viewmat` and `K` moved like `torch.Tensor.to` does."""
+        return Camera(
+            self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near
+        )
+
+
+def _check_rigid(viewmat: torch.Tensor) -> None:
+    rotation = viewmat[:3, :3]
+    error = (rotation.T @ rotation - torch.eye(3, dtype=viewmat.dtype)).abs().max().item()
+    if error > ROTATION_TOLERANCE:
+        raise ValueError(
+            f"viewmat: expected an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g}), got {error:.3g}"
+        )
+    if torch.linalg.det(rotation) < 0:
+        raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
+    if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
+        raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
+
+
+def _check_intrinsics(intrinsics: torch.Tensor) -> None:
+    (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
+    if fx <= 0 or fy <= 0:
+        raise ValueError(f"K: expected focal lengths > 0, got fx={fx:g}, fy={fy:g}")
+    if abs(skew) > 1e-6 * fx or abs(shear) > 1e-6 * fy:
+        raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
+    if last != [0.0, 0.0, 1.0]:
+        raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")

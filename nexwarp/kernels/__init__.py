@@ -1,0 +1,19 @@
+"""What a thread does: pure Warp, no torch, one source for CUDA and CPU.
+
+Symbols, the same in every file of this package:
+
+    means, quats, scales     surfel centre (world), rotation surfel -> world (wxyz), extents along its x and y axes (world)
+    opacities, gammas        o and (g1, g2) of the generalised Gaussian, paper Eq. 3
+    viewmat                  world -> camera (4, 4); x right, y down, z forward
+    fx, fy, cx, cy           intrinsics in pixels; pixel centres lie at +0.5
+    d                        direction of a pixel's ray in the camera frame, d.z = 1, so that t is z-depth
+    u, v, t                  the hit in the surfel's own axes (in units of its scales) and its z-depth
+    alpha, transmittance     weight = transmittance * alpha
+    K                        length of the hit buffer (max_hits); id -1, weight 0, depth 0 mark an empty slot
+    n                        number of texture points, H * W * K
+
+Kernels are made by cached factories over the scalar type, so that the float64 build that the proofs use is the same source.
+A kernel's first argument is `first`, the offset of its thread range: a CPU launch is one serial loop, so `launch.py`
+splits the range over Python threads. Whatever is written is therefore owned by one thread: no kernel relies on CPU atomics
+across the split.
+"""

@@ -1,0 +1,178 @@
+"""Hash-grid lookup (paper Eq. 1 and 2): unbounded, every level hashed, features down-weighted by a pixel's footprint.
+
+One thread a (level, point). Features are stored level-major, (levels * features, n): neighbouring threads write neighbouring
+values, and the MLP's matrix product takes the array as it is. A point with depth 0 (an empty hit slot) gets zeros and gives
+no gradient.
+
+The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may be
+half precision while their gradients are summed in float32. On a CPU a launch is split by level: a level's table belongs
+to one thread, and position gradients go to a slot a level (on CUDA all levels share one, by a stride of 0).
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from nexwarp.kernels.types import types
+
+PRIME_Y = wp.constant(wp.uint32(2654435761))
+PRIME_Z = wp.constant(wp.uint32(805459861))
+
+# Two-float atomics exist from sm_90 on; they halve the number of atomics of the backward pass.
+_ADD_PAIR = """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float2*>(&wp::index(table, level, slot)), make_float2(value[0], value[1]));
+#else
+    wp::atomic_add(table, level, slot, value);
+#endif
+"""
+
+
+@wp.func_native(_ADD_PAIR)
+def add_pair(table: wp.array2d(dtype=wp.vec2), level: wp.int32, slot: wp.int32, value: wp.vec2):
+    """Add a float pair to table[level, slot] atomically."""
+    ...
+
+
+@wp.func
+def map_positive(i: wp.int32):
+    """Fold the integers onto the non-negative ones: 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..."""
+    return wp.uint32(wp.where(i > 0, 2 * i - 1, -2 * i))
+
+
+@wp.func
+def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
+    """Table slot of corner j of a cell."""
+    x = map_positive(corner[0] + (j & 1))
+    y = map_positive(corner[1] + ((j >> 1) & 1)) * PRIME_Y
+    z = map_positive(corner[2] + (j >> 2)) * PRIME_Z
+    return wp.int32((x ^ y ^ z) & mask)
+
+
+@functools.cache
+def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespace:
+    """Make the forward and backward kernels.
+
+    Args:
+        real: scalar type of positions, table gradients and arithmetic.
+        storage: scalar type of the table and of the features written (`real` or wp.float16).
+        features: features a level, 1, 2, 4 or 8.
+    """
+    t = types(real)
+    vec3 = t.vec3
+    row = wp.types.vector(length=features, dtype=storage)
+    vec = wp.types.vector(length=features, dtype=real)
+    mat = wp.types.matrix(shape=(8, features), dtype=real)
+    vec8 = wp.types.vector(length=8, dtype=real)
+    ONE, ZERO = t.ONE, t.ZERO
+    INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
+    pairs = features == 2 and real is wp.float32
+
+    @wp.func
+    def interpolate(f: vec3, corners: mat, scale: real, depth: real, focal: real):
+        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 2."""
+        gx = ONE - f[0]
+        gy = ONE - f[1]
+        gz = ONE - f[2]
+        w = vec8(
+            gx * gy * gz,
+            f[0] * gy * gz,
+            gx * f[1] * gz,
+            f[0] * f[1] * gz,
+            gx * gy * f[2],
+            f[0] * gy * f[2],
+            gx * f[1] * f[2],
+            f[0] * f[1] * f[2],
+        )
+        ratio = focal / (scale * depth)
+        return (w @ corners) * (ONE - wp.exp(-ratio * ratio * INVERSE_TWO_PI))
+
+    @wp.func
+    def interpolate_dot(f: vec3, corners: mat, scale: real, depth: real, focal: real, grad: vec):
+        return wp.dot(interpolate(f, corners, scale, depth, focal), grad)
+
+    @wp.func
+    def cell(x: vec3):
+        return vec3(wp.floor(x[0]), wp.floor(x[1]), wp.floor(x[2]))
+
+    @wp.func
+    def gather(table: wp.array2d(dtype=row), level: int, corner: wp.vec3i, mask: wp.uint32):
+        corners = mat()
+        for j in range(8):
+            value = table[level, hash_slot(corner, j, mask)]
+            for k in range(wp.static(features)):
+                corners[j, k] = real(value[k])
+        return corners
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def hashgrid(
+        first: wp.int32,
+        table: wp.array2d(dtype=row),
+        positions: wp.array(dtype=vec3),
+        depths: wp.array(dtype=real),
+        resolutions: wp.array(dtype=real),
+        focal: wp.array(dtype=real),
+        mask: wp.uint32,
+        # outputs
+        encoded: wp.array2d(dtype=storage),
+    ):
+        l_, p = wp.tid()
+        level = first + l_
+        value = vec()
+        depth = depths[p]
+        if depth > ZERO:
+            scale = resolutions[level]
+            x = positions[p] * scale
+            base = cell(x)
+            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+            value = interpolate(x - base, gather(table, level, corner, mask), scale, depth, focal[0])
+        for k in range(wp.static(features)):
+            encoded[level * features + k, p] = storage(value[k])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def hashgrid_backward(
+        first: wp.int32,
+        table: wp.array2d(dtype=row),
+        positions: wp.array(dtype=vec3),
+        depths: wp.array(dtype=real),
+        resolutions: wp.array(dtype=real),
+        focal: wp.array(dtype=real),
+        mask: wp.uint32,
+        grad_encoded: wp.array2d(dtype=storage),
+        unscale: wp.array(dtype=real),
+        # outputs
+        grad_table: wp.array2d(dtype=vec),
+        grad_positions: wp.array2d(dtype=vec3),
+        grad_depths: wp.array2d(dtype=real),
+    ):
+        l_, p = wp.tid()
+        level = first + l_
+        depth = depths[p]
+        if not (depth > ZERO):
+            return
+        grad = vec()
+        for k in range(wp.static(features)):
+            grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
+        scale = resolutions[level]
+        x = positions[p] * scale
+        base = cell(x)
+        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+        gf, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+            x - base, gather(table, level, corner, mask), scale, depth, focal[0], grad
+        )
+        for j in range(8):
+            slot = hash_slot(corner, j, mask)
+            part = vec()
+            for k in range(wp.static(features)):
+                part[k] = gc[j, k]
+            if wp.static(pairs):
+                add_pair(grad_table, level, slot, part)
+            else:
+                wp.atomic_add(grad_table, level, slot, part)
+        if grad_positions.shape[0] > 0:
+            wp.atomic_add(grad_positions, level, p, gf * scale)
+            wp.atomic_add(grad_depths, level, p, gd)
+
+    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)

@@ -1,0 +1,91 @@
+"""Launches that use every CPU core: a CPU launch is a serial loop that frees the GIL, so the range is split over threads.
+
+The number of chunks is fixed, whatever the number of threads, so that nothing depends on how many there are.
+"""
+
+import functools
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+CHUNKS = 16
+SMALLEST_CHUNK = 256
+
+_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def set_num_threads(count: int) -> None:
+    """Set how many CPU threads kernels use (all cores at first); results do not depend on it."""
+    global _threads
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
+    _threads = count
+
+
+def get_num_threads() -> int:
+    """Return how many CPU threads kernels use."""
+    return _threads
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="nexwarp")
+
+
+def chunks(dim: int) -> list[tuple[int, int]]:
+    """Split [0, dim) into at most CHUNKS ranges of at least SMALLEST_CHUNK."""
+    size = max(SMALLEST_CHUNK, -(-dim // CHUNKS))
+    return [(first, min(first + size, dim)) for first in range(0, dim, size)]
+
+
+def launch(
+    kernel: wp.Kernel,
+    dim: int | tuple[int, int],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    device: wp.Device,
+    stream: wp.Stream | None = None,
+    block_dim: int = 256,
+    adjoint: tuple[Sequence[Any], Sequence[Any]] | None = None,
+) -> None:
+    """Launch a kernel whose first argument is `first` over the leading dimension of `dim`.
+
+    Args:
+        kernel: the kernel; its arguments are `first`, then inputs, then outputs.
+        dim: size of the thread range; the leading dimension is the one that is split on a CPU.
+        inputs: input arguments without `first`.
+        outputs: output arrays.
+        device: Warp device.
+        stream: CUDA stream, by default the device's current one.
+        block_dim: threads a block on CUDA.
+        adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs no
+            gradient. Gradients are added to.
+    """
+    shape = (dim,) if isinstance(dim, int) else tuple(dim)
+    if min(shape) == 0:
+        return
+    extra: dict[str, Any] = {"device": device, "block_dim": block_dim, "record_tape": False}
+    if adjoint is not None:
+        extra |= {"adj_inputs": [None, *adjoint[0]], "adj_outputs": list(adjoint[1]), "adjoint": True}
+
+    def part(bounds: tuple[int, int]) -> None:
+        first, last = bounds
+        wp.launch(
+            kernel, (last - first, *shape[1:]), inputs=[first, *inputs], outputs=list(outputs), stream=stream, **extra
+        )
+
+    if not device.is_cpu:
+        part((0, shape[0]))
+        return
+    ranges = chunks(shape[0]) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
+    if _threads == 1 or len(ranges) == 1:
+        for bounds in ranges:
+            part(bounds)
+        return
+    # Loading inside the threads would compile twice.
+    wp.load_module(module=kernel.module, device=device)
+    list(_pool(_threads).map(part, ranges))

@@ -1,0 +1,23 @@
+"""What a tensor means and how it differentiates: one torch op a stage, the only torch <-> Warp boundary."""
+
+from nexwarp.ops.collect import Hits, collect, splat_error
+from nexwarp.ops.compose import compose
+from nexwarp.ops.project import Projection, project
+from nexwarp.ops.sh import plain_colors
+from nexwarp.ops.texture import texture
+from nexwarp.ops.tiles import Tiles, intersect_tiles
+from nexwarp.ops.unproject import unproject
+
+__all__ = [
+    "Hits",
+    "Projection",
+    "Tiles",
+    "collect",
+    "compose",
+    "intersect_tiles",
+    "plain_colors",
+    "project",
+    "splat_error",
+    "texture",
+    "unproject",
+]

@@ -1,0 +1,66 @@
+"""The torch <-> Warp boundary: arrays, types, devices and streams."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+
+from nexwarp.kernels import launch as launching
+
+REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
+STORAGES = {**REALS, torch.float16: wp.float16}
+
+
+def real_of(tensor: torch.Tensor) -> type:
+    """Warp scalar type of a float32 or float64 tensor."""
+    if tensor.dtype not in REALS:
+        raise TypeError(f"expected float32 or float64 tensors, got {tensor.dtype}")
+    return REALS[tensor.dtype]
+
+
+def array(tensor: torch.Tensor | None, dtype: type) -> Any:
+    """View a contiguous tensor as a Warp array argument of the given element type; None stays None."""
+    if tensor is None:
+        return None
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+@functools.cache
+def _device(kind: str, index: int | None) -> wp.Device:
+    return wp.get_device("cpu" if kind == "cpu" else f"cuda:{index}")
+
+
+def device_of(tensor: torch.Tensor) -> wp.Device:
+    """Warp device of a tensor."""
+    return _device(tensor.device.type, tensor.device.index)
+
+
+@functools.cache
+def _stream(index: int, pointer: int) -> wp.Stream:
+    return wp.Stream(f"cuda:{index}", cuda_stream=pointer)
+
+
+def stream_of(tensor: torch.Tensor) -> wp.Stream | None:
+    """Torch's current stream on the tensor's device, None on a CPU."""
+    if tensor.device.type == "cpu":
+        return None
+    return _stream(tensor.device.index, torch.cuda.current_stream(tensor.device).cuda_stream)
+
+
+def launch(
+    like: torch.Tensor,
+    kernel: wp.Kernel,
+    dim: int | tuple[int, int],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    **options: Any,
+) -> None:
+    """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`."""
+    launching.launch(kernel, dim, inputs, outputs, device=device_of(like), stream=stream_of(like), **options)
+
+
+def grad_like(tensor: torch.Tensor, needed: bool) -> torch.Tensor | None:
+    """Zeros to add gradients to, or None when nobody needs them."""
+    return torch.zeros_like(tensor, memory_format=torch.contiguous_format) if needed else None

@@ -1,0 +1,200 @@
+"""Collection pass: the K heaviest hits of every pixel and the plain colour of all others."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from nexwarp.camera import Camera
+from nexwarp.kernels.collect import (
+    BLOCK_DIM,
+    collect_backward_kernel,
+    collect_kernel,
+    reduce_rows_kernel,
+    splat_error_kernel,
+)
+from nexwarp.kernels.types import MAX_HITS, types
+from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops.project import Projection
+from nexwarp.ops.tiles import Tiles
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the collection pass found.
+
+    Attributes:
+        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer, N of paper Eq. 4; differentiable.
+        ids: (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots.
+        depths: (H, W, K) z-depths in world units, 0 in empty slots; differentiable.
+        weights: (H, W, K), 0 in empty slots; differentiable.
+        alpha: (H, W) 1 - final transmittance; differentiable.
+        stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
+    """
+
+    plain: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    alpha: torch.Tensor
+    stops: torch.Tensor
+
+
+def collect(
+    projection: Projection, tiles: Tiles, camera: Camera, *, max_hits: int = 2, low_pass: bool = False
+) -> Hits:
+    """Walk every pixel's list front to back; differentiable with respect to the projection.
+
+    Args:
+        projection: surfels in the camera's frame.
+        tiles: their lists.
+        camera: the camera.
+        max_hits: K, length of the buffer, 0 to 8.
+        low_pass: use max(surfel, screen-space Gaussian) as the kernel, for surfels smaller than a pixel.
+    """
+    if not 0 <= max_hits <= MAX_HITS:
+        raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
+    return Hits(*_Collect.apply(projection.records, projection.centers, tiles, camera, max_hits, low_pass))
+
+
+def splat_error(
+    projection: Projection, tiles: Tiles, hits: Hits, camera: Camera, errors: torch.Tensor, *, low_pass: bool = False
+) -> torch.Tensor:
+    """Give each surfel the sum over pixels of its blending weight times the pixel's error.
+
+    Args:
+        projection, tiles, camera, low_pass: as given to `collect`.
+        hits: as returned by `collect`.
+        errors: (H, W) error of each pixel, >= 0.
+
+    Returns:
+        (N,) blended errors. Not differentiable.
+    """
+    records = projection.records.detach()
+    real = real_of(records)
+    rows, slots = _rows(tiles, records)
+    sums = records.new_zeros(slots)
+    inputs = _inputs(records, projection.centers.detach(), tiles, camera, rows)
+    inputs += [array(hits.stops, wp.int32), array(errors.detach().to(records.dtype).contiguous(), real)]
+    kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
+    launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], block_dim=BLOCK_DIM)
+    return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
+
+
+def _threads(tiles: Tiles) -> int:
+    return (len(tiles.tile_offsets) - 1) * tiles.tile_size**2
+
+
+def _inputs(
+    records: torch.Tensor, centers: torch.Tensor, tiles: Tiles, camera: Camera, rows: torch.Tensor | None = None
+) -> list[Any]:
+    t = types(real_of(records))
+    lists = [tiles.surfel_ids] + ([] if rows is None else [rows]) + [tiles.tile_offsets]
+    return [
+        array(records, t.vec4),
+        array(centers, t.vec3),
+        *(array(x, wp.int32) for x in lists),
+        wp.vec2i(camera.width, camera.height),
+        tiles.columns,
+        t.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+        camera.near,
+    ]
+
+
+def _rows(tiles: Tiles, records: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """Row that each entry's gradient goes to, and how many rows: by entry on a CPU, by surfel on CUDA."""
+    if records.is_cuda:
+        return tiles.surfel_ids, len(records)
+    return tiles.entries, len(tiles.entries)
+
+
+def _reduce(slots: torch.Tensor, tiles: Tiles, count: int, dtype: type) -> torch.Tensor:
+    """Add up each surfel's rows; on CUDA they already are. A row is (columns,) elements of `dtype`."""
+    if slots.is_cuda:
+        return slots
+    sums = slots.new_empty(count, *slots.shape[1:])
+    inputs = [array(tiles.order, wp.int32), array(tiles.ends, wp.int32), array(slots, dtype), slots.shape[1]]
+    launch(slots, reduce_rows_kernel(dtype), count, inputs, [array(sums, dtype)])
+    return sums
+
+
+class _Collect(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        records: torch.Tensor,
+        centers: torch.Tensor,
+        tiles: Tiles,
+        camera: Camera,
+        max_hits: int,
+        low_pass: bool,
+    ) -> tuple[torch.Tensor, ...]:
+        real = real_of(records)
+        shape = (camera.height, camera.width)
+        plain = records.new_empty(*shape, 3)
+        ids = torch.empty(*shape, max_hits, dtype=torch.int32, device=records.device)
+        depths, weights = (records.new_empty(*shape, max_hits) for _ in range(2))
+        alphas = records.new_empty(shape)
+        stops = torch.empty(shape, dtype=torch.int32, device=records.device)
+        outputs = [
+            array(plain.view(-1, 3), types(real).vec3),
+            array(ids.view(-1, max_hits) if max_hits else ids.new_empty(1, 1), wp.int32),
+            array(depths.view(-1, max_hits) if max_hits else depths.new_empty(1, 1), real),
+            array(weights.view(-1, max_hits) if max_hits else weights.new_empty(1, 1), real),
+            array(alphas.view(-1), real),
+            array(stops.view(-1), wp.int32),
+        ]
+        kernel = collect_kernel(real, max_hits, low_pass, tiles.tile_size)
+        inputs = _inputs(records, centers, tiles, camera)
+        launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
+        ctx.save_for_backward(records, centers, plain, ids, weights, alphas, stops)
+        ctx.mark_non_differentiable(ids, stops)
+        ctx.rest = (tiles, camera, max_hits, low_pass)
+        return plain, ids, depths, weights, alphas, stops
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,
+        grad_plain: torch.Tensor,
+        _ids: None,
+        grad_depths: torch.Tensor,
+        grad_weights: torch.Tensor,
+        grad_alphas: torch.Tensor,
+        _stops: None,
+    ) -> tuple[torch.Tensor | None, ...]:
+        records, centers, plain, ids, weights, alphas, stops = ctx.saved_tensors
+        tiles, camera, max_hits, low_pass = ctx.rest
+        real = real_of(records)
+        t = types(real)
+        slots = max(max_hits, 1)
+
+        def buffer(tensor: torch.Tensor, dtype: type) -> Any:
+            return array(tensor.contiguous().view(-1, slots) if max_hits else tensor.new_empty(1, 1), dtype)
+
+        rows, count = _rows(tiles, records)
+        grad_rows = records.new_zeros(count, 4, 4)
+        # Centres carry a gradient only through the low-pass.
+        grad_center_rows = centers.new_zeros(count if low_pass else 1, 3)
+        inputs = [
+            *_inputs(records, centers, tiles, camera, rows),
+            array(plain.view(-1, 3), t.vec3),
+            buffer(ids, wp.int32),
+            buffer(weights, real),
+            array(alphas.view(-1), real),
+            array(stops.view(-1), wp.int32),
+            array(grad_plain.contiguous().view(-1, 3), t.vec3),
+            buffer(grad_depths, real),
+            buffer(grad_weights, real),
+            array(grad_alphas.contiguous().view(-1), real),
+        ]
+        outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3)]
+        kernel = collect_backward_kernel(real, max_hits, low_pass, tiles.tile_size)
+        launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
+        grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)
+        grad_centers = None
+        if low_pass:
+            grad_centers = _reduce(grad_center_rows[:, None], tiles, len(records), t.vec3)[:, 0]
+        return grad_records, grad_centers, None, None, None, None

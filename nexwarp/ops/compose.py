@@ -1,0 +1,81 @@
+"""Composition of the passes into one image."""
+
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.types import types
+from nexwarp.ops._interop import array, grad_like, launch, real_of
+
+
+def compose(
+    plain: torch.Tensor,
+    colors: torch.Tensor,
+    weights: torch.Tensor,
+    alpha: torch.Tensor,
+    background: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Add up the passes (paper Eq. 5); differentiable in every argument.
+
+    Args:
+        plain: (H, W, 3) colour of the hits outside the buffer.
+        colors: (H, W, K, 3) colours of the hits in the buffer.
+        weights: (H, W, K) their weights.
+        alpha: (H, W).
+        background: (3,).
+
+    Returns:
+        (H, W, 3) image = plain + textured + (1 - alpha) background, and (H, W, 3) textured = sum_k weight_k colour_k.
+    """
+    return _Compose.apply(*(x.contiguous() for x in (plain, colors, weights, alpha, background)))
+
+
+def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
+    vec3 = types(real).vec3
+    plain, colors, weights, alpha, background = tensors
+
+    def flat(x: torch.Tensor | None, *shape: int) -> torch.Tensor | None:
+        return None if x is None else x.reshape(-1, *shape) if x.numel() else x.view(x.shape[0] * x.shape[1], *shape)
+
+    hits = next((x.shape[2] for x in (weights, colors) if x is not None), 0)
+    return [
+        array(flat(plain, 3), vec3),
+        array(flat(colors, hits, 3), vec3),
+        array(flat(weights, hits), real),
+        array(flat(alpha), real),
+        array(None if background is None else background[None], vec3),
+    ]
+
+
+class _Compose(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        plain = inputs[0]
+        real = real_of(plain)
+        image, textured = torch.empty_like(plain), torch.empty_like(plain)
+        outputs = [array(x.view(-1, 3), types(real).vec3) for x in (image, textured)]
+        launch(plain, compose_kernel(real), plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs)
+        ctx.save_for_backward(*inputs)
+        return image, textured
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_image: torch.Tensor, grad_textured: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        plain, alpha = inputs[0], inputs[3]
+        real = real_of(plain)
+        grads = [grad_like(x, need) for x, need in zip(inputs[:4], ctx.needs_input_grad, strict=False)]
+        incoming = [array(x.contiguous().view(-1, 3), types(real).vec3) for x in (grad_image, grad_textured)]
+        launch(
+            plain,
+            compose_kernel(real),
+            plain.shape[0] * plain.shape[1],
+            _arrays(real, list(inputs)),
+            [None, None],
+            adjoint=(_arrays(real, [*grads, None]), incoming),
+        )
+        # One colour for all pixels: torch's sum instead of every thread adding to one place.
+        background = (grad_image * (1 - alpha)[..., None]).sum((0, 1)) if ctx.needs_input_grad[4] else None
+        return (*grads, background)

@@ -1,0 +1,107 @@
+"""Projection of surfels into a camera's frame."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from nexwarp.checks import check_tensors
+from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.types import types
+from nexwarp.ops._interop import array, grad_like, launch, real_of
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Surfels in the camera's frame, as the walk along a ray reads them.
+
+    Attributes:
+        records: (N, 4, 4), see `nexwarp.kernels.surfel`; differentiable.
+        centers: (N, 3) centres in the camera frame, world units; differentiable.
+    """
+
+    records: torch.Tensor
+    centers: torch.Tensor
+
+
+def project(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    colors: torch.Tensor,
+    viewmat: torch.Tensor,
+) -> Projection:
+    """Project surfels; differentiable with respect to every argument.
+
+    Args:
+        means: (N, 3) world.
+        quats: (N, 4) unit, wxyz, surfel to world.
+        scales: (N, 2) world units.
+        opacities: (N,).
+        gammas: (N, 2).
+        colors: (N, 3) plain colours.
+        viewmat: (4, 4) world to camera.
+
+    Raises:
+        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    """
+    check_tensors(
+        {
+            "means": (means, ("N", 3)),
+            "quats": (quats, ("N", 4)),
+            "scales": (scales, ("N", 2)),
+            "opacities": (opacities, ("N",)),
+            "gammas": (gammas, ("N", 2)),
+            "colors": (colors, ("N", 3)),
+            "viewmat": (viewmat, (4, 4)),
+        }
+    )
+    tensors = (means, quats, scales, opacities, gammas, colors, viewmat)
+    return Projection(*_Project.apply(*(x.contiguous() for x in tensors)))
+
+
+def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Any]:
+    t = types(real)
+    dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2, t.vec3, t.mat44)
+    return [array(x, dtype) for x, dtype in zip(tensors, dtypes, strict=True)]
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        means = inputs[0]
+        real = real_of(means)
+        t = types(real)
+        records = means.new_empty(len(means), 4, 4)
+        centers = torch.empty_like(means)
+        outputs = [array(records, t.vec4), array(centers, t.vec3)]
+        launch(means, project_kernel(real), len(means), [*_arrays(real, (*inputs[:6], inputs[6][None])), 0], outputs)
+        ctx.save_for_backward(*inputs)
+        return records, centers
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        means, viewmat = inputs[0], inputs[6]
+        real, count = real_of(means), len(means)
+        t = types(real)
+        grads = [grad_like(x, need) for x, need in zip(inputs[:6], ctx.needs_input_grad, strict=False)]
+        # A slot a surfel, then one sum: no contention, and a fixed order.
+        step = int(ctx.needs_input_grad[6])
+        grad_viewmats = viewmat.new_zeros(count, 4, 4) if step else None
+        viewmats = viewmat.expand(count, 4, 4) if step else viewmat[None]
+        outputs = [None, None]
+        adjoint_outputs = [array(grad_records.contiguous(), t.vec4), array(grad_centers.contiguous(), t.vec3)]
+        launch(
+            means,
+            project_kernel(real),
+            count,
+            [*_arrays(real, (*inputs[:6], viewmats)), step],
+            outputs,
+            adjoint=([*_arrays(real, (*grads, grad_viewmats)), None], adjoint_outputs),
+        )
+        return (*grads, grad_viewmats.sum(0) if step else None)

@@ -1,0 +1,229 @@
+"""Texturing pass: the neural field at points, as spherical harmonics coefficients or as colours along rays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.sh import textured_colors_kernels
+from nexwarp.kernels.types import types
+from nexwarp.ops._interop import STORAGES, array, launch, real_of
+
+# Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
+HALF_GRADIENT = 64.0
+
+
+def texture(
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    grid: torch.Tensor,
+    weights: Sequence[torch.Tensor],
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+    *,
+    directions: torch.Tensor | None = None,
+    clamp: bool = False,
+    half: bool = False,
+) -> torch.Tensor:
+    """Look points up in the hash grid, apply the MLP and, given directions, evaluate the colours.
+
+    Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
+
+    Args:
+        positions: (n, 3) world.
+        depths: (n,) z-depths from the camera, world units; a point with depth 0 is skipped and has features 0.
+        grid: (L, T, F) features, T a power of two, F in 1, 2, 4, 8.
+        weights: the MLP's matrices (out, in), ReLU between them, no biases; 3 (d + 1)^2 outputs for SH degree d.
+        resolutions: (L,) cells per world unit.
+        focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 2.
+        directions: (P, 3) unit directions, world, where n = P * K and point i belongs to direction i // K.
+        clamp: limit colours to >= 0.
+        half: keep features, activations and coefficients in half precision; gradients are scaled on the way
+            and summed in float32.
+
+    Returns:
+        (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours 0.5 + SH(direction).
+    """
+    positions, depths = positions.contiguous(), depths.contiguous()
+    if directions is not None:
+        directions = directions.contiguous()
+    return _Texture.apply(positions, depths, directions, grid, resolutions, focal, clamp, half, *weights)
+
+
+class _Texture(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        directions: torch.Tensor | None,
+        grid: torch.Tensor,
+        resolutions: torch.Tensor,
+        focal: torch.Tensor,
+        clamp: bool,
+        half: bool,
+        *weights: torch.Tensor,
+    ) -> torch.Tensor:
+        dtype = torch.float16 if half else grid.dtype
+        table = grid.contiguous().to(dtype)
+        matrices = [w.to(dtype) for w in weights]
+        encoded = torch.empty(grid.shape[0] * grid.shape[2], len(positions), dtype=dtype, device=grid.device)
+        kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
+        launch(
+            positions, kernels.forward, (grid.shape[0], len(positions)), arguments, [array(encoded, STORAGES[dtype])]
+        )
+        layers = [encoded]
+        for matrix in matrices[:-1]:
+            layers.append(torch.relu_(matrix @ layers[-1]))
+        coefficients = matrices[-1] @ layers[-1]
+        ctx.clamp = clamp
+        ctx.layers = len(layers)
+        ctx.save_for_backward(
+            positions, depths, directions, resolutions, focal, table, coefficients, *layers, *matrices
+        )
+        if directions is None:
+            return coefficients.to(grid.dtype)
+        colors = torch.empty_like(positions)
+        kernels, arguments = _colors(coefficients, directions, len(positions), clamp)
+        launch(positions, kernels.forward, len(positions), arguments, [array(colors, types(real_of(positions)).vec3)])
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        positions, depths, directions, resolutions, focal, table, coefficients, *rest = ctx.saved_tensors
+        layers, matrices = rest[: ctx.layers], rest[ctx.layers :]
+        need_positions, need_depths, need_directions, need_grid = ctx.needs_input_grad[:4]
+        scale = _gradient_scale(grad, table.dtype)
+        grad_directions = None
+        if directions is None:
+            signal = (grad * scale).to(table.dtype)
+        else:
+            signal, grad_directions = _colors_backward(
+                coefficients, directions, grad.contiguous(), scale, ctx.clamp, need_directions
+            )
+        unscale = scale.reciprocal()
+        grad_matrices = []
+        for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):
+            grad_matrices.insert(0, _product(signal, layer) * unscale)
+            signal = matrix.T @ signal
+            if len(grad_matrices) < len(matrices):
+                signal = torch.ops.aten.threshold_backward(signal, layer, 0)
+        grad_grid, grad_positions, grad_depths = _lookup_backward(
+            table, positions, depths, resolutions, focal, signal, unscale, need_positions or need_depths
+        )
+        return (
+            grad_positions if need_positions else None,
+            grad_depths if need_depths else None,
+            grad_directions,
+            grad_grid if need_grid else None,
+            *(None,) * 4,
+            *grad_matrices,
+        )
+
+
+def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """(1,) power of two that brings the largest gradient near HALF_GRADIENT in half precision; 1 otherwise."""
+    if dtype != torch.float16 or grad.numel() == 0:
+        return grad.new_ones(1)
+    largest = torch.linalg.vector_norm(grad, float("inf")).clamp_min(1e-30)
+    return torch.exp2(torch.floor(torch.log2(HALF_GRADIENT / largest))).clamp(2.0**-24, 2.0**60).view(1)
+
+
+def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
+    """signal @ layer.T, summed and returned in at least float32."""
+    if signal.dtype == torch.float16:
+        return torch.mm(signal, layer.T, out_dtype=torch.float32)
+    return signal @ layer.T
+
+
+def _lookup(
+    table: torch.Tensor,
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+) -> tuple[Any, list[Any]]:
+    real, storage = real_of(positions), STORAGES[table.dtype]
+    _, size, features = table.shape
+    arguments = [
+        array(table, wp.types.vector(length=features, dtype=storage)),
+        array(positions, types(real).vec3),
+        array(depths, real),
+        array(resolutions, real),
+        array(focal, real),
+        wp.uint32(size - 1),
+    ]
+    return hashgrid_kernels(real, storage, features), arguments
+
+
+def _lookup_backward(
+    table: torch.Tensor,
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+    grad_encoded: torch.Tensor,
+    unscale: torch.Tensor,
+    need_points: bool,
+) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+    real = real_of(positions)
+    levels, _, features = table.shape
+    count = len(positions)
+    grad_grid = torch.zeros_like(table, dtype=positions.dtype)
+    # On a CPU a slot a level, owned by one thread; on CUDA all levels add to one.
+    slots = (levels if positions.device.type == "cpu" else 1) if need_points else 0
+    point_slots = positions.new_zeros(slots, count, 3)
+    depth_slots = positions.new_zeros(slots, count)
+    shared = need_points and slots == 1
+    kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
+    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real)]
+    outputs = [
+        array(grad_grid, wp.types.vector(length=features, dtype=real)),
+        array(point_slots.expand(levels, -1, -1) if shared else point_slots, types(real).vec3),
+        array(depth_slots.expand(levels, -1) if shared else depth_slots, real),
+    ]
+    launch(positions, kernels.backward, (levels, count), arguments, outputs)
+    if not need_points:
+        return grad_grid, None, None
+    if shared:
+        return grad_grid, point_slots[0], depth_slots[0]
+    return grad_grid, point_slots.sum(0), depth_slots.sum(0)
+
+
+def _colors(
+    coefficients: torch.Tensor, directions: torch.Tensor, count: int, clamp: bool
+) -> tuple[Any, list[Any]]:
+    real, storage = real_of(directions), STORAGES[coefficients.dtype]
+    degree = round((coefficients.shape[0] // 3) ** 0.5) - 1
+    kernels = textured_colors_kernels(real, storage, degree, clamp)
+    hits = count // max(len(directions), 1)
+    return kernels, [array(coefficients, storage), array(directions, types(real).vec3), hits]
+
+
+def _colors_backward(
+    coefficients: torch.Tensor,
+    directions: torch.Tensor,
+    grad_colors: torch.Tensor,
+    scale: torch.Tensor,
+    clamp: bool,
+    need_directions: bool,
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    real = real_of(directions)
+    vec3 = types(real).vec3
+    count = len(grad_colors)
+    signal = torch.empty_like(coefficients)
+    slots = directions.new_zeros(count if need_directions else 0, 3)
+    kernels, arguments = _colors(coefficients, directions, count, clamp)
+    arguments += [array(scale, real), array(grad_colors, vec3)]
+    launch(
+        directions,
+        kernels.backward,
+        count,
+        arguments,
+        [array(signal, STORAGES[coefficients.dtype]), array(slots, vec3)],
+    )
+    return signal, slots.view(len(directions), -1, 3).sum(1) if need_directions else None

@@ -1,0 +1,79 @@
+"""World positions of hits and directions of rays."""
+
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from nexwarp.camera import Camera
+from nexwarp.kernels.types import types
+from nexwarp.kernels.unproject import unproject_kernel
+from nexwarp.ops._interop import array, grad_like, launch, real_of
+
+
+def unproject(depths: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the world points at the given z-depths along the pixels' rays, and the rays' directions.
+
+    Args:
+        depths: (H, W, K) z-depths, world units.
+        camera: the camera; gradients reach its `viewmat`.
+
+    Returns:
+        (H, W, K, 3) positions, world frame, and (H, W, 3) unit directions, world frame; both differentiable.
+    """
+    return _Unproject.apply(depths.contiguous(), camera.viewmat.contiguous(), camera)
+
+
+class _Unproject(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, depths: torch.Tensor, viewmat: torch.Tensor, camera: Camera
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        positions = depths.new_empty(*depths.shape, 3)
+        directions = depths.new_empty(*depths.shape[:2], 3)
+        _launch(depths, viewmat[None], 0, camera, (positions, directions))
+        ctx.save_for_backward(depths, viewmat)
+        ctx.camera = camera
+        return positions, directions
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, grad_positions: torch.Tensor, grad_directions: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
+        depths, viewmat = ctx.saved_tensors
+        need_depths, step, _ = ctx.needs_input_grad
+        pixels = depths.shape[0] * depths.shape[1]
+        grad_depths = grad_like(depths, need_depths)
+        grad_viewmats = viewmat.new_zeros(pixels, 4, 4) if step else None
+        viewmats = viewmat.expand(pixels, 4, 4) if step else viewmat[None]
+        grads = (grad_positions.contiguous(), grad_directions.contiguous())
+        _launch(depths, viewmats, int(step), ctx.camera, grads, (grad_depths, grad_viewmats))
+        return grad_depths, grad_viewmats.sum(0) if step else None, None
+
+
+def _rows(depths: torch.Tensor | None) -> torch.Tensor | None:
+    return None if depths is None else depths.view(depths.shape[0] * depths.shape[1], depths.shape[2])
+
+
+def _launch(
+    depths: torch.Tensor,
+    viewmats: torch.Tensor,
+    step: int,
+    camera: Camera,
+    outputs: tuple[torch.Tensor, torch.Tensor],
+    grads: tuple[torch.Tensor | None, torch.Tensor | None] | None = None,
+) -> None:
+    """Launch forward into `outputs`, or, given `grads` to add to, backward from `outputs`' gradients."""
+    real = real_of(depths)
+    t = types(real)
+    pixels = depths.shape[0] * depths.shape[1]
+    intrinsics = t.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+    inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, intrinsics, camera.width]
+    arrays = [array(outputs[0].view(pixels, -1, 3) if depths.shape[2] else outputs[0].view(pixels, 0, 3), t.vec3)]
+    arrays.append(array(outputs[1].view(pixels, 3), t.vec3))
+    if grads is None:
+        launch(depths, unproject_kernel(real), pixels, inputs, arrays)
+        return
+    adjoint_inputs = [array(_rows(grads[0]), real), array(grads[1], t.mat44), None, None, None]
+    launch(depths, unproject_kernel(real), pixels, inputs, [None, None], adjoint=(adjoint_inputs, arrays))

@@ -1,0 +1,131 @@
+"""Rendering: project -> tiles -> collect -> texture -> compose (paper Sec. 3.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from nexwarp import ops
+from nexwarp.camera import Camera
+from nexwarp.checks import check_range, check_tensors
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.surfels import Surfels
+from nexwarp.texture import NeuralTexture
+
+
+@dataclass(frozen=True)
+class Passes:
+    """What the passes of one rendering left behind, for `Rendering.splat_error`."""
+
+    projection: ops.Projection
+    tiles: ops.Tiles
+    hits: ops.Hits
+    camera: Camera
+    low_pass: bool
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The buffers of one rendering; everything but `ids` is differentiable.
+
+    Attributes:
+        image: (H, W, 3) = plain + textured + (1 - alpha) background; not clamped.
+        plain: (H, W, 3) blended colours of the hits that are not textured, N of paper Eq. 4; without background.
+        textured: (H, W, 3) sum over the K textured hits of weight * colour.
+        ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
+        depths: (H, W, K) their z-depths, world units; 0 in empty slots.
+        weights: (H, W, K) their blending weights; 0 in empty slots.
+        alpha: (H, W) 1 - final transmittance.
+        passes: intermediate results.
+    """
+
+    image: torch.Tensor
+    plain: torch.Tensor
+    textured: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    alpha: torch.Tensor
+    passes: Passes
+
+    def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
+        """Return (N,): each surfel's sum over pixels of blending weight * errors (H, W). Not differentiable."""
+        p = self.passes
+        return ops.splat_error(p.projection, p.tiles, p.hits, p.camera, errors, low_pass=p.low_pass)
+
+
+def render(
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    camera: Camera,
+    max_hits: int = 2,
+    background: Sequence[float] | torch.Tensor = (0.0, 0.0, 0.0),
+    sh_degree: int = 3,
+    low_pass: bool = False,
+    clamp_texture: bool = False,
+) -> Rendering:
+    """Render surfels as a camera sees them.
+
+    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`.
+
+    Args:
+        surfels: the N surfels, N may be 0.
+        texture: the neural texture, on the same device; None gives the textured hits their plain colour instead.
+        camera: the camera, on the same device.
+        max_hits: K, how many hits a pixel textures, 0 to 8.
+        background: three numbers or a (3,) tensor, seen through what is left of the transmittance.
+        sh_degree: 0 to 3, limits the degree of both appearances.
+        low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
+        clamp_texture: limit textured colours to >= 0.
+
+    Raises:
+        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    """
+    background = _check(surfels, texture, camera, max_hits, background, sh_degree)
+    shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
+    colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, sh_degree)
+    projection = ops.project(*shape, colors, camera.viewmat)
+    tiles = ops.intersect_tiles(*shape, projection, camera, low_pass=low_pass)
+    hits = ops.collect(projection, tiles, camera, max_hits=max_hits, low_pass=low_pass)
+    if texture is None:
+        texels = colors[hits.ids.clamp_min(0).long()] if len(surfels) else colors.new_zeros(*hits.ids.shape, 3)
+    else:
+        positions, directions = ops.unproject(hits.depths, camera)
+        texels = texture.colors(
+            positions, hits.depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture
+        )
+    image, textured = ops.compose(hits.plain, texels, hits.weights, hits.alpha, background)
+    passes = Passes(projection, tiles, hits, camera, low_pass)
+    return Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, passes)
+
+
+def _check(
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    camera: Camera,
+    max_hits: int,
+    background: Sequence[float] | torch.Tensor,
+    sh_degree: int,
+) -> torch.Tensor:
+    """Check types, shapes and devices only, so as never to wait for a GPU; return the background as a tensor."""
+    for name, value, kind in (("surfels", surfels, Surfels), ("camera", camera, Camera)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: expected a nexwarp.{kind.__name__}, got {type(value).__name__}")
+    if texture is not None and not isinstance(texture, NeuralTexture):
+        raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
+    for name, value, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, 3)):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, 0, high)
+    means = surfels.means
+    if means.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
+    if not isinstance(background, torch.Tensor):
+        if len(background) != 3:
+            raise ValueError(f"background: expected 3 values, got {len(background)}")
+        background = torch.stack([means.new_full((), float(x)) for x in background])
+    others = {"camera.viewmat": (camera.viewmat, (4, 4)), "background": (background, (3,))}
+    if texture is not None:
+        others["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
+    check_tensors(others, dtype=means.dtype, device=means.device)
+    return background
