@@ -5,8 +5,6 @@ from typing import Any
 
 import torch
 
-from nexwarp.checks import check_finite, check_range, check_tensors
-
 ROTATION_TOLERANCE = 1e-3
 
 
@@ -41,17 +39,17 @@ class Camera:
     cy: float = field(init=False)
 
     def __post_init__(self) -> None:
-        check_tensors({"viewmat": (self.viewmat, (4, 4))})
-        check_tensors({"K": (self.K, (3, 3))})
+        viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int):
                 raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-            check_range(name, value, 1)
-        check_range("near", float(self.near), 0.0)
-        viewmat, intrinsics = self.viewmat.detach().double().cpu(), self.K.detach().double().cpu()
-        check_finite("viewmat", viewmat)
-        check_finite("K", intrinsics)
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+        if isinstance(self.near, bool) or not isinstance(self.near, (int, float)):
+            raise TypeError(f"near: expected a number, got {type(self.near).__name__}")
+        if not 0 <= self.near < float("inf"):
+            raise ValueError(f"near: expected at least 0 and finite, got {self.near}")
         _check_rigid(viewmat)
         _check_intrinsics(intrinsics)
         (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
@@ -78,6 +76,20 @@ class Camera:
         return Camera(
             self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near
         )
+
+
+def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
+    """Check a finite floating (size, size) tensor and return it as float64 on the CPU."""
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
+    if not tensor.is_floating_point():
+        raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
+    if tensor.shape != (size, size):
+        raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
+    matrix = tensor.detach().double().cpu()
+    if not bool(torch.isfinite(matrix).all()):
+        raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
+    return matrix
 
 
 def _check_rigid(viewmat: torch.Tensor) -> None:

@@ -7,7 +7,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import Camera
-from nexwarp.checks import check_range, check_tensors
+from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
@@ -20,7 +20,7 @@ class Passes:
     projection: ops.Projection
     tiles: ops.Tiles
     hits: ops.Hits
-    camera: Camera
+    pinhole: ops.Pinhole
     low_pass: bool
 
 
@@ -51,7 +51,7 @@ class Rendering:
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
         """Return (N,): each surfel's sum over pixels of blending weight * errors (H, W). Not differentiable."""
         p = self.passes
-        return ops.splat_error(p.projection, p.tiles, p.hits, p.camera, errors, low_pass=p.low_pass)
+        return ops.splat_error(p.projection, p.tiles, p.hits, p.pinhole, errors, low_pass=p.low_pass)
 
 
 def render(
@@ -83,19 +83,20 @@ def render(
     """
     background = _check(surfels, texture, camera, max_hits, background, sh_degree)
     shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
+    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera, low_pass=low_pass)
-    hits = ops.collect(projection, tiles, camera, max_hits=max_hits, low_pass=low_pass)
+    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
+    hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     if texture is None:
         texels = colors[hits.ids.clamp_min(0).long()] if len(surfels) else colors.new_zeros(*hits.ids.shape, 3)
     else:
-        positions, directions = ops.unproject(hits.depths, camera)
+        positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
         texels = texture.colors(
             positions, hits.depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture
         )
     image, textured = ops.compose(hits.plain, texels, hits.weights, hits.alpha, background)
-    passes = Passes(projection, tiles, hits, camera, low_pass)
+    passes = Passes(projection, tiles, hits, pinhole, low_pass)
     return Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, passes)
 
 
@@ -121,6 +122,8 @@ def _check(
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
     if not isinstance(background, torch.Tensor):
+        if not isinstance(background, Sequence) or isinstance(background, str):
+            raise TypeError(f"background: expected three numbers or a tensor, got {type(background).__name__}")
         if len(background) != 3:
             raise ValueError(f"background: expected 3 values, got {len(background)}")
         background = torch.stack([means.new_full((), float(x)) for x in background])

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from nexwarp.checks import check_finite, check_tensors
+from nexwarp.ops.checks import check_finite, check_tensors
 
 # Raw values stay finite at the ends of the ranges; activated ones come back within 2e-6.
 END = 1e-6

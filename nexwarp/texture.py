@@ -4,9 +4,11 @@ import torch
 from torch import nn
 
 from nexwarp import ops
-from nexwarp.checks import check_range, check_tensors
+from nexwarp.ops.checks import check_range, check_tensors
 
 GRID_INIT = 0.01
+# Cells are indexed by int32: finer grids wrap around at once.
+LARGEST_RESOLUTION = 1e9
 
 
 class NeuralTexture(nn.Module):
@@ -62,8 +64,8 @@ class NeuralTexture(nn.Module):
             raise ValueError(f"table_size: expected a power of two, got {table_size}")
         if features not in (1, 2, 4, 8):
             raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
-        check_range("min_resolution", min_resolution, 1e-30)
-        check_range("max_resolution", max_resolution, min_resolution)
+        check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+        check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
         self.config = {
             "levels": levels,
             "table_size": table_size,
@@ -104,8 +106,8 @@ class NeuralTexture(nn.Module):
         Returns:
             (..., (sh_degree + 1)^2, 3) coefficients, differentiable in positions, depths and the parameters.
         """
-        check_tensors({"grid": (self.grid, self.grid.shape), "positions": (positions, (*depths.shape, 3))})
-        check_tensors({"positions": (positions, (*depths.shape, 3)), "depths": (depths, tuple(depths.shape))})
+        expected = {"depths": (depths, tuple(depths.shape)), "positions": (positions, (*depths.shape, 3))}
+        check_tensors(expected, dtype=self.grid.dtype, device=self.grid.device)
         out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)
         return out.T.reshape(*depths.shape, -1, 3)
 

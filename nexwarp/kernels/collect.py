@@ -71,7 +71,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     pixels = tile_size * tile_size
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
     def collect(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
@@ -173,7 +173,7 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
     sum3, sum4 = lane_sum(vec3), lane_sum(vec4)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
     def collect_backward(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
@@ -304,7 +304,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     sum1 = lane_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
     def splat_error(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
@@ -373,7 +373,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
 
 @functools.cache
 def reduce_rows_kernel(dtype: type) -> wp.Kernel:
-    """Make the kernel that adds up each surfel's entry slots, one thread a surfel, in a fixed order."""
+    """Make the kernel that adds up each surfel's entry slots to `sums`, one thread a surfel, in a fixed order."""
 
     @wp.kernel(enable_backward=False, module="unique")
     def reduce_rows(
@@ -390,9 +390,7 @@ def reduce_rows_kernel(dtype: type) -> wp.Kernel:
         if rank > 0:
             start = ends[rank - 1]
         for c in range(columns):
-            total = dtype()
             for e in range(start, ends[rank]):
-                total += slots[e, c]
-            sums[order[rank], c] = total
+                sums[order[rank], c] += slots[e, c]
 
     return reduce_rows

@@ -2,6 +2,7 @@
 
 from nexwarp.ops.collect import Hits, collect, splat_error
 from nexwarp.ops.compose import compose
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.texture import texture
@@ -10,6 +11,7 @@ from nexwarp.ops.unproject import unproject
 
 __all__ = [
     "Hits",
+    "Pinhole",
     "Projection",
     "Tiles",
     "collect",

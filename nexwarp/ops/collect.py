@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.camera import Camera
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.kernels.collect import (
     BLOCK_DIM,
     collect_backward_kernel,
@@ -43,14 +43,14 @@ class Hits:
 
 
 def collect(
-    projection: Projection, tiles: Tiles, camera: Camera, *, max_hits: int = 2, low_pass: bool = False
+    projection: Projection, tiles: Tiles, camera: Pinhole, *, max_hits: int = 2, low_pass: bool = False
 ) -> Hits:
     """Walk every pixel's list front to back; differentiable with respect to the projection.
 
     Args:
         projection: surfels in the camera's frame.
         tiles: their lists.
-        camera: the camera.
+        camera: the image plane.
         max_hits: K, length of the buffer, 0 to 8.
         low_pass: use max(surfel, screen-space Gaussian) as the kernel, for surfels smaller than a pixel.
     """
@@ -60,7 +60,7 @@ def collect(
 
 
 def splat_error(
-    projection: Projection, tiles: Tiles, hits: Hits, camera: Camera, errors: torch.Tensor, *, low_pass: bool = False
+    projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, errors: torch.Tensor, *, low_pass: bool = False
 ) -> torch.Tensor:
     """Give each surfel the sum over pixels of its blending weight times the pixel's error.
 
@@ -88,7 +88,7 @@ def _threads(tiles: Tiles) -> int:
 
 
 def _inputs(
-    records: torch.Tensor, centers: torch.Tensor, tiles: Tiles, camera: Camera, rows: torch.Tensor | None = None
+    records: torch.Tensor, centers: torch.Tensor, tiles: Tiles, camera: Pinhole, rows: torch.Tensor | None = None
 ) -> list[Any]:
     t = types(real_of(records))
     lists = [tiles.surfel_ids] + ([] if rows is None else [rows]) + [tiles.tile_offsets]
@@ -98,7 +98,7 @@ def _inputs(
         *(array(x, wp.int32) for x in lists),
         wp.vec2i(camera.width, camera.height),
         tiles.columns,
-        t.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+        t.vec4(*camera.intrinsics),
         camera.near,
     ]
 
@@ -114,7 +114,7 @@ def _reduce(slots: torch.Tensor, tiles: Tiles, count: int, dtype: type) -> torch
     """Add up each surfel's rows; on CUDA they already are. A row is (columns,) elements of `dtype`."""
     if slots.is_cuda:
         return slots
-    sums = slots.new_empty(count, *slots.shape[1:])
+    sums = slots.new_zeros(count, *slots.shape[1:])
     inputs = [array(tiles.order, wp.int32), array(tiles.ends, wp.int32), array(slots, dtype), slots.shape[1]]
     launch(slots, reduce_rows_kernel(dtype), count, inputs, [array(sums, dtype)])
     return sums
@@ -127,7 +127,7 @@ class _Collect(torch.autograd.Function):
         records: torch.Tensor,
         centers: torch.Tensor,
         tiles: Tiles,
-        camera: Camera,
+        camera: Pinhole,
         max_hits: int,
         low_pass: bool,
     ) -> tuple[torch.Tensor, ...]:

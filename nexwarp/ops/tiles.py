@@ -6,7 +6,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from nexwarp.camera import Camera
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch, real_of, stream_of
@@ -45,7 +45,8 @@ def intersect_tiles(
     opacities: torch.Tensor,
     gammas: torch.Tensor,
     projection: Projection,
-    camera: Camera,
+    viewmat: torch.Tensor,
+    camera: Pinhole,
     *,
     low_pass: bool = False,
     tile_size: int = TILE_SIZE,
@@ -54,8 +55,9 @@ def intersect_tiles(
 
     Args:
         means, quats, scales, opacities, gammas: activated surfels.
-        projection: of the same surfels into `camera`.
-        camera: the camera.
+        projection: of the same surfels.
+        viewmat: (4, 4) world to camera.
+        camera: the image plane.
         low_pass: whether supports include the screen-space low-pass.
         tile_size: pixels along a tile's side, a multiple of 8.
     """
@@ -71,8 +73,8 @@ def intersect_tiles(
     arguments = [
         array(order, wp.int32),
         *(array(x, dtype) for x, dtype in zip(tensors, dtypes, strict=True)),
-        array(camera.viewmat.detach().contiguous()[None], t.mat44),
-        t.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+        array(viewmat.contiguous()[None], t.mat44),
+        t.vec4(*camera.intrinsics),
         camera.near,
         wp.vec2i(columns, rows),
     ]

@@ -5,29 +5,31 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.camera import Camera
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernel
 from nexwarp.ops._interop import array, grad_like, launch, real_of
 
 
-def unproject(depths: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the world points at the given z-depths along the pixels' rays, and the rays' directions.
 
     Args:
         depths: (H, W, K) z-depths, world units.
-        camera: the camera; gradients reach its `viewmat`.
+        viewmat: (4, 4) world to camera.
+        camera: the image plane.
 
     Returns:
-        (H, W, K, 3) positions, world frame, and (H, W, 3) unit directions, world frame; both differentiable.
+        (H, W, K, 3) positions, world frame, and (H, W, 3) unit directions, world frame; both
+        differentiable with respect to `depths` and `viewmat`.
     """
-    return _Unproject.apply(depths.contiguous(), camera.viewmat.contiguous(), camera)
+    return _Unproject.apply(depths.contiguous(), viewmat.contiguous(), camera)
 
 
 class _Unproject(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, depths: torch.Tensor, viewmat: torch.Tensor, camera: Camera
+        ctx: Any, depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
     ) -> tuple[torch.Tensor, torch.Tensor]:
         positions = depths.new_empty(*depths.shape, 3)
         directions = depths.new_empty(*depths.shape[:2], 3)
@@ -60,7 +62,7 @@ def _launch(
     depths: torch.Tensor,
     viewmats: torch.Tensor,
     step: int,
-    camera: Camera,
+    camera: Pinhole,
     outputs: tuple[torch.Tensor, torch.Tensor],
     grads: tuple[torch.Tensor | None, torch.Tensor | None] | None = None,
 ) -> None:
@@ -68,7 +70,7 @@ def _launch(
     real = real_of(depths)
     t = types(real)
     pixels = depths.shape[0] * depths.shape[1]
-    intrinsics = t.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+    intrinsics = t.vec4(*camera.intrinsics)
     inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, intrinsics, camera.width]
     arrays = [array(outputs[0].view(pixels, -1, 3) if depths.shape[2] else outputs[0].view(pixels, 0, 3), t.vec3)]
     arrays.append(array(outputs[1].view(pixels, 3), t.vec3))

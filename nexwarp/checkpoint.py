@@ -1,0 +1,187 @@
+"""Models and checkpoints on disk: safetensors and JSON only; every file is written aside, then renamed."""
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.surfels import Surfels
+from nexwarp.texture import NeuralTexture
+
+FORMAT_VERSION = 1
+MODEL_FILE = "model.safetensors"
+FRAME = "COLMAP world, cameras x right, y down, z forward"
+
+
+@dataclass
+class Model:
+    """A trained scene.
+
+    Attributes:
+        surfels: the surfels, float32.
+        texture: the neural texture, float32 (stored in half precision).
+        meta: what rendering needs beside them: `max_hits`, `background`, `sh_degree`, `low_pass`, `clamp_texture`,
+            `near`; and `format_version`, `frame`, `scene_scale`, `preset`, `iteration`.
+    """
+
+    surfels: Surfels
+    texture: NeuralTexture
+    meta: dict[str, Any]
+
+    def to(self, device: torch.device | str) -> "Model":
+        """Move surfels and texture to a device, in place."""
+        self.surfels.to(device)
+        self.texture.to(device)
+        return self
+
+    @property
+    def render_options(self) -> dict[str, Any]:
+        """Keyword arguments that the model was trained with, for `nexwarp.render`."""
+        return {
+            name: self.meta[name] for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
+        }
+
+
+def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
+    """Write `model.safetensors` into a folder: surfels in float32, grid and MLP in half precision."""
+    from safetensors.torch import save
+
+    tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
+    for name, x in model.texture.state_dict().items():
+        tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
+    tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
+    meta = {**model.meta, "format_version": FORMAT_VERSION, "frame": FRAME, "texture": model.texture.config}
+    path = Path(folder) / MODEL_FILE
+    write_atomically(path, save(tensors, {"nexwarp": json.dumps(meta)}))
+    return path
+
+
+def load(path: str | os.PathLike[str]) -> Model:
+    """Load a trained scene; needs neither the photos nor the training set.
+
+    Args:
+        path: a run folder or a `model.safetensors`.
+
+    Raises:
+        FileNotFoundError: nothing there.
+        ValueError: not a nexwarp model, of another format version, damaged, or tensors that do not fit.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if path.is_dir():
+        path = path / MODEL_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a run folder with a {MODEL_FILE}, or such a file")
+    try:
+        with safe_open(path, "pt") as file:
+            header = (file.metadata() or {}).get("nexwarp")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
+    if header is None:
+        raise ValueError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
+    meta = json.loads(header)
+    if meta.get("format_version") != FORMAT_VERSION:
+        raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
+    try:
+        surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
+        texture = NeuralTexture(**meta.pop("texture"))
+        texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: the tensors do not make a model ({error})") from None
+    return Model(surfels, texture, meta)
+
+
+def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
+    """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all."""
+    from safetensors.torch import save_file
+
+    folder, aside, old = run / "checkpoint", run / "checkpoint.tmp", run / "checkpoint.old"
+    for leftover in (aside, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    aside.mkdir()
+    save_file({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors")
+    write_atomically(aside / "state.json", json.dumps(state).encode())
+    if folder.exists():
+        folder.rename(old)
+    aside.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load_checkpoint(run: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read what `save_checkpoint` wrote.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: it is damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    # A kill between the two renames leaves only the older one, under its other name.
+    folder = next((f for f in (run / "checkpoint", run / "checkpoint.old") if f.is_dir()), None)
+    if folder is None:
+        raise FileNotFoundError(f"{run}: expected a checkpoint to resume from, found none")
+    try:
+        return load_file(folder / "tensors.safetensors"), json.loads((folder / "state.json").read_text())
+    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise ValueError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
+
+
+def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> None:
+    """Write named cameras by set ("train", "test") as JSON, so that a run renders without its photos."""
+    data = {
+        group: {
+            name: {
+                "viewmat": camera.viewmat.tolist(),
+                "K": camera.K.tolist(),
+                "width": camera.width,
+                "height": camera.height,
+                "near": camera.near,
+            }
+            for name, camera in members.items()
+        }
+        for group, members in cameras.items()
+    }
+    write_json(path, data)
+
+
+def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
+    """Read what `save_cameras` wrote, float32 on the CPU."""
+    try:
+        data = json.loads(path.read_text())
+        return {
+            group: {
+                name: Camera(
+                    torch.tensor(c["viewmat"]), torch.tensor(c["K"]), c["width"], c["height"], near=c["near"]
+                )
+                for name, c in members.items()
+            }
+            for group, members in data.items()
+        }
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: expected the run's cameras, found no such file") from None
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: expected named cameras as JSON ({error})") from None
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write indented JSON atomically."""
+    write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name and rename it, so that it is there whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

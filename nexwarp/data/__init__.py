@@ -1,0 +1,7 @@
+"""Where scenes come from: COLMAP folders, the built-in demo, and the points that training starts from."""
+
+from nexwarp.data.demo import demo_folder, write_demo
+from nexwarp.data.points import InitialPoints, initial_points
+from nexwarp.data.scene import Scene, View, load_scene
+
+__all__ = ["InitialPoints", "Scene", "View", "demo_folder", "initial_points", "load_scene", "write_demo"]

@@ -1,0 +1,174 @@
+"""The points that training starts from: sparse points without outliers, spread evenly, with a size each."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+MIN_TRACK_LENGTH = 3
+ROBUST_SIGMAS = 3.0
+SIGMA_FROM_MAD = 1.4826  # of a normal distribution
+NEIGHBORS = 3
+
+
+@dataclass(frozen=True)
+class InitialPoints:
+    """Points in the order of farthest point sampling, so that every prefix covers the scene evenly.
+
+    Attributes:
+        means: (M, 3) float32, world frame.
+        colors: (M, 3) float32, sRGB in [0, 1].
+        scales: (M,) float32, world units, > 0.
+    """
+
+    means: torch.Tensor
+    colors: torch.Tensor
+    scales: torch.Tensor
+
+
+def initial_points(
+    points: torch.Tensor,
+    colors: torch.Tensor,
+    count: int,
+    *,
+    track_lengths: torch.Tensor | None = None,
+    errors: torch.Tensor | None = None,
+    filter_outliers: bool = True,
+) -> InitialPoints:
+    """Choose the points that training starts from.
+
+    A point's scale is half the root mean square distance to its 3 nearest predecessors in the order of the
+    sampling, that is, to what was there when it was added; the first three points, which lack predecessors,
+    take their nearest points of the whole choice. Points at exactly one position count once.
+
+    Args:
+        points: (P, 3) float, world frame.
+        colors: (P, 3) uint8 sRGB, or float in [0, 1].
+        count: how many are wanted; fewer come when fewer are available.
+        track_lengths: (P,) integer, photos that a point was triangulated from.
+        errors: (P,) float, mean reprojection errors in pixels; negative when unknown.
+        filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust sigmas,
+            as far as `track_lengths` and `errors` are given; never more than half of the points.
+
+    Returns:
+        min(count, available) points.
+
+    Raises:
+        ValueError: `count` < 1, no points, shapes that do not agree, points that are not finite.
+    """
+    _check_arguments(points, colors, count, track_lengths, errors)
+    xyz = points.detach().cpu().double().numpy()
+    rgb = colors.detach().cpu()
+    rgb = (rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float().clamp(0.0, 1.0)).numpy()
+    if filter_outliers:
+        keep = inliers(
+            len(xyz),
+            None if track_lengths is None else track_lengths.detach().cpu().numpy(),
+            None if errors is None else errors.detach().cpu().double().numpy(),
+        )
+        xyz, rgb = xyz[keep], rgb[keep]
+    order = farthest_points(xyz, count)
+    means = xyz[order]
+    return InitialPoints(
+        means=torch.from_numpy(means.astype(np.float32)),
+        colors=torch.from_numpy(rgb[order]),
+        scales=torch.from_numpy(predecessor_scales(means).astype(np.float32)),
+    )
+
+
+def _check_arguments(points, colors, count, track_lengths, errors) -> None:
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 1:
+        raise ValueError(f"points: expected shape (P, 3) with P >= 1, got {tuple(points.shape)}")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError("points: expected finite positions, got NaN or infinite ones")
+    if colors.shape != points.shape:
+        raise ValueError(f"colors: expected shape {tuple(points.shape)}, got {tuple(colors.shape)}")
+    for name, tensor in (("track_lengths", track_lengths), ("errors", errors)):
+        if tensor is not None and tensor.shape != points.shape[:1]:
+            raise ValueError(f"{name}: expected shape ({len(points)},), got {tuple(tensor.shape)}")
+
+
+def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | None) -> np.ndarray:
+    """Return the indices, ascending, of the points that pass the outlier filter; at least half of them.
+
+    Args:
+        count: number of points P.
+        track_lengths: (P,) integer or None.
+        errors: (P,) float, pixels, negative when unknown, or None.
+    """
+    short = np.zeros(count, dtype=bool) if track_lengths is None else track_lengths < MIN_TRACK_LENGTH
+    error = np.zeros(count) if errors is None else np.where(np.isnan(errors), np.inf, errors)
+    known = error[(error >= 0) & np.isfinite(error)]
+    bound = np.inf
+    if len(known):
+        median = np.median(known)
+        bound = median + ROBUST_SIGMAS * SIGMA_FROM_MAD * np.median(np.abs(known - median))
+    keep = ~short & (error <= bound)
+    half = (count + 1) // 2
+    if keep.sum() < half:  # a sparse capture, two-view points mostly: the better half, long tracks first
+        keep[np.lexsort((error, short))[:half]] = True
+    return np.flatnonzero(keep)
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Order points so that each is the farthest from all before it.
+
+    Args:
+        points: (P, 3) float64; where several are at one position, only the first of them is taken.
+        count: how many to take.
+
+    Returns:
+        (min(count, distinct),) int64 indices into `points`. The start is arbitrary but always the same:
+        fpsample's `start_idx` counts in the order of its own tree (1.0.2), so index 0 need not come first.
+    """
+    from fpsample import bucket_fps_kdline_sampling
+
+    # fpsample works in float32: centred, so that the distance from the origin costs no precision.
+    centred = (points - points.mean(axis=0)).astype(np.float32)
+    # Once only duplicates are left, fpsample returns one index again and again.
+    distinct = np.sort(np.unique(centred, axis=0, return_index=True)[1])
+    if len(distinct) == 1:
+        return distinct
+    height = int(
+        np.clip(np.log2(len(distinct)) - 8, 1, 9)
+    )  # of its tree: measured best at 9 for 400,000 points
+    order = bucket_fps_kdline_sampling(
+        np.ascontiguousarray(centred[distinct]), min(count, len(distinct)), h=height, start_idx=0
+    )
+    return distinct[order.astype(np.int64)]
+
+
+def predecessor_scales(means: np.ndarray) -> np.ndarray:
+    """Half the root mean square distance of each point to its 3 nearest predecessors, exactly.
+
+    Args:
+        means: (M, 3) float64 in order.
+
+    Returns:
+        (M,) float64, at least 1e-6 of the extent of `means`.
+    """
+    from scipy.spatial import cKDTree
+
+    count = len(means)
+    extent = float(np.linalg.norm(means.max(axis=0) - means.min(axis=0)))
+    squared = np.zeros(count)
+    tree = cKDTree(means)
+    pending = np.arange(NEIGHBORS, count)
+    neighbors = 4 * NEIGHBORS
+    while len(pending):
+        neighbors = min(2 * neighbors, count)
+        distances, indices = tree.query(means[pending], k=neighbors, workers=-1)
+        earlier = indices < pending[:, None]
+        done = earlier.sum(axis=1) >= NEIGHBORS
+        # The neighbours come nearest first, so the first 3 predecessors among them are the nearest of all.
+        rank = np.cumsum(earlier[done], axis=1)
+        chosen = earlier[done] & (rank <= NEIGHBORS)
+        squared[pending[done]] = (distances[done] ** 2 * chosen).sum(axis=1) / NEIGHBORS
+        pending = pending[~done]
+    for index in range(min(NEIGHBORS, count)):
+        others = np.delete(((means - means[index]) ** 2).sum(axis=1), index)
+        nearest = np.partition(others, NEIGHBORS)[:NEIGHBORS] if len(others) > NEIGHBORS else others
+        squared[index] = nearest.mean() if len(nearest) else 0.0
+    return np.maximum(0.5 * np.sqrt(squared), 1e-6 * (extent or 1.0))

@@ -1,0 +1,107 @@
+"""Image metrics as this field reports them: from 8-bit images, to compare with published numbers."""
+
+import warnings
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from nexwarp.checks import check_finite
+
+CONVENTION = (
+    "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
+    "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
+    "C2 = 0.03^2, mean over all pixels and channels. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to "
+    "[-1, 1]. "
+    "A set's figure is the mean over its images."
+)
+
+
+def to_uint8(image: torch.Tensor) -> torch.Tensor:
+    """Clamp a float image to [0, 1] and round it to 8 bits; an 8-bit image comes back as it is.
+
+    Raises:
+        TypeError: `image` is neither uint8 nor floating.
+        ValueError: `image` holds NaN or infinity.
+    """
+    if image.dtype == torch.uint8:
+        return image
+    if not image.is_floating_point():
+        raise TypeError(f"image: expected uint8 or a floating dtype, got {image.dtype}")
+    check_finite("image", image)
+    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of two (H, W, 3) images, uint8 or float in [0, 1]; inf if equal."""
+    image, target = _unit_images(image, target)
+    error = (image.double() - target.double()).square().mean()
+    return (-10.0 * torch.log10(error)).item()
+
+
+def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1]."""
+    return ssim_map(image, target).mean(dtype=torch.float64).item()
+
+
+def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """(H, W, 3) float32 map whose mean is `ssim`."""
+    x, y = (picture.permute(2, 0, 1) for picture in _unit_images(image, target))
+    mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2.0 * mx * my + c1) / (mx * mx + my * my + c1)
+    structure = (2.0 * (xy - mx * my) + c2) / ((xx - mx * mx) + (yy - my * my) + c2)
+    return (luminance * structure).permute(1, 2, 0)
+
+
+def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
+    """LPIPS (VGG, v0.1) of two (H, W, 3) images, or None, with one warning, when it is not available.
+
+    It needs the `lpips` package (`pip install nexwarp[lpips]`), which fetches the VGG weights on first use.
+    """
+    x, y = _unit_images(image, target)
+    network = _lpips_network(x.device)
+    if network is None:
+        return None
+    with torch.no_grad():
+        return network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False).item()
+
+
+@lru_cache(maxsize=2)
+def _lpips_network(device: torch.device) -> Any:
+    try:
+        import lpips
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
+            return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+    except (ImportError, OSError, RuntimeError) as error:
+        warnings.warn(
+            f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3
+        )
+        return None
+
+
+def _unit_images(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Check two images and return them as float32 multiples of 1/255."""
+    for name, tensor in (("image", image), ("target", target)):
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
+        if tensor.ndim != 3 or tensor.shape[-1] != 3:
+            raise ValueError(f"{name}: expected shape (H, W, 3), got {tuple(tensor.shape)}")
+    if target.shape != image.shape:
+        raise ValueError(f"target: expected shape {tuple(image.shape)}, got {tuple(target.shape)}")
+    if target.device != image.device:
+        raise ValueError(f"target: expected a tensor on {image.device}, got one on {target.device}")
+    return to_uint8(image).float() / 255.0, to_uint8(target).float() / 255.0
+
+
+def _blur(planes: torch.Tensor) -> torch.Tensor:
+    """Blur (C, H, W) planes with an 11 x 11 Gaussian of sigma 1.5, zeros outside."""
+    offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
+    window = torch.exp(-(offset**2) / (2.0 * 1.5**2))
+    count = len(planes)
+    row = (window / window.sum()).to(planes).expand(count, 1, 1, 11)
+    planes = F.conv2d(planes[None], row, padding=(0, 5), groups=count)
+    return F.conv2d(planes, row.transpose(2, 3), padding=(5, 0), groups=count)[0]

@@ -1,0 +1,195 @@
+"""The collection pass (paper Sec. 3.2): blend the plain colours, keep the K heaviest hits of each pixel."""
+
+from dataclasses import dataclass
+
+import torch
+
+ALPHA_MAX = 0.99
+ALPHA_MIN = 1 / 255
+TRANSMITTANCE_MIN = 1e-4
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the collection pass leaves in each pixel.
+
+    Attributes:
+        plain: (H, W, 3) blended colour of the hits that are not in the buffer.
+        ids: (H, W, K) int64, surfels in the buffer, heaviest first, -1 where empty.
+        depths: (H, W, K) z-depths of the hits, 0 where empty.
+        weights: (H, W, K) blending weights, 0 where empty.
+        alpha: (H, W) one minus the final transmittance.
+    """
+
+    plain: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    alpha: torch.Tensor
+
+
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+def pixel_centers(width: int, height: int, like: torch.Tensor) -> torch.Tensor:
+    """Pixel coordinates (H * W, 2) of the pixel centres, row by row."""
+    x = torch.arange(width, dtype=like.dtype, device=like.device) + 0.5
+    y = torch.arange(height, dtype=like.dtype, device=like.device) + 0.5
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+
+
+def camera_rays(pixels: torch.Tensor, fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
+    """Camera-frame directions (P, 3) with z = 1 through `pixels` (P, 2)."""
+    x, y = pixels.unbind(-1)
+    return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
+
+
+def power(u: torch.Tensor, gamma: torch.Tensor) -> torch.Tensor:
+    """|u|^(2 gamma), smooth at 0 and finite (with its gradient) wherever exp(-power / 2) is not zero."""
+    return (gamma * (u * u).clamp_min(1e-20).log()).clamp_max(50).exp()
+
+
+def intersect(
+    centers: torch.Tensor, axes: torch.Tensor, scales: torch.Tensor, rays: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Meet every ray (P, 3) with the plane of every surfel: u, v, t and whether they meet, each (P, N).
+
+    Args:
+        centers: (N, 3) in the camera frame.
+        axes: (N, 3, 3) in the camera frame; the columns are the u axis, the v axis and the normal.
+        scales: (N, 2).
+        rays: (P, 3) in the camera frame, z = 1.
+    """
+    normals = axes[:, :, 2]
+    slope = rays @ normals.T
+    meets = slope.abs() > 1e-12
+    t = (centers * normals).sum(-1) / torch.where(meets, slope, 1.0)
+    offsets = t[..., None] * rays[:, None] - centers
+    u = (offsets * axes[:, :, 0]).sum(-1) / scales[:, 0]
+    v = (offsets * axes[:, :, 1]).sum(-1) / scales[:, 1]
+    return u, v, t, meets
+
+
+def collect(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    colors: torch.Tensor,
+    viewmat: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near: float,
+    max_hits: int,
+    low_pass: bool = False,
+) -> Hits:
+    """Blend every pixel; differentiable with respect to every float tensor.
+
+    Args:
+        means: (N, 3), world frame.
+        quats: (N, 4), surfel to world, wxyz.
+        scales: (N, 2).
+        opacities: (N,).
+        gammas: (N, 2).
+        colors: (N, 3), plain colours.
+        viewmat: (4, 4), world to camera.
+        fx: focal length along x in pixels.
+        fy: focal length along y in pixels.
+        cx: x of the principal point in pixels.
+        cy: y of the principal point in pixels.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        near: hits count beyond this z-depth.
+        max_hits: K.
+        low_pass: let no surfel be smaller on screen than a Gaussian of standard deviation sqrt(1/2) pixel.
+    """
+    rotation = viewmat[:3, :3]
+    centers = means @ rotation.T + viewmat[:3, 3]
+    axes = rotation @ rotations(quats)
+    pixels = pixel_centers(width, height, means)
+
+    # The hit (Eq. 1).
+    u, v, t, meets = intersect(centers, axes, scales, camera_rays(pixels, fx, fy, cx, cy))
+    exponent = power(u, gammas[:, 0]) + power(v, gammas[:, 1])
+    if low_pass:
+        t, exponent, meets = widen(centers, pixels, fx, fy, cx, cy, near, t, exponent, meets)
+    alphas = (opacities * torch.exp(-exponent / 2)).clamp_max(ALPHA_MAX)
+    counts = meets & (alphas >= ALPHA_MIN) & (t > near)
+    alphas = torch.where(counts, alphas, 0.0)
+
+    # Front to back: transmittance before each hit, up to and including the hit that makes the pixel opaque.
+    order = torch.sort(centers[:, 2].detach().float(), stable=True).indices
+    alphas, t = alphas[:, order], t[:, order]
+    before = transmittance_before(alphas)
+    alphas = torch.where(before >= TRANSMITTANCE_MIN, alphas, 0.0)
+    weights = alphas * before
+    alpha = 1 - torch.prod(1 - alphas, dim=-1)
+
+    # The buffer: a stable sort of hits that are already front to back lets the nearer one win a tie.
+    heaviest = torch.sort(weights.detach(), dim=-1, descending=True, stable=True).indices[:, :max_hits]
+    filled = weights.detach().gather(-1, heaviest) > 0
+    kept = torch.zeros_like(weights, dtype=torch.bool).scatter(-1, heaviest, filled)
+    plain = torch.where(kept, 0.0, weights) @ colors[order]
+
+    def slots(values: torch.Tensor, empty: float) -> torch.Tensor:
+        values = torch.where(filled, values, empty)
+        values = torch.nn.functional.pad(values, (0, max_hits - values.shape[-1]), value=empty)
+        return values.reshape(height, width, max_hits)
+
+    return Hits(
+        plain=plain.reshape(height, width, 3),
+        ids=slots(order[heaviest], -1),
+        depths=slots(t.gather(-1, heaviest), 0.0),
+        weights=slots(weights.gather(-1, heaviest), 0.0),
+        alpha=alpha.reshape(height, width),
+    )
+
+
+def transmittance_before(alphas: torch.Tensor) -> torch.Tensor:
+    """Transmittance (P, N) in front of each of the sorted `alphas` (P, N): 1, 1 - a_0, (1 - a_0)(1 - a_1)."""
+    shifted = torch.nn.functional.pad(1 - alphas, (1, 0), value=1.0)[:, : alphas.shape[1]]
+    return torch.cumprod(shifted, dim=-1)
+
+
+def widen(
+    centers: torch.Tensor,
+    pixels: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    near: float,
+    t: torch.Tensor,
+    exponent: torch.Tensor,
+    meets: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Apply the screen-space low-pass filter: the smaller of `exponent` and 2 r^2, and the winner's depth.
+
+    r is the distance in pixels from the pixel centre to the projected centre; a centre at or before the near
+    depth has no projection, and so no filter.
+    """
+    visible = centers[:, 2] > near
+    z = torch.where(visible, centers[:, 2], 1.0)
+    projected = torch.stack([fx * centers[:, 0] / z + cx, fy * centers[:, 1] / z + cy], dim=-1)
+    screen = 2 * (pixels[:, None] - projected).square().sum(-1)
+    wins = visible & ((screen < exponent) | ~meets)
+    return torch.where(wins, z, t), torch.where(wins, screen, exponent), meets | wins

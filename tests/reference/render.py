@@ -1,0 +1,103 @@
+"""Both passes (paper Sec. 3.2): collect the hits, texture the K heaviest, put the image together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from tests.reference.collect import camera_rays, collect, pixel_centers
+from tests.reference.hashgrid import encode
+from tests.reference.sh import evaluate, plain_colors
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The buffers that nexwarp.render returns, by the same names."""
+
+    image: torch.Tensor
+    plain: torch.Tensor
+    textured: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    alpha: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Texture:
+    """The neural field.
+
+    Attributes:
+        grid: (L, T, F).
+        resolutions: (L,), cells per world unit.
+        mlp: weight matrices (out, in), first layer first, ReLU between them.
+    """
+
+    grid: torch.Tensor
+    resolutions: torch.Tensor
+    mlp: Sequence[torch.Tensor]
+
+
+def field(texture: Texture, positions: torch.Tensor, depths: torch.Tensor, focal: float) -> torch.Tensor:
+    """Spherical harmonics coefficients (n, C, 3) at `positions` (n, 3) seen at z-depth `depths` (n,)."""
+    values = encode(positions, depths, texture.grid, texture.resolutions, focal)
+    for matrix in texture.mlp[:-1]:
+        values = torch.relu(values @ matrix.T)
+    return (values @ texture.mlp[-1].T).unflatten(-1, (-1, 3))
+
+
+def render(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    sh: torch.Tensor,
+    texture: Texture | None,
+    viewmat: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near: float,
+    max_hits: int = 2,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    sh_degree: int = 3,
+    low_pass: bool = False,
+    clamp_texture: bool = False,
+) -> Rendering:
+    """Render; differentiable with respect to every float tensor, those of `texture` included."""
+    rotation = viewmat[:3, :3]
+    position = -rotation.T @ viewmat[:3, 3]
+    colors = plain_colors(sh, means, position, sh_degree)
+    hits = collect(
+        means, quats, scales, opacities, gammas, colors, viewmat,
+        fx, fy, cx, cy, width, height, near, max_hits, low_pass,
+    )  # fmt: skip
+
+    filled = hits.ids >= 0
+    texels = torch.zeros(height, width, max_hits, 3, dtype=means.dtype, device=means.device)
+    if texture is None:
+        texels = texels.index_put((filled,), colors[hits.ids[filled]])
+    else:
+        rays = camera_rays(pixel_centers(width, height, means), fx, fy, cx, cy) @ rotation
+        rays = rays.reshape(height, width, 1, 3).expand(-1, -1, max_hits, -1)[filled]
+        depths = hits.depths[filled]
+        coefficients = field(texture, position + depths[:, None] * rays, depths, (fx * fy) ** 0.5)
+        directions = rays / rays.norm(dim=-1, keepdim=True)
+        values = 0.5 + evaluate(coefficients, directions, sh_degree)
+        texels = texels.index_put((filled,), values.clamp_min(0) if clamp_texture else values)
+
+    textured = (hits.weights[..., None] * texels).sum(dim=-2)
+    behind = (1 - hits.alpha)[..., None] * torch.as_tensor(background, dtype=means.dtype, device=means.device)
+    return Rendering(
+        image=hits.plain + textured + behind,
+        plain=hits.plain,
+        textured=textured,
+        ids=hits.ids,
+        depths=hits.depths,
+        weights=hits.weights,
+        alpha=hits.alpha,
+    )

@@ -1,0 +1,157 @@
+"""Small seeded scenes, the same in every dtype: values are made in float64 and rounded to float32.
+
+All but `viewmat`: a rotation rounded to float32 is orthonormal to 1e-7 only, and then it matters, in float64,
+whether rays are turned into the world or surfels into the camera frame.
+
+A scene is a dict: the arguments of `Surfels.from_activated`, and `viewmat`, `K`, `width`, `height`, `near`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+import nexwarp as nw
+from tests.reference.collect import rotations
+
+Scene = dict[str, Any]
+SURFEL_KEYS = ("means", "quats", "scales", "opacities", "gammas", "sh")
+CAMERA_KEYS = ("viewmat", "K", "width", "height", "near")
+
+
+def uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+    return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def rigid(quat: tuple[float, ...], translation: tuple[float, ...]) -> torch.Tensor:
+    """Rigid motion (4, 4) float64 of a quaternion (wxyz) and a translation."""
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = rotations(torch.tensor([quat], dtype=torch.float64))[0]
+    motion[:3, 3] = torch.tensor(translation, dtype=torch.float64)
+    return motion
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def finish(scene: Scene, dtype: torch.dtype, device: torch.device | str) -> Scene:
+    """Cast and move every tensor of `scene`, rounded to float32 unless it must stay rigid."""
+    tensors = {key: value for key, value in scene.items() if isinstance(value, torch.Tensor)}
+    rounded = {key: value if key == "viewmat" else value.float() for key, value in tensors.items()}
+    return scene | {key: value.to(device=device, dtype=dtype) for key, value in rounded.items()}
+
+
+def random_scene(
+    count: int = 24,
+    *,
+    seed: int = 0,
+    width: int = 23,
+    height: int = 18,
+    sh_degree: int = 3,
+    off_centre: bool = False,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """Make `count` surfels of all orientations in front of a turned camera, opacities well above 1/255.
+
+    `off_centre` puts the principal point outside the image and makes fx and fy differ.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    fx, fy, cx, cy = (31.0, 22.0, -4.25, height + 3.5) if off_centre else (24.0, 24.0, width / 2, height / 2)
+    viewmat = rigid((0.9, 0.2, -0.3, 0.1), (0.3, -0.2, 0.5))
+    z = uniform(generator, count, low=2.0, high=5.0)
+    x = (uniform(generator, count, high=width) - cx) / fx * z
+    y = (uniform(generator, count, high=height) - cy) / fy * z
+    centers = torch.stack([x, y, z], dim=-1)
+    sh = 0.3 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
+    scene = {
+        "means": (centers - viewmat[:3, 3]) @ viewmat[:3, :3],
+        "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
+        "scales": uniform(generator, count, 2, low=0.2, high=0.9),
+        "opacities": uniform(generator, count, low=0.2, high=0.95),
+        "gammas": uniform(generator, count, 2, low=1.1, high=2.5),
+        "sh": sh,
+        "viewmat": viewmat,
+        "K": intrinsics(fx, fy, cx, cy),
+        "width": width,
+        "height": height,
+        "near": 0.01,
+    }
+    return finish(scene, dtype, device)
+
+
+def layered_scene(
+    count: int = 16, *, seed: int = 0, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Scene:
+    """Make opaque sheets one behind the other, so that the transmittance reaches 1e-4 and the walk stops.
+
+    Every third opacity lies above the cap of 0.99.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    scene = random_scene(count, seed=seed, dtype=torch.float64)
+    viewmat = scene["viewmat"]
+    z = torch.linspace(2.0, 4.0, count, dtype=torch.float64)
+    lateral = uniform(generator, count, 2, low=-0.3, high=0.3)
+    opacities = uniform(generator, count, low=0.8, high=0.97)
+    opacities[::3] = 0.999
+    tilt = torch.cat([torch.ones(count, 1), 0.05 * torch.randn(count, 3, generator=generator)], dim=-1)
+    scene |= {
+        "means": (torch.cat([lateral, z[:, None]], dim=-1) - viewmat[:3, 3]) @ viewmat[:3, :3],
+        "quats": multiply(torch.tensor([[0.9, -0.2, 0.3, -0.1]]).double(), tilt.double()),
+        "scales": uniform(generator, count, 2, low=0.8, high=2.0),
+        "opacities": opacities,
+        "gammas": uniform(generator, count, 2, low=1.5, high=4.0),
+    }
+    return finish(scene, dtype, device)
+
+
+def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product (N, 4), wxyz."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    product = [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+    return torch.stack(product, dim=-1)
+
+
+def make_surfels(scene: Scene) -> nw.Surfels:
+    return nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
+
+
+def make_camera(scene: Scene, **changes: Any) -> nw.Camera:
+    """Make the scene's camera; its viewmat is a leaf of its own that asks for a gradient."""
+    values = {key: scene[key] for key in CAMERA_KEYS} | changes
+    return nw.Camera(**(values | {"viewmat": values["viewmat"].detach().clone().requires_grad_()}))
+
+
+def make_texture(
+    *,
+    seed: int = 0,
+    sh_degree: int = 3,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> nw.NeuralTexture:
+    """Make a small field with random features and matrices, large enough to be seen in the image."""
+    texture = nw.NeuralTexture(
+        levels=4,
+        table_size=2**8,
+        features=2,
+        min_resolution=1.0,
+        max_resolution=6.0,
+        width=16,
+        hidden_layers=2,
+        sh_degree=sh_degree,
+    )
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        texture.grid.copy_(torch.randn(texture.grid.shape, generator=generator))
+        for matrix in texture.mlp.parameters():
+            size = (2.0 / matrix.shape[1]) ** 0.5
+            matrix.copy_(size * torch.randn(matrix.shape, generator=generator))
+    return texture.to(device=device, dtype=dtype)

@@ -1,0 +1,399 @@
+"""What must hold of every render, whatever the scene: laws, and agreement with the dense reference."""
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from tests.reference import render as reference
+from tests.scenes import (
+    Scene,
+    layered_scene,
+    make_camera,
+    make_surfels,
+    make_texture,
+    multiply,
+    random_scene,
+    rigid,
+)
+from tests.tolerances import FLIPS, assert_close, assert_finite, assert_same_ids, precision
+
+BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
+BACKGROUND = (0.1, 0.4, 0.7)
+MAX_HITS = 8
+
+
+def draw(scene: Scene, texture: nw.NeuralTexture | None = None, **options: Any) -> Any:
+    """Render `scene` over the test background."""
+    return nw.render(
+        make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options)
+    )
+
+
+def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
+    """Fail unless the buffers are the same to the last bit."""
+    for name in buffers:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+
+
+def assert_alike(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
+    """Fail unless the buffers agree to the tolerance of their dtype."""
+    for name in buffers:
+        assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name)
+
+
+# Agreement with the reference
+
+
+def loss(out: Any) -> torch.Tensor:
+    """Sum of all differentiable buffers with fixed random factors."""
+    generator = torch.Generator().manual_seed(7)
+    total = out.image.new_zeros(())
+    for name in BUFFERS:
+        buffer = getattr(out, name)
+        factors = torch.randn(buffer.shape, generator=generator, dtype=torch.float64)
+        total = total + (buffer * factors.to(buffer)).sum()
+    return total
+
+
+def reference_render(
+    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, **options: Any
+) -> reference.Rendering:
+    """Hand the public objects, in float64 on the CPU, to the reference."""
+    field = None
+    if texture is not None:
+        field = reference.Texture(texture.grid, texture.resolutions.double(), list(texture.mlp.parameters()))
+    return reference.render(
+        surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas, surfels.sh, field,
+        camera.viewmat, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
+        **options,
+    )  # fmt: skip
+
+
+def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:
+    """Derivative (6,) along the rigid motions applied behind `viewmat`: three turns, three shifts."""
+    generators = torch.zeros(6, 4, 4, dtype=torch.float64)
+    for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        generators[axis, b, a], generators[axis, a, b] = 1.0, -1.0
+        generators[axis + 3, axis, 3] = 1.0
+    moved = generators @ viewmat.detach().double().cpu()
+    return (moved * viewmat.grad.double().cpu()).sum(dim=(1, 2))
+
+
+def twin(module: torch.nn.Module | None) -> Any:
+    """Copy a module to float64 on the CPU."""
+    return None if module is None else copy.deepcopy(module).double().cpu()
+
+
+CASES = [
+    # scene, textured, max_hits, low_pass, sh_degree, clamp_texture
+    ("random", True, 2, False, 3, False),
+    ("random", True, 1, True, 1, True),
+    ("random", True, 4, False, 2, True),
+    ("random", False, 2, True, 3, False),
+    ("random", True, 0, False, 3, False),
+    ("layered", True, 2, True, 3, False),
+    ("layered", True, 8, False, 0, True),
+    ("layered", False, 1, False, 2, False),
+    ("off_centre", True, 8, True, 2, False),
+    ("off_centre", True, 2, False, 3, True),
+    ("specks", True, 2, True, 3, False),
+    ("specks", False, 4, False, 1, False),
+]
+
+
+def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
+    if name == "layered":
+        return layered_scene(dtype=dtype, device=device)
+    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
+    if name == "specks":
+        scene["scales"] *= 0.1
+    return scene
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(("name", "textured", "max_hits", "low_pass", "sh_degree", "clamp_texture"), CASES)
+def test_render_agrees_with_the_reference(
+    name: str,
+    textured: bool,
+    max_hits: int,
+    low_pass: bool,
+    sh_degree: int,
+    clamp_texture: bool,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> None:
+    """Values, and gradients with respect to every parameter, to the feature grid, the MLP and the camera."""
+    scene = make_scene(name, dtype, device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    texture = make_texture(dtype=dtype, device=device) if textured else None
+    options = {
+        "max_hits": max_hits,
+        "background": BACKGROUND,
+        "sh_degree": sh_degree,
+        "low_pass": low_pass,
+        "clamp_texture": clamp_texture,
+    }
+    row = precision(dtype, device, textured)
+    flips = 0.0 if dtype == torch.float64 else FLIPS
+
+    surfels64, texture64 = twin(surfels), twin(texture)
+    camera64 = make_camera(
+        scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()}
+    )
+    out = nw.render(surfels, texture, camera, **options)
+    expected = reference_render(surfels64, texture64, camera64, **options)
+    loss(out).backward()
+    loss(expected).backward()
+
+    assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
+    for buffer in BUFFERS:
+        values = getattr(out, buffer), getattr(expected, buffer)
+        assert_close(*values, kind="value", name=buffer, precision=row, allow_flips=flips)
+    assert_gradients(surfels, surfels64, row)
+    if textured:
+        assert_gradients(texture, texture64, row)
+    assert_close(
+        rigid_gradient(camera.viewmat),
+        rigid_gradient(camera64.viewmat),
+        kind="gradient",
+        name="viewmat",
+        precision=row,
+    )
+
+
+def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: torch.dtype) -> None:
+    """Fail unless all parameters have the same gradients; one that is missing counts as zero."""
+    parameters = dict(actual.named_parameters())
+    for name, parameter in expected.named_parameters():
+        gradients = [
+            torch.zeros_like(value) if value.grad is None else value.grad
+            for value in (parameters[name], parameter)
+        ]
+        assert_close(*gradients, kind="gradient", name=name, precision=row)
+
+
+# Laws
+
+
+def test_repeated_renders_are_identical(device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    first = draw(scene, texture)
+    for _ in range(3):
+        again = draw(scene, texture)
+        assert_same(again, first, (*BUFFERS, "ids"))
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_the_order_of_the_surfels_changes_nothing(low_pass: bool, device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    permutation = torch.randperm(len(scene["means"])).to(device)
+    shuffled = scene | {
+        key: scene[key][permutation] for key in ("means", "quats", "scales", "opacities", "gammas", "sh")
+    }
+    out = draw(scene, texture, low_pass=low_pass)
+    other = draw(shuffled, texture, low_pass=low_pass)
+    assert_same(other, out)
+    mapped = torch.where(other.ids >= 0, permutation[other.ids.clamp_min(0).long()], -1)
+    assert torch.equal(mapped, out.ids.long())
+
+
+def test_moving_scene_and_camera_together_changes_nothing(device: torch.device) -> None:
+    scene = random_scene(sh_degree=0, dtype=torch.float64, device=device)
+    quat = (0.3, -0.7, 0.4, 0.5)
+    motion = rigid(quat, (3.0, -1.0, 2.0)).to(device)
+    turn = torch.tensor([quat], dtype=torch.float64, device=device)
+    moved = scene | {
+        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
+        "quats": multiply(turn, scene["quats"]),
+        "viewmat": scene["viewmat"] @ motion.inverse(),
+    }
+    assert_alike(draw(moved, max_hits=4), draw(scene, max_hits=4))
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_scaling_the_world_scales_depths_only(low_pass: bool, device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device)
+    scene["near"] = 2.5
+    factor = 37.0
+    viewmat = scene["viewmat"].clone()
+    viewmat[:3, 3] *= factor
+    scaled = scene | {
+        "means": factor * scene["means"],
+        "scales": factor * scene["scales"],
+        "viewmat": viewmat,
+        "near": factor * scene["near"],
+    }
+    out, expected = draw(scaled, low_pass=low_pass), draw(scene, low_pass=low_pass)
+    assert_alike(out, expected, ("image", "plain", "textured", "weights", "alpha"))
+    assert_close(out.depths / factor, expected.depths, kind="value", name="depths")
+
+
+def test_without_texture_max_hits_does_not_matter(device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device)
+    expected = draw(scene, max_hits=0)
+    assert expected.ids.shape == (18, 23, 0) and not expected.textured.any()
+    for max_hits in (1, 2, 3, MAX_HITS):
+        assert_alike(draw(scene, max_hits=max_hits), expected, ("image", "alpha"))
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_with_room_for_all_hits_nothing_stays_plain(textured: bool, device: torch.device) -> None:
+    scene = random_scene(MAX_HITS, device=device)
+    scene["opacities"] *= 0.8
+    texture = make_texture(device=device) if textured else None
+    out = draw(scene, texture, max_hits=MAX_HITS)
+    assert not out.plain.any()
+    assert_close(out.weights.sum(-1), out.alpha, kind="value", name="sum of the weights")
+
+
+def test_buffers_follow_their_definition(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    out = draw(scene, make_texture(device=device), max_hits=4)
+    empty = out.ids < 0
+    assert empty.any() and not empty.all()
+    assert (out.ids[empty] == -1).all() and not out.weights[empty].any() and not out.depths[empty].any()
+    assert (out.weights[~empty] > 0).all() and (out.depths[~empty] > scene["near"]).all()
+    assert (out.weights[..., 1:] <= out.weights[..., :-1]).all()
+    assert out.ids.dtype == torch.int32 and out.image.dtype == torch.float32
+    behind = (1 - out.alpha)[..., None] * torch.tensor(BACKGROUND, device=device)
+    assert_close(out.image, out.plain + out.textured + behind, kind="value", name="image")
+
+
+def test_background_may_be_a_tensor(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    out = draw(scene, background=torch.tensor(BACKGROUND, device=device))
+    assert_same(out, draw(scene))
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_a_crop_is_a_camera_with_another_centre(textured: bool, device: torch.device) -> None:
+    """To the last bit: no result may depend on where a pixel lies in its tile or a tile in the image."""
+    scene = random_scene(width=50, height=41, device=device)
+    texture = make_texture(device=device) if textured else None
+    left, top, width, height = 7, 5, 29, 19
+    intrinsics = scene["K"].clone()
+    intrinsics[:2, 2] -= torch.tensor([left, top], device=device)
+    cropped = draw(scene | {"K": intrinsics, "width": width, "height": height}, texture, max_hits=3)
+    full = draw(scene, texture, max_hits=3)
+    for name in (*BUFFERS, "ids"):
+        window = getattr(full, name)[top : top + height, left : left + width]
+        assert torch.equal(getattr(cropped, name), window), name
+
+
+@pytest.mark.parametrize("textured", [False, True])
+@pytest.mark.parametrize("max_hits", [0, 2])
+def test_no_surfels(max_hits: int, textured: bool, device: torch.device) -> None:
+    scene = random_scene(0, device=device)
+    texture = make_texture(device=device) if textured else None
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, texture, camera, max_hits=max_hits, background=BACKGROUND)
+    assert torch.equal(out.image, torch.tensor(BACKGROUND, device=device).expand(18, 23, 3))
+    assert (out.ids == -1).all() and not out.alpha.any() and not out.weights.any() and not out.depths.any()
+    (out.image.sum() + out.alpha.sum() + out.weights.sum()).backward()
+    assert surfels.means.grad is None or surfels.means.grad.shape == (0, 3)
+
+
+def test_one_surfel(device: torch.device) -> None:
+    scene = random_scene(1, device=device)
+    out = draw(scene, max_hits=2)
+    hit = out.ids[..., 0] == 0
+    assert hit.any() and (out.ids[..., 1] == -1).all()
+    assert_close(out.weights[..., 0], out.alpha, kind="value", name="weights")
+
+
+def awkward_scene(device: torch.device, dtype: torch.dtype = torch.float32) -> Scene:
+    """Make surfels behind, at, around and across the camera, edge-on, enormous and tiny, in many pairings."""
+    scene = random_scene(24, seed=2, dtype=dtype)
+    centers = scene["means"] @ scene["viewmat"][:3, :3].T + scene["viewmat"][:3, 3]
+    centers[:4, 2] *= -1  # behind
+    centers[4:8, 2] = torch.tensor([0.0, 0.01, 1e-6, -1e-6], dtype=dtype)  # at the camera plane
+    centers[8] = 0  # at the camera
+    scene |= {"means": centers, "viewmat": torch.eye(4, dtype=dtype)}
+    scene["scales"][0] = 1e4  # centred behind, seen in front
+    scene["scales"][9:13] = 1e4
+    scene["scales"][13:17] = 1e-5
+    scene["scales"][17] = torch.tensor([1e4, 1e-5], dtype=dtype)
+    scene["quats"][18:20] = torch.tensor([0.5, 0.0, 0.5, 0.0], dtype=dtype)  # edge-on
+    scene["means"][18] = torch.tensor([0.0, 0.0, 2.0], dtype=dtype)
+    scene["means"][19] = torch.tensor([0.5, 0.1, 2.0], dtype=dtype)
+    scene["gammas"][20:22] = 60.0
+    scene["gammas"][22] = 1.0
+    scene["opacities"][20:23] = torch.tensor([1.0, 0.0, 1.0], dtype=dtype)
+    return {
+        key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in scene.items()
+    }
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("near", [0.0, 0.01])
+def test_awkward_surfels_stay_finite(near: float, low_pass: bool, device: torch.device) -> None:
+    scene = awkward_scene(device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene, near=near)
+    out = nw.render(surfels, texture, camera, max_hits=4, low_pass=low_pass)
+    for name in BUFFERS:
+        assert_finite(getattr(out, name), name)
+    loss(out).backward()
+    gradients = {"viewmat": camera.viewmat.grad}
+    for module in (surfels, texture):
+        gradients |= {name: parameter.grad for name, parameter in module.named_parameters()}
+    for name, gradient in gradients.items():
+        assert gradient is not None, name
+        assert_finite(gradient, name)
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_awkward_surfels_agree_with_the_reference(low_pass: bool, device: torch.device) -> None:
+    """Surfels that cross the near plane are clipped by it, never dropped.
+
+    The principal point is moved so that no ray lies in the plane of a surfel, where no answer is right.
+    """
+    scene = awkward_scene(device, torch.float64)
+    scene["K"][0, 2] += 0.1
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, None, camera, max_hits=4, low_pass=low_pass)
+    expected = reference_render(twin(surfels), None, camera.to("cpu"), max_hits=4, low_pass=low_pass)
+    assert_same_ids(out.ids, expected.ids, name="ids")
+    assert_alike(out, expected)
+
+
+@pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
+def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
+    """The K heaviest are the first K of the eight heaviest."""
+    scene = layered_scene(device=device)
+    most, out = (draw(scene, max_hits=size) for size in (MAX_HITS, max_hits))
+    assert_same_ids(out.ids, most.ids[..., :max_hits], name="ids")
+    for name in ("weights", "depths"):
+        assert_close(getattr(out, name), getattr(most, name)[..., :max_hits], kind="value", name=name)
+
+
+def test_grid_can_be_written_in_place(device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    first = draw(scene, texture).textured
+    with torch.no_grad():
+        texture.grid.neg_()
+    assert not torch.equal(draw(scene, texture).textured, first)
+    with torch.no_grad():
+        texture.grid.neg_()
+    assert torch.equal(draw(scene, texture).textured, first)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2])
+def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device)
+    texture = make_texture(sh_degree=sh_degree, dtype=torch.float64, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, texture, camera)
+    assert_alike(out, reference_render(twin(surfels), twin(texture), camera.to("cpu")))
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9])
+def test_surfels_of_lower_degree(coefficients: int, device: torch.device) -> None:
+    scene = random_scene(device=device)
+    padded = scene["sh"].clone()
+    padded[:, coefficients:] = 0
+    short = draw(scene | {"sh": scene["sh"][:, :coefficients]})
+    assert_same(short, draw(scene | {"sh": padded}))

@@ -1,0 +1,162 @@
+"""The metrics against scikit-image, hand-computed cases and their stated convention."""
+
+import math
+import sys
+import types
+import warnings
+from collections.abc import Callable
+
+import pytest
+import skimage.metrics
+import torch
+
+from nexwarp import losses, metrics
+
+
+def images(height: int = 48, width: int = 61) -> list[torch.Tensor]:
+    """A smooth picture with an edge, and a noisy version of it; uint8."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    target = torch.stack([x, y, (x + y > 0.9).float()], -1)
+    noisy = (target + 0.1 * torch.randn(target.shape)).clamp(0, 1)
+    return [(picture * 255).round().to(torch.uint8) for picture in (noisy, target)]
+
+
+def test_psnr_is_scikit_images(device: torch.device) -> None:
+    image, target = images()
+    expected = skimage.metrics.peak_signal_noise_ratio(target.numpy(), image.numpy(), data_range=255)
+    assert metrics.psnr(image.to(device), target.to(device)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_map_is_scikit_images_away_from_the_border(device: torch.device) -> None:
+    image, target = images()
+    _, expected = skimage.metrics.structural_similarity(
+        image.double().numpy() / 255,
+        target.double().numpy() / 255,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )
+    actual = metrics.ssim_map(image.to(device), target.to(device)).cpu().double()
+    inside = slice(5, -5)
+    difference = (actual - torch.from_numpy(expected))[inside, inside]
+    assert difference.abs().max() < 2e-4  # moments in float32: 1e-7 over C2 = 9e-4 where the image is flat
+    assert abs(difference.mean().item()) < 1e-6
+    assert metrics.ssim(image, target) == pytest.approx(actual.mean().item(), abs=1e-6)
+
+
+def test_ssim_is_the_one_that_training_minimises(device: torch.device) -> None:
+    image, target = (picture.to(device) for picture in images())
+    loss = losses.dssim(image.double() / 255, target.double() / 255).item()
+    assert metrics.ssim(image, target) == pytest.approx(1 - loss, abs=2e-6)
+
+
+def test_psnr_by_hand() -> None:
+    black, white = torch.zeros(4, 6, 3), torch.ones(4, 6, 3)
+    assert metrics.psnr(black, white) == 0.0
+    assert metrics.psnr(black, black) == math.inf
+    assert metrics.psnr(black, torch.full((4, 6, 3), 51, dtype=torch.uint8)) == pytest.approx(
+        20 * math.log10(5)
+    )
+    one = torch.zeros(4, 6, 3, dtype=torch.uint8)
+    one[1, 2, 0] = 255
+    assert metrics.psnr(one, black) == pytest.approx(10 * math.log10(4 * 6 * 3))
+
+
+def test_ssim_by_hand() -> None:
+    image, target = images()
+    assert metrics.ssim(image, image) == pytest.approx(1.0, abs=1e-6)
+    assert metrics.ssim(image, target) == pytest.approx(metrics.ssim(target, image), abs=1e-6)
+    a, b = 51 / 255, 204 / 255
+    flat = metrics.ssim_map(torch.full((30, 30, 3), a), torch.full((30, 30, 3), b))
+    assert flat[15, 15, 0].item() == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-4)
+
+
+def test_zeros_stand_outside_the_image() -> None:
+    """The padding of the convention: an image in a black frame has the same map inside."""
+    image, target = images(20, 24)
+    framed = [torch.nn.functional.pad(picture, (0, 0, 7, 7, 7, 7)) for picture in (image, target)]
+    inside = metrics.ssim_map(*framed)[7:-7, 7:-7]
+    assert (inside - metrics.ssim_map(image, target)).abs().max() < 2e-5
+
+
+@pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
+def test_metrics_do_not_see_below_8_bits(metric: Callable[..., float]) -> None:
+    image, target = images()
+    exact = image.double() / 255
+    shaken = exact + 0.45 / 255 * (2 * torch.rand(exact.shape).double() - 1)
+    assert metric(shaken, target) == metric(image, target) == metric(exact.float(), target.float() / 255)
+    assert metric(exact * 3 - 1, target) == metric((exact * 3 - 1).clamp(0, 1), target)
+    mirrored = [picture.flip(1) for picture in (image, target)]
+    assert metric(*mirrored) == pytest.approx(metric(image, target), abs=1e-5)
+
+
+def test_to_uint8_rounds_and_clamps() -> None:
+    values = torch.tensor([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 254.6 / 255, 1.0, 7.0])
+    assert metrics.to_uint8(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
+    every = torch.arange(256, dtype=torch.uint8)
+    assert metrics.to_uint8(every.float() / 255).equal(every)
+    assert metrics.to_uint8(every) is every
+    with pytest.raises(ValueError, match="image: expected finite values, got nan at index"):
+        metrics.to_uint8(torch.tensor([0.0, float("nan")]))
+    with pytest.raises(TypeError, match=r"image: expected uint8 or a floating dtype, got torch\.int64"):
+        metrics.to_uint8(torch.zeros(3, dtype=torch.int64))
+
+
+def test_wrong_inputs_name_the_argument() -> None:
+    image = torch.zeros(4, 5, 3)
+    with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(3, 4, 5\)"):
+        metrics.ssim(torch.zeros(3, 4, 5), image)
+    with pytest.raises(ValueError, match=r"target: expected shape \(4, 5, 3\), got \(4, 6, 3\)"):
+        metrics.psnr(image, torch.zeros(4, 6, 3))
+    with pytest.raises(TypeError, match=r"target: expected a torch\.Tensor, got ndarray"):
+        metrics.psnr(image, image.numpy())
+
+
+class FakeLPIPS(torch.nn.Module):
+    """Stands for the package's network: keeps what it was given, answers with the mean difference."""
+
+    def __init__(self, **options: object) -> None:
+        super().__init__()
+        self.options = options
+
+    def forward(self, x: torch.Tensor, y: torch.Tensor, normalize: bool) -> torch.Tensor:
+        assert self.options == {"net": "vgg", "version": "0.1", "verbose": False}
+        assert not self.training and not normalize and x.shape[:2] == (1, 3)
+        return (x - y).mean().view(1, 1, 1, 1)
+
+
+@pytest.fixture
+def fresh_network() -> None:
+    metrics._lpips_network.cache_clear()
+    yield
+    metrics._lpips_network.cache_clear()
+
+
+def test_lpips_gets_images_in_0_1(monkeypatch: pytest.MonkeyPatch, fresh_network: None) -> None:
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=FakeLPIPS))
+    white, black = torch.full((8, 9, 3), 255, dtype=torch.uint8), torch.zeros(8, 9, 3)
+    assert metrics.lpips_vgg(white, black) == 1.0
+
+
+def test_lpips_is_left_out_with_one_warning(monkeypatch: pytest.MonkeyPatch, fresh_network: None) -> None:
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    image = torch.zeros(8, 9, 3)
+    with pytest.warns(RuntimeWarning, match=r"LPIPS is left out.*pip install nexwarp\[lpips\]"):
+        assert metrics.lpips_vgg(image, image) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert metrics.lpips_vgg(image, image) is None
+
+
+def test_lpips_is_left_out_when_the_weights_do_not_come(
+    monkeypatch: pytest.MonkeyPatch, fresh_network: None
+) -> None:
+    def offline(**_: object) -> None:
+        raise OSError("no network")
+
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=offline))
+    with pytest.warns(RuntimeWarning, match="no network"):
+        assert metrics.lpips_vgg(torch.zeros(8, 9, 3), torch.zeros(8, 9, 3)) is None

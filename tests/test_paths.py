@@ -1,0 +1,160 @@
+"""Laws of camera paths."""
+
+import math
+
+import pytest
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.paths import ellipse, focus, look_at
+from tests.tolerances import assert_close
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+INTRINSICS = torch.tensor([[90.0, 0.0, 33.0], [0.0, 95.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def camera(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor = UP) -> Camera:
+    return Camera(look_at(position.double(), target.double(), up), INTRINSICS, 64, 48, near=0.2)
+
+
+def ring(count: int = 24, radii: tuple[float, float] = (3.0, 2.0), height: float = 1.5) -> list[Camera]:
+    """Cameras on a noisy ellipse about (1, -2, 0), looking more or less at (1, -2, 0.3)."""
+    middle = torch.tensor([1.0, -2.0, 0.0], dtype=torch.float64)
+    cameras = []
+    for angle in torch.rand(count, dtype=torch.float64) * 2 * math.pi:
+        offset = torch.stack([radii[0] * angle.cos(), radii[1] * angle.sin(), angle.new_tensor(height)])
+        position = middle + offset + 0.05 * torch.randn(3, dtype=torch.float64)
+        cameras.append(camera(position, middle + 0.3 * UP + 0.05 * torch.randn(3, dtype=torch.float64)))
+    return cameras
+
+
+def positions(cameras: list[Camera]) -> torch.Tensor:
+    return torch.stack([each.position for each in cameras])
+
+
+def similarity(scale: float) -> tuple[torch.Tensor, torch.Tensor, float]:
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    return rotation * torch.linalg.det(rotation), torch.randn(3, dtype=torch.float64), scale
+
+
+def moved(each: Camera, motion: tuple[torch.Tensor, torch.Tensor, float]) -> Camera:
+    """The camera after the world is rotated, scaled, then shifted."""
+    rotation, shift, scale = motion
+    viewmat = each.viewmat.clone()
+    viewmat[:3, :3] = each.viewmat[:3, :3] @ rotation.T
+    viewmat[:3, 3] = scale * each.viewmat[:3, 3] - viewmat[:3, :3] @ shift
+    return Camera(viewmat, each.K, each.width, each.height, each.near)
+
+
+def test_focus_is_where_the_axes_meet() -> None:
+    target = torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
+    cameras = [camera(target + 3 * torch.randn(3), target) for _ in range(5)]
+    assert_close(focus(cameras), target, kind="value", name="focus")
+
+
+def test_focus_of_two_skew_axes_is_half_way() -> None:
+    """Axes along x at z = 0 and along y at z = 1 pass each other at (0, 0, 0) and (0, 0, 1)."""
+    a = camera(torch.tensor([-2.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0]))
+    b = camera(torch.tensor([0.0, -5.0, 1.0]), torch.tensor([0.0, 0.0, 1.0]))
+    assert_close(focus([a, b]), torch.tensor([0.0, 0.0, 0.5]), kind="value", name="focus")
+
+
+def test_every_camera_looks_at_the_focus_upright() -> None:
+    cameras = ring()
+    up = -torch.stack([each.viewmat[1, :3] for each in cameras]).mean(0)
+    for each in ellipse(cameras, 30):
+        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
+        assert depth > 1.0
+        assert (x / depth).item() == pytest.approx(33.0, abs=1e-9)
+        assert (y / depth).item() == pytest.approx(20.0, abs=1e-9)
+        right, down = each.viewmat[0, :3], each.viewmat[1, :3]
+        assert abs(right @ up) < 1e-12 and down @ up < 0
+        rotation = each.viewmat[:3, :3]
+        assert (rotation @ rotation.T - torch.eye(3)).abs().max() < 1e-12
+        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
+
+
+def test_path_is_an_ellipse_through_the_cameras_region() -> None:
+    cameras = ring(count=60)
+    path, given = positions(ellipse(cameras, 200)), positions(cameras)
+    centre = path.mean(0)
+    values = torch.linalg.svdvals(path - centre) / 10.0  # of a * cos over 200 steps: a * 10
+    assert values[2] < 1e-9, "the path leaves its plane"
+    assert values[0].item() == pytest.approx(3.0, rel=0.1)
+    assert values[1].item() == pytest.approx(2.0, rel=0.1)
+    assert (path[:, 2].mean() - given[:, 2].mean()).abs() < 0.02
+    for axis in range(2):
+        low, high = torch.quantile(given[:, axis], torch.tensor([0.05, 0.95]).double())
+        assert path[:, axis].max().item() == pytest.approx(high.item(), abs=0.15)
+        assert path[:, axis].min().item() == pytest.approx(low.item(), abs=0.15)
+
+
+def test_path_is_closed_and_smooth() -> None:
+    """Each step, the one from the last to the first included, is a chord of 3 degrees of the ellipse."""
+    path = positions(ellipse(ring(), 120))
+    steps = (path - path.roll(1, 0)).norm(dim=1)
+    assert steps.max() < 2 * 3.2 * math.sin(math.radians(1.5))
+    assert steps.min() > 2 * 1.7 * math.sin(math.radians(1.5))
+    turns = path - 2 * path.roll(1, 0) + path.roll(2, 0)
+    assert turns.norm(dim=1).max() < 3.2 * math.radians(3) ** 2
+
+
+def test_path_starts_beside_the_first_camera_and_turns_one_way() -> None:
+    for _ in range(10):  # the signs of principal axes are up to chance
+        cameras = ring()
+        path = positions(ellipse(cameras, 90))
+        nearest = (path - cameras[0].position).norm(dim=1).argmin().item()
+        assert min(nearest, 90 - nearest) <= 8
+        spokes = path - path.mean(0)
+        assert (torch.linalg.cross(spokes, spokes.roll(-1, 0))[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
+def test_path_moves_and_scales_with_the_cameras(scale: float) -> None:
+    cameras, motion = ring(), similarity(scale)
+    expected = [moved(each, motion) for each in ellipse(cameras, 17)]
+    actual = ellipse([moved(each, motion) for each in cameras], 17)
+    for mine, theirs in zip(actual, expected, strict=True):
+        assert_close(mine.viewmat, theirs.viewmat, kind="value", name="viewmat")
+
+
+def test_path_takes_the_rest_from_the_first_camera(device: torch.device) -> None:
+    cameras = [each.to(device, torch.float32) for each in ring()]
+    path = ellipse(cameras, 5)
+    assert len(path) == 5
+    for each in path:
+        assert each.viewmat.dtype == torch.float32 and each.device == cameras[0].device
+        assert each.K.equal(cameras[0].K)
+        assert (each.width, each.height, each.near) == (64, 48, 0.2)
+    assert len(ellipse(cameras)) == 120
+
+
+def test_an_upright_wall_of_cameras_gives_an_upright_ellipse() -> None:
+    target = torch.tensor([0.0, 4.0, 0.0])
+    places = [torch.tensor([float(x), 0.0, float(z)]) for x in range(-3, 4) for z in range(-1, 2)]
+    path = ellipse([camera(place, target) for place in places], 40)
+    assert positions(path)[:, 1].abs().max() < 1e-9
+    assert positions(path)[:, 2].max() > 0.5
+
+
+def test_centres_on_a_line_give_a_path_along_it() -> None:
+    target = torch.tensor([0.0, 4.0, 0.0])
+    path = positions(ellipse([camera(torch.tensor([x, 0.0, 1.0]), target) for x in (-2.0, -1.0, 2.0)], 20))
+    assert (path[:, 1:] - torch.tensor([0.0, 1.0])).abs().max() < 1e-9
+    assert path[:, 0].max().item() == pytest.approx(1.7) and path[:, 0].min().item() == pytest.approx(-1.9)
+
+
+def test_degenerate_cameras_are_refused() -> None:
+    origin, ahead = torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])
+    one = camera(origin, ahead)
+    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+        ellipse([])
+    for cameras in ([one], [one, one], [one, camera(origin + 1, ahead + 1)]):
+        with pytest.raises(ValueError, match="cameras: expected two or more with axes that are not parallel"):
+            ellipse(cameras)
+    with pytest.raises(ValueError, match="cameras: expected at least two distinct centres"):
+        ellipse([camera(ahead, 2 * ahead), camera(ahead, ahead + torch.tensor([1.0, 0.0, 0.0]))])
+    with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
+        ellipse(ring(), 0)
+    with pytest.raises(ValueError, match="up: expected a direction across the line"):
+        look_at(UP, 3 * UP, UP)

@@ -1,0 +1,95 @@
+"""Pictures: what is written is what was given, whole or not at all."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nexwarp.metrics import to_uint8
+from nexwarp.pictures import error_map, save_png, side_by_side
+
+
+def read(path: Path) -> torch.Tensor:
+    with Image.open(path) as picture:
+        return torch.from_numpy(np.array(picture))
+
+
+def test_png_returns_what_was_saved(tmp_path: Path, device: torch.device) -> None:
+    image = torch.rand(7, 9, 3, device=device) * 1.4 - 0.2
+    save_png(tmp_path / "new" / "a.png", image.requires_grad_())
+    assert read(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu())
+    save_png(tmp_path / "new" / "a.png", to_uint8(image).flip(0))
+    assert read(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu().flip(0))
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+def test_a_failed_save_leaves_the_old_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, image = tmp_path / "a.png", torch.rand(4, 4, 3)
+    save_png(path, image)
+
+    def full_disk(self: Image.Image, name: Path, **_: object) -> None:
+        Path(name).write_bytes(b"half a pictu")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Image.Image, "save", full_disk)
+    with pytest.raises(OSError, match="no space left"):
+        save_png(path, 1 - image)
+    assert read(path).equal(to_uint8(image))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_error_map_runs_from_violet_to_yellow_at_a_quarter() -> None:
+    target = torch.zeros(1, 6, 3)
+    image = torch.tensor([0.0, 0.05, 0.1, 0.2, 0.25, 1.0]).view(1, 6, 1).expand(1, 6, 3)
+    colours = error_map(image, target)
+    assert colours.dtype == torch.uint8 and colours.shape == (1, 6, 3)
+    assert colours[0, 0].tolist() == [68, 1, 84]  # viridis' ends
+    assert colours[0, 4].tolist() == colours[0, 5].tolist() == [253, 231, 37]
+    light = colours[0, :5].float() @ torch.tensor([0.2126, 0.7152, 0.0722])
+    assert (light.diff() > 0).all(), "a larger error must be lighter"
+
+
+def test_error_map_averages_channels_and_is_symmetric() -> None:
+    image, target = torch.rand(5, 6, 3), torch.rand(5, 6, 3)
+    assert error_map(image, target).equal(error_map(target, image))
+    red, grey = torch.tensor([[[0.6, 0.0, 0.0]]]), torch.full((1, 1, 3), 0.2)
+    assert error_map(red, torch.zeros(1, 1, 3)).equal(error_map(grey, torch.zeros(1, 1, 3)))
+
+
+def test_strip_holds_the_images_and_white_gaps() -> None:
+    a, b = torch.randint(255, (5, 4, 3), dtype=torch.uint8), torch.rand(5, 7, 3)
+    strip = side_by_side([a, b], gap=3)
+    assert strip.shape == (5, 14, 3)
+    assert strip[:, :4].equal(a) and strip[:, 7:].equal(to_uint8(b))
+    assert strip[:, 4:7].eq(255).all()
+    assert side_by_side([a], gap=3).equal(a)
+    assert side_by_side([a, a], gap=0).equal(torch.cat([a, a], 1))
+
+
+def test_captions_stand_above_the_images() -> None:
+    images = [torch.zeros(20, 80, 3), torch.full((20, 60, 3), 0.5)]
+    strip = side_by_side(images, captions=["truth", ""])
+    assert strip.shape == (36, 144, 3)
+    assert strip[16:].equal(side_by_side(images))
+    assert (strip[:16, :80] < 128).any() and strip[:16, 80:].eq(255).all()
+
+
+def test_wrong_inputs_name_the_argument(tmp_path: Path) -> None:
+    image = torch.zeros(4, 5, 3)
+    with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(4, 5\)"):
+        save_png(tmp_path / "a.png", image[..., 0])
+    with pytest.raises(
+        TypeError, match=r"image: expected a uint8 or floating torch\.Tensor, got torch\.int64"
+    ):
+        save_png(tmp_path / "a.png", image.long())
+    with pytest.raises(ValueError, match=r"target: expected shape \(4, 5, 3\), got \(5, 4, 3\)"):
+        error_map(image, image.transpose(0, 1))
+    with pytest.raises(ValueError, match=r"images: expected images of one height, got heights \[4, 2\]"):
+        side_by_side([image, image[:2]])
+    with pytest.raises(ValueError, match="captions: expected 1, one for each image, got 2"):
+        side_by_side([image], captions=["a", "b"])
+    with pytest.raises(ValueError, match="images: expected at least one, got none"):
+        side_by_side([])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,354 @@
+"""The reference is right: hand-computed values, and gradients against finite differences."""
+
+import math
+
+import pytest
+import scipy.special
+import torch
+
+from tests.reference.collect import collect, power
+from tests.reference.hashgrid import encode, hash_corners, map_positive
+from tests.reference.render import Texture, render
+from tests.reference.sh import basis, plain_colors
+from tests.scenes import Scene, intrinsics, random_scene, rigid
+from tests.tolerances import assert_close
+
+FLOATS = ("means", "quats", "scales", "opacities", "gammas")
+HALF = 2**-0.5
+
+
+def tensor(*values: float | tuple[float, ...]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def leaves(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    return tuple(value.detach().clone().requires_grad_() for value in tensors)
+
+
+def pinhole(scene: Scene) -> dict[str, float]:
+    """The intrinsics of `scene` as the reference takes them."""
+    (fx, _, cx), (_, fy, cy), _ = scene["K"].tolist()
+    sizes = {key: scene[key] for key in ("width", "height", "near")}
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy} | sizes
+
+
+def sheets(*surfels: tuple[float, float], scale: tuple[float, float] = (0.2, 0.1)) -> dict[str, torch.Tensor]:
+    """Surfels (z, opacity) that face the camera on its axis, with primary colours in turn."""
+    z, opacities = tensor(*surfels).unbind(-1)
+    count = len(surfels)
+    return {
+        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
+        "quats": tensor((1, 0, 0, 0)).expand(count, -1),
+        "scales": tensor(scale).expand(count, -1),
+        "opacities": opacities,
+        "gammas": tensor((1.0, 1.5)).expand(count, -1),
+        "colors": torch.eye(3, dtype=torch.float64)[torch.arange(count) % 3],
+        "viewmat": torch.eye(4, dtype=torch.float64),
+    }
+
+
+# Five by five pixels; the centre of pixel [2, 2] is the principal point, a pixel is 0.2 wide at depth 2.
+VIEW = {"fx": 10.0, "fy": 10.0, "cx": 2.5, "cy": 2.5, "width": 5, "height": 5, "near": 0.01}
+
+
+def value_of(number: torch.Tensor, expected: float | list[float], name: str) -> None:
+    assert_close(number, torch.tensor(expected, dtype=torch.float64), kind="value", name=name)
+
+
+# Spherical harmonics
+
+
+def test_basis_is_the_real_form_of_scipys() -> None:
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    polar, azimuth = directions[:, 2].acos(), torch.atan2(directions[:, 1], directions[:, 0])
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            values = scipy.special.sph_harm_y(degree, abs(order), polar.numpy(), azimuth.numpy())
+            part = values.imag if order < 0 else values.real
+            columns.append(torch.as_tensor(part) * (math.sqrt(2) if order else 1))
+    assert_close(basis(directions, 3), torch.stack(columns, dim=-1), kind="value", name="basis")
+
+
+def test_lower_degrees_are_prefixes() -> None:
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=-1)
+    for degree in range(3):
+        assert torch.equal(basis(directions, degree), basis(directions, 3)[:, : (degree + 1) ** 2])
+
+
+def test_plain_color_by_hand() -> None:
+    """Seen along +z, degree 1 adds 0.4886 times coefficient 2; negative colours are cut."""
+    sh = torch.zeros(1, 4, 3, dtype=torch.float64)
+    sh[0, 0] = tensor(1.0, 0.0, -9.0)
+    sh[0, 2] = tensor(0.0, 1.0, 0.0)
+    colors = plain_colors(sh, tensor((1.0, 2.0, 7.0)), tensor(1.0, 2.0, 3.0), 3)
+    value_of(colors[0], [0.5 + 0.28209479177387814, 0.5 + 0.4886025119029199, 0.0], "colors")
+    colors = plain_colors(sh, tensor((1.0, 2.0, 7.0)), tensor(1.0, 2.0, 3.0), 0)
+    value_of(colors[0], [0.5 + 0.28209479177387814, 0.5, 0.0], "colors at degree 0")
+
+
+# The collection pass
+
+
+def test_one_surfel_by_hand() -> None:
+    hits = collect(**sheets((2.0, 0.8)), **VIEW, max_hits=1)
+    value_of(hits.alpha[2, 2], 0.8, "centre: u = v = 0")
+    value_of(hits.alpha[2, 3], 0.8 * math.exp(-0.5), "one pixel right: u = 1, gamma 1")
+    value_of(hits.alpha[2, 4], 0.8 * math.exp(-2.0), "two pixels right: u = 2")
+    value_of(hits.alpha[3, 2], 0.8 * math.exp(-4.0), "one pixel down: v = 2, gamma 1.5, so |v|^3 / 2 = 4")
+    value_of(hits.alpha[0, 2], 0.0, "two pixels up: v = 4, below the cut-off")
+    value_of(hits.depths[2, 2, 0], 2.0, "depth")
+    assert hits.ids[2, 3].tolist() == [0] and hits.ids[0, 2].tolist() == [-1]
+    assert not hits.weights[0, 2].any() and not hits.depths[0, 2].any() and not hits.plain.any()
+
+
+def test_cut_off_and_cap() -> None:
+    kept, cut = 1.001 / 255, 0.999 / 255
+    value_of(collect(**sheets((2.0, kept)), **VIEW, max_hits=0).alpha[2, 2], kept, "just above 1/255")
+    value_of(collect(**sheets((2.0, cut)), **VIEW, max_hits=0).alpha[2, 2], 0.0, "just below 1/255")
+    value_of(collect(**sheets((2.0, 1.0)), **VIEW, max_hits=0).alpha[2, 2], 0.99, "capped")
+
+
+def test_two_layers_by_hand() -> None:
+    """In front of (back, first in the list) alpha 0.8 stands alpha 0.5."""
+    scene = sheets((3.0, 0.8), (2.0, 0.5))
+    for max_hits in (0, 1, 2, 4):
+        hits = collect(**scene, **VIEW, max_hits=max_hits)
+        red, green = (0.4 if max_hits < 2 else 0.0), (0.5 if max_hits < 1 else 0.0)
+        value_of(hits.plain[2, 2], [red, green, 0.0], f"plain, K = {max_hits}")
+        value_of(hits.alpha[2, 2], 0.9, f"alpha, K = {max_hits}")
+        value_of(hits.weights[2, 2], [0.5, 0.4, 0.0, 0.0][:max_hits], f"weights, K = {max_hits}")
+        value_of(hits.depths[2, 2], [2.0, 3.0, 0.0, 0.0][:max_hits], f"depths, K = {max_hits}")
+        assert hits.ids[2, 2].tolist() == [1, 0, -1, -1][:max_hits]
+
+
+def test_the_buffer_is_heaviest_first() -> None:
+    hits = collect(**sheets((2.0, 0.1), (3.0, 0.8), (4.0, 0.9)), **VIEW, max_hits=2)
+    assert hits.ids[2, 2].tolist() == [1, 2]
+    value_of(hits.weights[2, 2], [0.9 * 0.8, 0.9 * 0.2 * 0.9], "weights")
+    value_of(hits.plain[2, 2], [0.1, 0.0, 0.0], "plain")
+
+
+def test_nearer_wins_a_tie_of_weights() -> None:
+    """0.8 x 0.25 is 0.2 to the last bit."""
+    hits = collect(**sheets((3.0, 0.25), (2.0, 0.2)), **VIEW, max_hits=1)
+    assert hits.ids[2, 2].tolist() == [1]
+    assert collect(**sheets((3.0, 0.25), (2.0, 0.2)), **VIEW, max_hits=2).ids[2, 2].tolist() == [1, 0]
+
+
+def test_lower_index_goes_first_at_equal_depth() -> None:
+    hits = collect(**sheets((2.0, 0.5), (2.0, 0.6)), **VIEW, max_hits=2)
+    value_of(hits.weights[2, 2], [0.5, 0.3], "weights")
+    close = sheets((2.0 + 1e-12, 0.5), (2.0, 0.6))
+    value_of(collect(**close, **VIEW, max_hits=2).weights[2, 2], [0.5, 0.3], "equal once rounded to float32")
+
+
+def test_the_walk_stops_behind_the_hit_that_makes_the_pixel_opaque() -> None:
+    """0.02, 4e-4, 8e-6: the third hit is blended, the fourth is not."""
+    hits = collect(**sheets(*((z, 0.98) for z in (2.0, 3.0, 4.0, 5.0))), **VIEW, max_hits=8)
+    assert hits.ids[2, 2].tolist() == [0, 1, 2, -1, -1, -1, -1, -1]
+    value_of(hits.weights[2, 2, :4], [0.98, 0.0196, 0.000392, 0.0], "weights")
+    value_of(1 - hits.alpha[2, 2], 8e-6, "transmittance")
+
+
+def test_near_tests_the_depth_of_the_hit() -> None:
+    """Tilted by 45 degrees about y and centred behind the camera, the first surfel is met at depth 3.
+
+    It still goes first: centres sort by signed depth.
+    """
+    scene = sheets((-1.0, 0.5), (2.0, 0.5), scale=(1e3, 1e3))
+    scene["means"] = tensor((4.0, 0.0, -1.0), (0.0, 0.0, 2.0))
+    scene["quats"] = tensor((math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0), (1.0, 0.0, 0.0, 0.0))
+    hits = collect(**scene, **VIEW, max_hits=2)
+    assert hits.ids[2, 2].tolist() == [0, 1]
+    value_of(hits.depths[2, 2], [3.0, 2.0], "depths")
+    assert collect(**scene, **(VIEW | {"near": 2.0}), max_hits=2).ids[2, 2].tolist() == [0, -1]
+    assert collect(**scene, **(VIEW | {"near": 3.001}), max_hits=2).ids[2, 2].tolist() == [-1, -1]
+
+
+def test_low_pass_by_hand() -> None:
+    """A speck spreads like exp(-r^2) over the pixels, at its centre's depth; a large surfel stays as is."""
+    speck = sheets((2.0, 0.8), scale=(1e-4, 1e-4))
+    hits = collect(**speck, **VIEW, max_hits=1, low_pass=True)
+    value_of(hits.alpha[2, 3], 0.8 * math.exp(-1.0), "r = 1")
+    value_of(hits.alpha[1, 1], 0.8 * math.exp(-2.0), "r^2 = 2")
+    value_of(hits.depths[1, 1, 0], 2.0, "depth")
+    value_of(collect(**speck, **VIEW, max_hits=1).alpha[2, 3], 0.0, "without")
+    value_of(
+        collect(**speck, **(VIEW | {"near": 2.0}), max_hits=1, low_pass=True).alpha[2, 2], 0.0, "before near"
+    )
+    large = sheets((2.0, 0.8), scale=(3.0, 3.0))
+    plain, filtered = (collect(**large, **VIEW, max_hits=1, low_pass=flag).alpha for flag in (False, True))
+    assert_close(filtered[2, 3], plain[2, 3], kind="value", name="large")
+
+
+def test_low_pass_sees_a_surfel_edge_on() -> None:
+    scene = sheets((2.0, 0.8), scale=(0.5, 0.5))
+    scene["quats"] = tensor((HALF, 0.0, HALF, 0.0))
+    hits = collect(**scene, **VIEW, max_hits=1, low_pass=True)
+    value_of(hits.alpha[2, 3], 0.8 * math.exp(-1.0), "r = 1, off the plane")
+    value_of(hits.depths[2, 2, 0], 2.0, "depth")
+
+
+def test_power_at_zero() -> None:
+    u = tensor(0.0, 1e-30, 1e30).requires_grad_()
+    values = power(u, tensor(1.5, 1.5, 1.5))
+    (gradient,) = torch.autograd.grad(values.sum(), u)
+    assert values[:2].max() < 1e-25 and values[2] > 1e20 and gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("max_hits", [0, 2])
+def test_gradients_of_collect(max_hits: int, low_pass: bool) -> None:
+    scene = random_scene(6, seed=7, width=4, height=3, off_centre=True, dtype=torch.float64)
+    if low_pass:
+        scene["scales"][::2] *= 0.01
+    colors = torch.rand(6, 3, dtype=torch.float64)
+    inputs = leaves(*(scene[key] for key in FLOATS), colors, scene["viewmat"])
+
+    def blend(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        hits = collect(*tensors, **pinhole(scene), max_hits=max_hits, low_pass=low_pass)
+        return hits.plain, hits.depths, hits.weights, hits.alpha
+
+    assert blend(*inputs)[3].max() > 0.3
+    assert torch.autograd.gradcheck(blend, inputs)
+
+
+# The hash grid
+
+
+def test_map_positive() -> None:
+    mapped = map_positive(torch.arange(-3, 4))
+    assert mapped.tolist() == [6, 4, 2, 0, 1, 3, 5]
+
+
+def test_hash_by_hand() -> None:
+    """(3, -2, 0) maps to (5, 4, 0); 4 x 2654435761 = 2027808452 modulo 2^32; xor 5 is 2027808449."""
+    corners = torch.tensor([[3, -2, 0], [0, 0, 0], [-1, 1, 7], [123456, -654321, 2**30]])
+    expected = [2027808449, 0]
+    expected.append(2 ^ 2654435761 ^ (13 * 805459861 % 2**32))
+    expected.append(246911 ^ (1308642 * 2654435761 % 2**32) ^ ((2**31 - 1) * 805459861 % 2**32))
+    assert hash_corners(corners, 2**32).tolist() == expected
+    assert hash_corners(corners, 2**4).tolist() == [value % 16 for value in expected]
+
+
+def test_encode_at_a_corner_and_between() -> None:
+    """At a corner the entry, between two corners their mean; times 1 - exp(-1 / 2 pi) where f = s t."""
+    grid = torch.randn(2, 16, 3, dtype=torch.float64)
+    resolutions = tensor(2.0, 4.0)
+    positions = tensor((1.5, -1.0, 0.0), (1.75, -1.0, 0.0))
+    features = encode(positions, tensor(5.0, 5.0), grid, resolutions, focal=10.0)
+    entries = hash_corners(torch.tensor([[3, -2, 0], [4, -2, 0], [6, -4, 0], [7, -4, 0]]), 16).tolist()
+    factors = 1 - math.exp(-1 / (2 * math.pi)), 1 - math.exp(-0.25 / (2 * math.pi))
+    expected = torch.stack([
+        torch.cat([factors[0] * grid[0, entries[0]], factors[1] * grid[1, entries[2]]]),
+        torch.cat([
+            factors[0] * (grid[0, entries[0]] + grid[0, entries[1]]) / 2,
+            factors[1] * grid[1, entries[3]],
+        ]),
+    ])  # fmt: skip
+    assert_close(features, expected, kind="value", name="features")
+
+
+def test_gradients_of_encode() -> None:
+    inputs = leaves(
+        torch.randn(5, 3, dtype=torch.float64),
+        1 + torch.rand(5, dtype=torch.float64),
+        torch.randn(3, 16, 2, dtype=torch.float64),
+    )
+    resolutions = tensor(1.0, 1.7, 3.0)
+    assert torch.autograd.gradcheck(lambda *tensors: encode(*tensors, resolutions, focal=4.0), inputs)
+
+
+def test_gradients_of_plain_colors() -> None:
+    inputs = leaves(
+        0.2 * torch.randn(3, 16, 3, dtype=torch.float64),
+        torch.randn(3, 3, dtype=torch.float64),
+        tensor(3.0, -4.0, 5.0),
+    )
+    assert torch.autograd.gradcheck(lambda *tensors: plain_colors(*tensors, degree=3), inputs)
+
+
+# The whole
+
+
+def make_field(sh_degree: int = 3) -> Texture:
+    count = 3 * (sh_degree + 1) ** 2
+    mlp = [0.6 * torch.randn(shape, dtype=torch.float64) for shape in ((6, 4), (5, 6), (count, 5))]
+    return Texture(torch.randn(2, 8, 2, dtype=torch.float64), tensor(1.0, 2.5), mlp)
+
+
+def test_a_field_of_zeros_is_grey() -> None:
+    scene = random_scene(6, dtype=torch.float64)
+    field = make_field()
+    field.mlp[-1].zero_()
+    arguments = [scene[key] for key in (*FLOATS, "sh")]
+    out = render(*arguments, field, scene["viewmat"], **pinhole(scene), background=(0.1, 0.2, 0.3))
+    grey = 0.5 * out.weights.sum(-1, keepdim=True).expand(-1, -1, 3)
+    assert_close(out.textured, grey, kind="value", name="textured")
+    behind = (1 - out.alpha)[..., None] * tensor(0.1, 0.2, 0.3)
+    assert_close(out.image, out.plain + grey + behind, kind="value", name="image")
+
+
+def test_the_field_is_asked_where_the_pixel_sees_the_surfel() -> None:
+    """One level whose features are linear in x shows the position: one cell holds the whole surfel."""
+    scene = sheets((2.0, 0.8), scale=(0.3, 0.3))
+    scene["viewmat"] = rigid((1.0, 0.0, 0.0, 0.0), (-0.5, -0.5, -1.0))
+    scene["means"] = scene["means"] + tensor(0.5, 0.5, 1.0)
+    corners = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    grid = torch.zeros(1, 2**12, 3, dtype=torch.float64)
+    entries = hash_corners(corners, 2**12)
+    assert len(set(entries.tolist())) == 8
+    grid[0, entries] = corners.double()
+    mlp = [torch.eye(3, dtype=torch.float64)]
+    sh = torch.zeros(1, 1, 3, dtype=torch.float64)
+    surfel = [scene[key] for key in FLOATS]
+    # Resolution 0.25 puts x in [0, 4) into one cell, where the features are x / 4.
+    texture = Texture(grid, tensor(0.25), mlp)
+    out = render(*surfel, sh, texture, scene["viewmat"], **VIEW, max_hits=1)
+    factor = 1 - math.exp(-((10 / (0.25 * 2.0)) ** 2) / (2 * math.pi))
+    # Pixel [3, 2] sees the surfel 0.2 below the axis, at (0.5, 0.7, 3) in the world.
+    coefficients = factor * tensor(0.5, 0.7, 3.0) / 4
+    expected = (0.5 + 0.28209479177387814 * coefficients) * out.weights[3, 2, 0]
+    assert_close(out.textured[3, 2], expected, kind="value", name="textured")
+
+
+def test_no_texture_makes_no_difference_of_max_hits() -> None:
+    scene = random_scene(8, dtype=torch.float64)
+    arguments = [scene[key] for key in (*FLOATS, "sh")]
+    images = [
+        render(*arguments, None, scene["viewmat"], **pinhole(scene), max_hits=max_hits).image
+        for max_hits in (0, 1, 2, 8)
+    ]
+    for image in images[1:]:
+        assert_close(image, images[0], kind="value", name="image")
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("textured", [False, True])
+@pytest.mark.parametrize("sh_degree", [1, 3])
+def test_gradients_of_the_whole_render(sh_degree: int, textured: bool, low_pass: bool) -> None:
+    scene = random_scene(3, seed=5, width=4, height=3, sh_degree=sh_degree, dtype=torch.float64)
+    scene["K"] = intrinsics(5.0, 6.0, 1.7, 1.4)
+    scene["sh"] = 0.3 * scene["sh"]
+    field = make_field(sh_degree)
+    inputs = leaves(*(scene[key] for key in (*FLOATS, "sh", "viewmat")), field.grid, *field.mlp)
+
+    def picture(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        *surfels, viewmat, grid = tensors[:8]
+        texture = Texture(grid, field.resolutions, tensors[8:]) if textured else None
+        out = render(
+            *surfels, texture, viewmat, **pinhole(scene), background=(0.2, 0.4, 0.6), low_pass=low_pass
+        )  # fmt: skip
+        return out.image, out.plain, out.textured, out.depths, out.weights, out.alpha
+
+    assert picture(*inputs)[5].max() > 0.3
+    assert torch.autograd.gradcheck(picture, inputs, fast_mode=True)
+
+
+def test_no_surfels() -> None:
+    scene = random_scene(0, dtype=torch.float64)
+    arguments = [scene[key] for key in (*FLOATS, "sh")]
+    out = render(*arguments, make_field(), scene["viewmat"], **pinhole(scene), background=(0.1, 0.2, 0.3))
+    assert_close(out.image, tensor(0.1, 0.2, 0.3).expand(18, 23, 3), kind="value", name="image")
+    assert (out.ids == -1).all() and not out.alpha.any()
