@@ -1,10 +1,23 @@
 """nexwarp: Nexels, neurally-textured surfels for real-time novel view synthesis, in NVIDIA Warp and PyTorch."""
 
 from nexwarp.camera import Camera
+from nexwarp.checkpoint import Model, load
+from nexwarp.data import Scene, View, load_scene
 from nexwarp.render import Rendering, render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "NeuralTexture", "Rendering", "Surfels", "render"]
+__all__ = [
+    "Camera",
+    "Model",
+    "NeuralTexture",
+    "Rendering",
+    "Scene",
+    "Surfels",
+    "View",
+    "load",
+    "load_scene",
+    "render",
+]

@@ -100,8 +100,12 @@ def _check_rigid(viewmat: torch.Tensor) -> None:
             f"viewmat: expected an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g}), got {error:.3g}"
         )
     if torch.linalg.det(rotation) < 0:
-        raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
-    if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
+        raise ValueError(
+            "viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)"
+        )
+    if (
+        viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)
+    ).abs().max() > ROTATION_TOLERANCE:
         raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
 
 

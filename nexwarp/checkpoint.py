@@ -44,7 +44,8 @@ class Model:
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments that the model was trained with, for `nexwarp.render`."""
         return {
-            name: self.meta[name] for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
+            name: self.meta[name]
+            for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
         }
 
 
@@ -82,18 +83,22 @@ def load(path: str | os.PathLike[str]) -> Model:
     try:
         with safe_open(path, "pt") as file:
             header = (file.metadata() or {}).get("nexwarp")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
     if header is None:
         raise ValueError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     meta = json.loads(header)
     if meta.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
+        raise ValueError(
+            f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}"
+        )
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
         texture = NeuralTexture(**meta.pop("texture"))
-        texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
+        texture.load_state_dict(
+            {name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")}
+        )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: the tensors do not make a model ({error})") from None
     return Model(surfels, texture, meta)
@@ -107,7 +112,9 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
     for leftover in (aside, old):
         shutil.rmtree(leftover, ignore_errors=True)
     aside.mkdir()
-    save_file({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors")
+    save_file(
+        {name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors"
+    )
     write_atomically(aside / "state.json", json.dumps(state).encode())
     if folder.exists():
         folder.rename(old)

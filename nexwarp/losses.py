@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from nexwarp.checks import check_range, check_tensors
+from nexwarp.ops.checks import check_range, check_tensors
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from nexwarp.checks import check_finite
+from nexwarp.ops.checks import check_finite
 
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.checks import check_range
+from nexwarp.ops.checks import check_range
 
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
 

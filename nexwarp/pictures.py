@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.checks import check_range
+from nexwarp.ops.checks import check_range
 
 ERROR_SCALE = 0.25
 CAPTION_HEIGHT = 16

@@ -130,7 +130,12 @@ class Config:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Config":
         """Rebuild a config from `as_dict`; ValueError names an unknown or missing key."""
-        parts = {"losses": LossWeights, "rates": LearningRates, "texture": TextureConfig, "densify": DensifyConfig}
+        parts = {
+            "losses": LossWeights,
+            "rates": LearningRates,
+            "texture": TextureConfig,
+            "densify": DensifyConfig,
+        }
         try:
             data = {k: parts[k](**_tuples(v)) if k in parts else v for k, v in data.items()}
             return cls(**_tuples(data))
@@ -199,7 +204,9 @@ class Trainer:
         _seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
-        self.texture = NeuralTexture(**texture_shape(scene, config), sh_degree=config.sh_degree).to(self.device)
+        self.texture = NeuralTexture(**texture_shape(scene, config), sh_degree=config.sh_degree).to(
+            self.device
+        )
         self.optimizer = _make_optimizer(self.surfels, self.texture, config, scene.scale)
         self.densifier = Densifier(_densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration = 0
@@ -289,7 +296,9 @@ class Trainer:
         try:
             self._restore(tensors, state)
         except (KeyError, TypeError, RuntimeError) as error:
-            raise ValueError(f"{run}: expected a checkpoint of this run, but it does not fit ({error})") from None
+            raise ValueError(
+                f"{run}: expected a checkpoint of this run, but it does not fit ({error})"
+            ) from None
 
     def _restore(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
         raw = {k[8:]: v for k, v in tensors.items() if k.startswith("surfels.")}
@@ -423,7 +432,9 @@ def _pixel_resolution(scene: Scene) -> float:
     return float(np.quantile(density.numpy(), 0.95))
 
 
-def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:
+def _make_optimizer(
+    surfels: Surfels, texture: NeuralTexture, config: Config, scale: float
+) -> torch.optim.Adam:
     rates = config.rates
     ends: dict[str, tuple[float, float]] = {
         "means": (rates.means[0] * scale, rates.means[1] * scale),
@@ -434,7 +445,9 @@ def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, sc
         "sh0": (rates.sh0,) * 2,
         "shN": (rates.shN,) * 2,
     }
-    groups = [{"params": [getattr(surfels, name)], "ends": ends[name], "lr": ends[name][0]} for name in PARAMETERS]
+    groups = [
+        {"params": [getattr(surfels, name)], "ends": ends[name], "lr": ends[name][0]} for name in PARAMETERS
+    ]
     if config.max_hits:
         groups.append({"params": [texture.grid], "ends": rates.grid, "lr": rates.grid[0]})
         groups.append({"params": list(texture.mlp.parameters()), "ends": rates.mlp, "lr": rates.mlp[0]})

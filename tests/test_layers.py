@@ -15,6 +15,7 @@ LAYERS = [
     {"render", "losses", "metrics", "paths", "pictures"},
     {"densify", "checkpoint", "evaluate"},
     {"trainer"},
+    {"runs", "console"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -207,92 +207,61 @@ def test_every_kind_of_photo_becomes_rgb(tmp_path, mode):
     assert np.array_equal(read_image(tmp_path / "photo.png").numpy(), np.repeat(grey[:, :, None], 3, axis=2))
 
 
-def edit(path: Path, name: str, change) -> Path:
-    """Apply `change` to the bytes of a file of the scene, and return the scene."""
-    file = path / name
-    file.write_bytes(change(file.read_bytes()))
-    return path
+def damaged(name: str, change=lambda data: data[: len(data) // 2], **options):
+    """Maker of a scene in which the bytes of a file are changed, by default cut in half."""
+
+    def make(path: Path) -> Path:
+        file = make_scene(path, **options) / name
+        file.write_bytes(change(file.read_bytes()))
+        return path
+
+    return make
 
 
-def remove(path: Path, name: str) -> Path:
-    (path / name).unlink()
-    return path
+def lacking(name: str):
+    """Maker of a scene without one of its files."""
+    return lambda path: (make_scene(path) / name).unlink() or path
 
 
-def nan_points() -> np.ndarray:
-    points = np.zeros((5, 3))
-    points[2, 1] = np.nan
-    return points
+def built(**options):
+    """Maker of a scene with other options."""
+    return lambda path: make_scene(path, **options)
 
 
+DISTORTED = (40.0, 40.0, 24.0, 18.0, 0.1, 0.0, 0.0, 0.0)
+NOT_A_NUMBER = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]])
+UNDECODABLE = "03.png: expected a complete image file, could not decode it"
 BAD_SCENES = {
     "no folder": (lambda path: path / "absent", "no such folder, expected a COLMAP scene"),
     "no model": (lambda path: path, "no COLMAP model found, expected cameras, images and points3D"),
     "half a model": (
-        lambda path: remove(make_scene(path), "sparse/0/points3D.bin"),
-        r"incomplete COLMAP model in .*0: points3D.bin not found",
+        lacking("sparse/0/points3D.bin"),
+        "incomplete COLMAP model in .*0: points3D.bin not found",
     ),
-    "no images in the model": (lambda path: make_scene(path, names=[]), "has no registered images"),
-    "one image": (lambda path: make_scene(path, names=["a.png"]), "at least 2 registered images .* got 1"),
-    "no points": (
-        lambda path: make_scene(path, points=np.zeros((0, 3))),
-        "no 3D points, expected at least one",
+    "no images in the model": (built(names=[]), "has no registered images"),
+    "one image": (built(names=["a.png"]), "at least 2 registered images .* got 1"),
+    "no points": (built(points=np.zeros((0, 3))), "no 3D points, expected at least one"),
+    "points of NaN": (built(points=NOT_A_NUMBER), r"finite 3D points, got \(0.0, nan, 0.0\)"),
+    "distorted": (built(model="OPENCV", params=DISTORTED), "model OPENCV of .*colmap image_undistorter"),
+    "escaping name": (built(names=["../x.png", "a.png"]), "image name '../x.png' leaves the images folder"),
+    "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
+    "absent photo": (lacking("images/03.png"), "03.png: image not found, but the COLMAP model names it"),
+    "truncated photo": (damaged("images/03.png"), UNDECODABLE),
+    "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
+    "photos of another shape": (built(size=(36, 48)), "00.png: expected an image of 48x36 .* got 36x48"),
+    "short cameras": (
+        damaged("sparse/0/cameras.bin", lambda data: data[:-3]),
+        r"truncated, expected \d+ bytes",
     ),
-    "points of NaN": (
-        lambda path: make_scene(path, points=nan_points()),
-        r"finite 3D points, got \(0.0, nan, 0.0\)",
-    ),
-    "distorted camera": (
-        lambda path: make_scene(path, model="OPENCV", params=(40, 40, 24, 18, 0.1, 0, 0, 0)),
-        "camera model OPENCV of .*colmap image_undistorter",
-    ),
-    "escaping name": (
-        lambda path: make_scene(path, names=["../x.png", "a.png"]),
-        r"image name '../x.png' leaves the images folder",
-    ),
-    "absent photo": (
-        lambda path: remove(make_scene(path), "images/03.png"),
-        r"03.png: image not found, but the COLMAP model names it",
-    ),
-    "truncated photo": (
-        lambda path: edit(make_scene(path), "images/03.png", lambda data: data[: len(data) // 2]),
-        r"03.png: expected a complete image file, could not decode it",
-    ),
-    "no photo at all": (
-        lambda path: edit(make_scene(path), "images/03.png", lambda data: b"<html>not found</html>"),
-        r"03.png: expected a complete image file, could not decode it",
-    ),
-    "photos of another shape": (
-        lambda path: make_scene(path, size=(HEIGHT, WIDTH)),
-        r"00.png: expected an image of 48x36 pixels, or that shape at another size, got 36x48",
-    ),
-    "truncated cameras": (
-        lambda path: edit(make_scene(path), "sparse/0/cameras.bin", lambda data: data[:-3]),
-        r"cameras.bin: truncated, expected \d+ bytes, got \d+",
-    ),
-    "truncated images": (
-        lambda path: edit(make_scene(path), "sparse/0/images.bin", lambda data: data[: len(data) // 2]),
-        "images.bin: truncated or damaged",
-    ),
-    "truncated frames": (
-        lambda path: edit(make_scene(path), "sparse/0/frames.bin", lambda data: data[: len(data) // 2]),
-        "frames.bin: truncated or damaged",
-    ),
-    "empty cameras": (
-        lambda path: edit(make_scene(path), "sparse/0/cameras.bin", lambda data: b""),
-        "cameras.bin: truncated or damaged",
-    ),
-    "truncated points": (
-        lambda path: edit(make_scene(path), "sparse/0/points3D.bin", lambda data: data[: len(data) // 2]),
-        "points3D.bin: truncated or damaged",
-    ),
-    "garbage text": (
-        lambda path: edit(make_scene(path, text=True), "sparse/0/images.txt", lambda data: b"what\n"),
-        "not a readable COLMAP model",
-    ),
+    "empty cameras": (damaged("sparse/0/cameras.bin", lambda data: b""), "cameras.bin: truncated or damaged"),
+    "truncated images": (damaged("sparse/0/images.bin"), "images.bin: truncated or damaged"),
+    "truncated frames": (damaged("sparse/0/frames.bin"), "frames.bin: truncated or damaged"),
+    # pycolmap would allocate for a count from nowhere: 95 seconds, and all the memory there is.
+    "truncated points": (damaged("sparse/0/points3D.bin"), "points3D.bin: truncated or damaged"),
+    "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),
     "focal length of zero": (
-        lambda path: make_scene(path, params=(0.0, 43.0, 25.5, 16.25)),
-        "00.png: the COLMAP camera of this image is not usable: K: expected focal lengths > 0",
+        built(params=(0.0, 43.0, 25.5, 16.25)),
+        "00.png: .* K: expected focal lengths > 0",
     ),
 }
 

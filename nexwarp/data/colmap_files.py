@@ -1,7 +1,8 @@
 """Whether a binary COLMAP model is complete.
 
 pycolmap reads on past the end of a truncated file: counts become whatever memory holds, and it allocates for
-them until memory is gone (minutes, for a cut-off points3D.bin). So the lengths in the files are followed first.
+them until memory is gone (minutes, for a cut-off points3D.bin). So the lengths in
+the files are followed first.
 """
 
 import struct

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nexwarp.checks import check_range
 from nexwarp.data.colmap import pycolmap_module
 from nexwarp.data.demo_points import Rig, SparsePoint, sparse_points
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.raytrace import render
+from nexwarp.ops.checks import check_range
 
 VERSION = 1  # of the content: raise it when anything changes in what `write_demo` writes
 WIDTH, HEIGHT, VIEWS, POINTS = 192, 144, 40, 4000
@@ -102,9 +102,9 @@ def _move(scene: Path, folder: Path) -> None:
         folder.rmdir()  # Windows renames onto nothing, not even an empty folder
     try:
         scene.rename(folder)
-    except OSError as error:
+    except OSError:
         _check_free(folder)  # a race is lost: say it in the same words
-        raise error
+        raise
 
 
 def demo_cameras(width: int, height: int, views: int) -> Rig:

@@ -65,9 +65,8 @@ def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:
         return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
     pixels = image[: height * factor, : width * factor].numpy()
-    rows = pixels[::factor].astype(
-        np.int64
-    )  # adding up slices is far faster than a sum over two strided axes
+    # Adding up slices is far faster than a sum over two strided axes.
+    rows = pixels[::factor].astype(np.int64)
     for offset in range(1, factor):
         rows += pixels[offset::factor]
     total = rows[:, ::factor].copy()

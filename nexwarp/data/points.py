@@ -47,8 +47,8 @@ def initial_points(
         count: how many are wanted; fewer come when fewer are available.
         track_lengths: (P,) integer, photos that a point was triangulated from.
         errors: (P,) float, mean reprojection errors in pixels; negative when unknown.
-        filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust sigmas,
-            as far as `track_lengths` and `errors` are given; never more than half of the points.
+        filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust
+            sigmas, as far as `track_lengths` and `errors` are given; never more than half of the points.
 
     Returns:
         min(count, available) points.

@@ -1,9 +1,9 @@
 """An exact ray tracer for textured rectangles, in numpy: the ground truth of the demo scene.
 
-Symbols: a rectangle is origin + a u + b v with 0 <= a, b <= 1, a ray is start + t d. With M = (u | v | origin -
-start), M (a, b, 1) = t d, so one solve gives (a, b, 1) / t = M^-1 d, linear in d. Rectangles are seen only from
-the side that their normal v x u points to, where the texture is not mirrored; walls of a room and faces of boxes
-need no other.
+Symbols: a rectangle is origin + a u + b v with 0 <= a, b <= 1, a ray is start + t d. With the columns
+M = (u, v, origin - start), M (a, b, 1) = t d, so one solve gives (a, b, 1) / t = M^-1 d, linear in d.
+Rectangles are seen only from the side that their normal v x u points to, where the texture is not mirrored;
+walls of a room and faces of boxes need no other.
 """
 
 from collections.abc import Sequence

@@ -83,10 +83,7 @@ def load_scene(path: str | os.PathLike, images: str = "images", downscale: int =
             not finite.
     """
     path = Path(path)
-    if isinstance(downscale, bool) or not isinstance(downscale, int):
-        raise TypeError(f"downscale: expected an int, got {type(downscale).__name__}")
-    if downscale < 1:
-        raise ValueError(f"downscale: expected at least 1, got {downscale}")
+    _check_downscale(downscale)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, expected a COLMAP scene")
     model = read_model(path)
@@ -113,6 +110,13 @@ def load_scene(path: str | os.PathLike, images: str = "images", downscale: int =
         scale=scale,
         path=path,
     )
+
+
+def _check_downscale(downscale: int) -> None:
+    if isinstance(downscale, bool) or not isinstance(downscale, int):
+        raise TypeError(f"downscale: expected an int, got {type(downscale).__name__}")
+    if downscale < 1:
+        raise ValueError(f"downscale: expected at least 1, got {downscale}")
 
 
 def _images_folder(path: Path, images: str) -> Path:

@@ -4,7 +4,12 @@ from collections.abc import Iterator
 
 import warp as wp
 
-from nexwarp.kernels.collect import collect_backward_kernel, collect_kernel, reduce_rows_kernel, splat_error_kernel
+from nexwarp.kernels.collect import (
+    collect_backward_kernel,
+    collect_kernel,
+    reduce_rows_kernel,
+    splat_error_kernel,
+)
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.project import project_kernel
@@ -15,7 +20,10 @@ from nexwarp.kernels.unproject import unproject_kernel
 
 
 def all_kernels(
-    real: type = wp.float32, storage: type = wp.float16, tile_size: int = 16, max_hits: range = range(MAX_HITS + 1)
+    real: type = wp.float32,
+    storage: type = wp.float16,
+    tile_size: int = 16,
+    max_hits: range = range(MAX_HITS + 1),
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and a range of K."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))

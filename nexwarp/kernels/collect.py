@@ -71,7 +71,12 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     pixels = tile_size * tile_size
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+        module_options={"fast_math": real is wp.float32},
+    )
     def collect(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
@@ -173,7 +178,12 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
     sum3, sum4 = lane_sum(vec3), lane_sum(vec4)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+        module_options={"fast_math": real is wp.float32},
+    )
     def collect_backward(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
@@ -304,7 +314,12 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     sum1 = lane_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options={"fast_math": real is wp.float32})
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+        module_options={"fast_math": real is wp.float32},
+    )
     def splat_error(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),

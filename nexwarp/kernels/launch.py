@@ -75,7 +75,12 @@ def launch(
     def part(bounds: tuple[int, int]) -> None:
         first, last = bounds
         wp.launch(
-            kernel, (last - first, *shape[1:]), inputs=[first, *inputs], outputs=list(outputs), stream=stream, **extra
+            kernel,
+            (last - first, *shape[1:]),
+            inputs=[first, *inputs],
+            outputs=list(outputs),
+            stream=stream,
+            **extra,
         )
 
     if not device.is_cpu:

@@ -24,7 +24,10 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Any:
     """View a contiguous tensor as a Warp array argument of the given element type; None stays None."""
     if tensor is None:
         return None
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    view = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    # The view is a bare pointer: it must keep alive what may be a temporary, like grad.contiguous().
+    view.tensor = tensor
+    return view
 
 
 @functools.cache

@@ -7,7 +7,6 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.ops.pinhole import Pinhole
 from nexwarp.kernels.collect import (
     BLOCK_DIM,
     collect_backward_kernel,
@@ -17,6 +16,8 @@ from nexwarp.kernels.collect import (
 )
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops.checks import check_tensors
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 from nexwarp.ops.tiles import Tiles
 
@@ -60,7 +61,13 @@ def collect(
 
 
 def splat_error(
-    projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, errors: torch.Tensor, *, low_pass: bool = False
+    projection: Projection,
+    tiles: Tiles,
+    hits: Hits,
+    camera: Pinhole,
+    errors: torch.Tensor,
+    *,
+    low_pass: bool = False,
 ) -> torch.Tensor:
     """Give each surfel the sum over pixels of its blending weight times the pixel's error.
 
@@ -72,12 +79,14 @@ def splat_error(
     Returns:
         (N,) blended errors. Not differentiable.
     """
+    check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
     records = projection.records.detach()
     real = real_of(records)
     rows, slots = _rows(tiles, records)
     sums = records.new_zeros(slots)
     inputs = _inputs(records, projection.centers.detach(), tiles, camera, rows)
-    inputs += [array(hits.stops, wp.int32), array(errors.detach().to(records.dtype).contiguous(), real)]
+    errors = errors.detach().to(records.dtype).contiguous()
+    inputs += [array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
     launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], block_dim=BLOCK_DIM)
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
@@ -88,7 +97,11 @@ def _threads(tiles: Tiles) -> int:
 
 
 def _inputs(
-    records: torch.Tensor, centers: torch.Tensor, tiles: Tiles, camera: Pinhole, rows: torch.Tensor | None = None
+    records: torch.Tensor,
+    centers: torch.Tensor,
+    tiles: Tiles,
+    camera: Pinhole,
+    rows: torch.Tensor | None = None,
 ) -> list[Any]:
     t = types(real_of(records))
     lists = [tiles.surfel_ids] + ([] if rows is None else [rows]) + [tiles.tile_offsets]

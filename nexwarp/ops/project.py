@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.ops.checks import check_tensors
 from nexwarp.kernels.project import project_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops.checks import check_tensors
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,21 @@ class _Project(torch.autograd.Function):
         records = means.new_empty(len(means), 4, 4)
         centers = torch.empty_like(means)
         outputs = [array(records, t.vec4), array(centers, t.vec3)]
-        launch(means, project_kernel(real), len(means), [*_arrays(real, (*inputs[:6], inputs[6][None])), 0], outputs)
+        launch(
+            means,
+            project_kernel(real),
+            len(means),
+            [*_arrays(real, (*inputs[:6], inputs[6][None])), 0],
+            outputs,
+        )
         ctx.save_for_backward(*inputs)
         return records, centers
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(
+        ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         means, viewmat = inputs[0], inputs[6]
         real, count = real_of(means), len(means)

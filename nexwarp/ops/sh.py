@@ -5,10 +5,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.ops.checks import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops.checks import check_tensors
 
 
 def plain_colors(sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int) -> torch.Tensor:
@@ -30,7 +30,9 @@ def plain_colors(sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, 
 
 class _PlainColors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int) -> torch.Tensor:
+    def forward(
+        ctx: Any, sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
+    ) -> torch.Tensor:
         real = real_of(means)
         vec3 = types(real).vec3
         colors = torch.empty_like(means)
@@ -47,7 +49,11 @@ class _PlainColors(torch.autograd.Function):
         need_sh, need_means, step, _ = ctx.needs_input_grad
         real, count = real_of(means), len(means)
         vec3 = types(real).vec3
-        grads = [grad_like(sh, need_sh), grad_like(means, need_means), means.new_zeros(count, 3) if step else None]
+        grads = [
+            grad_like(sh, need_sh),
+            grad_like(means, need_means),
+            means.new_zeros(count, 3) if step else None,
+        ]
         positions = position.expand(count, 3) if step else position[None]
         launch(
             means,

@@ -73,7 +73,11 @@ class _Texture(torch.autograd.Function):
         encoded = torch.empty(grid.shape[0] * grid.shape[2], len(positions), dtype=dtype, device=grid.device)
         kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
         launch(
-            positions, kernels.forward, (grid.shape[0], len(positions)), arguments, [array(encoded, STORAGES[dtype])]
+            positions,
+            kernels.forward,
+            (grid.shape[0], len(positions)),
+            arguments,
+            [array(encoded, STORAGES[dtype])],
         )
         layers = [encoded]
         for matrix in matrices[:-1]:
@@ -88,7 +92,13 @@ class _Texture(torch.autograd.Function):
             return coefficients.to(grid.dtype)
         colors = torch.empty_like(positions)
         kernels, arguments = _colors(coefficients, directions, len(positions), clamp)
-        launch(positions, kernels.forward, len(positions), arguments, [array(colors, types(real_of(positions)).vec3)])
+        launch(
+            positions,
+            kernels.forward,
+            len(positions),
+            arguments,
+            [array(colors, types(real_of(positions)).vec3)],
+        )
         return colors
 
     @staticmethod
@@ -134,7 +144,7 @@ def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
 
 
 def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
-    """signal @ layer.T, summed and returned in at least float32."""
+    """Signal @ layer.T, summed and returned in at least float32."""
     if signal.dtype == torch.float16:
         return torch.mm(signal, layer.T, out_dtype=torch.float32)
     return signal @ layer.T

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 import warp as wp
 
-from nexwarp.ops.pinhole import Pinhole
 from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch, real_of, stream_of
+from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
@@ -124,5 +124,3 @@ def _scan(counts: torch.Tensor) -> int:
     with wp.ScopedStream(stream_of(counts)):
         wp.utils.array_scan(ends, ends, inclusive=True)
     return int(counts[-1])
-
-

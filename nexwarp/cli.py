@@ -1,0 +1,308 @@
+"""Command line: `nexwarp train`, `eval`, `render`, `info`."""
+
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from rich.console import Console
+
+import nexwarp
+from nexwarp import console as display
+from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
+from nexwarp.data import Scene
+from nexwarp.evaluate import evaluate
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.metrics import to_uint8
+from nexwarp.paths import ellipse
+from nexwarp.pictures import save_png
+from nexwarp.runs import (
+    CAMERAS_FILE,
+    DEMO,
+    METRICS_FILE,
+    SceneSource,
+    create_run,
+    pick_device,
+    prepare_run,
+    read_run,
+)
+from nexwarp.trainer import Config, TextureConfig, Trainer, preset
+
+# The demo is small enough for two CPU cores.
+DEMO_SETTINGS: dict[str, Any] = {
+    "iterations": 1200,
+    "max_surfels": 2000,
+    "texture": TextureConfig(levels=8, table_size=2**15, width=32),
+}
+CHECKPOINTS = 10
+
+Scene_ = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+Run_ = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+@dataclass
+class Train:
+    """Train a scene, evaluate it on its test views, and keep everything in a run folder."""
+
+    scene: Scene_
+    """COLMAP folder (images/ and sparse/0/), or `demo` for the built-in scene."""
+    run: Path | None = None
+    """Folder to write to; runs/SCENE by default."""
+    max_surfels: int | None = None
+    """Budget P of surfels, never exceeded (400,000; demo 2,000)."""
+    iterations: int | None = None
+    """Training steps; schedules stretch with them (30,000; demo 1,200)."""
+    downscale: int = 1
+    """Reduce photos by this factor, by area."""
+    images: str = "images"
+    """Folder of the photos below SCENE, such as images_4."""
+    max_hits: int | None = None
+    """K, hits a pixel textures, 0 to 8 (2); 0 trains without a texture."""
+    preset: str = "default"
+    """`default`, or `paper` to reproduce the publication."""
+    seed: int | None = None
+    """Of every random choice (0)."""
+    device: str | None = None
+    """`cuda` or `cpu`; CUDA where present by default."""
+    resume: bool = False
+    """Continue the run in --run."""
+    overwrite: bool = False
+    """Replace the run in --run."""
+
+    def __call__(self, console: Console) -> None:
+        """Train."""
+        source = SceneSource(self.scene, self.images, self.downscale)
+        run = self.run or Path("runs") / source.name
+        prepare_run(run, resume=self.resume, overwrite=self.overwrite)
+        device = pick_device(self.device)
+        config = self._config(run)
+        if self.downscale < 1:
+            raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
+        console.print(f"nexwarp {nexwarp.__version__}: {source.name} on {name}, preset {config.preset}")
+        scene = source.load()
+        size = scene.train[0].camera
+        console.print(
+            f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
+            f"{len(scene.points):,} points"
+        )
+        trainer = Trainer(scene, config, device)
+        if self.resume:
+            trainer.restore(run)
+            console.print(f"resumed at iteration {trainer.iteration:,}")
+        else:
+            create_run(run, source, config, device.type)
+        _train(trainer, run, console)
+        _finish(trainer, scene, run, device, console)
+
+    def _config(self, run: Path) -> Config:
+        """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
+        given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
+        given = {name: value for name, value in (given | {"seed": self.seed}).items() if value is not None}
+        if self.max_hits is not None and not 0 <= self.max_hits <= MAX_HITS:
+            raise ValueError(f"--max-hits: expected 0 to {MAX_HITS}, got {self.max_hits}")
+        if self.resume:
+            config = read_run(run)[1]
+            for name, value in given.items():
+                if getattr(config, name) != value:
+                    flag = f"--{name.replace('_', '-')}"
+                    raise ValueError(
+                        f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}"
+                    )
+            return config
+        base = preset(self.preset)
+        if self.scene == DEMO:
+            base = dataclasses.replace(base, **DEMO_SETTINGS)
+        return dataclasses.replace(base, **given)
+
+
+@dataclass
+class Eval:
+    """Evaluate a run on the test views of its scene."""
+
+    run: Run_
+    """Run folder."""
+    scene: str | None = None
+    """Where the scene is now, if it moved."""
+    device: str | None = None
+    """`cuda` or `cpu`; CUDA where present by default."""
+
+    def __call__(self, console: Console) -> None:
+        """Evaluate."""
+        device = pick_device(self.device)
+        source, _, _ = read_run(self.run)
+        model = load(self.run).to(device)
+        if self.scene is not None:
+            source = dataclasses.replace(source, path=self.scene)
+        scene = source.load()
+        metrics = _evaluate(model, scene, self.run, console)
+        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
+
+
+@dataclass
+class Render:
+    """Render a run without its photos: the test views and an ellipse around the scene, as PNG files in its renders/."""
+
+    run: Run_
+    """Run folder."""
+    frames: int = 120
+    """Views on the ellipse; 0 for none."""
+    device: str | None = None
+    """`cuda` or `cpu`; CUDA where present by default."""
+
+    @torch.no_grad()
+    def __call__(self, console: Console) -> None:
+        """Render."""
+        if self.frames < 0:
+            raise ValueError(f"--frames: expected at least 0, got {self.frames}")
+        device = pick_device(self.device)
+        model = load(self.run).to(device)
+        cameras = load_cameras(self.run / CAMERAS_FILE)
+        renders = self.run / "renders"
+        jobs = {
+            renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras["test"].items()
+        }
+        if self.frames:
+            path = ellipse(list(cameras["train"].values()), self.frames)
+            jobs |= {renders / "ellipse" / f"{i:04d}.png": camera for i, camera in enumerate(path)}
+        with display.counting(console, "rendering", len(jobs)) as done:
+            for file, camera in jobs.items():
+                out = nexwarp.render(model.surfels, model.texture, camera.to(device), **model.render_options)
+                save_png(file, to_uint8(out.image).cpu())
+                done()
+        console.print(f"{len(jobs)} pictures in {renders}")
+
+
+@dataclass
+class Info:
+    """Tell what a run holds."""
+
+    run: Run_
+    """Run folder."""
+
+    def __call__(self, console: Console) -> None:
+        """Print a table."""
+        source, config, _ = read_run(self.run)
+        rows = {"scene": source.path, "preset": config.preset, "iterations": f"{config.iterations:,}"}
+        if (self.run / MODEL_FILE).is_file():
+            model = load(self.run)
+            texture = model.texture.config
+            rows |= {
+                "surfels": f"{len(model.surfels):,} (budget {config.max_surfels:,})",
+                "K": str(model.meta["max_hits"]),
+                "texture": f"{texture['levels']} levels of {texture['table_size']:,}, "
+                f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
+                "model file": f"{(self.run / MODEL_FILE).stat().st_size / 1e6:.1f} MB",
+            }
+        else:
+            rows["model"] = "none yet: the training has not finished"
+        if (self.run / METRICS_FILE).is_file():
+            metrics = json.loads((self.run / METRICS_FILE).read_text())
+            rows |= {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        console.print(display.results_table(rows, str(self.run)))
+
+
+def _train(trainer: Trainer, run: Path, console: Console) -> None:
+    """Run the loop with its display; keep checkpoints on the way and when interrupted."""
+    every = max(trainer.config.iterations // CHECKPOINTS, 1)
+    with display.TrainingDisplay(
+        console, trainer.config.iterations, trainer.iteration, trainer.device
+    ) as shown:
+
+        def observe(step: Any) -> None:
+            shown(step)
+            if step.iteration % every == 0 or step.iteration == trainer.config.iterations:
+                trainer.save(run)
+
+        try:
+            trainer.run(observe)
+        except KeyboardInterrupt:
+            trainer.save(run)
+            raise
+
+
+def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
+    """Write the model, then evaluate what was written."""
+    file = save_model(run, trainer.model())
+    sets = {"train": scene.train, "test": scene.test}
+    save_cameras(
+        run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()}
+    )
+    model = load(run).to(device)
+    rate = trainer.iteration / max(trainer.seconds, 1e-9)
+    facts = {
+        "preset": trainer.config.preset,
+        "iterations": trainer.iteration,
+        "surfels": len(model.surfels),
+        "megabytes": file.stat().st_size / 1e6,
+        "seconds": trainer.seconds,
+        "iterations_per_second": rate,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+    }
+    rows = {}
+    if scene.test:
+        metrics = _evaluate(model, scene, run, console, facts)
+        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+    rows |= {
+        "surfels": f"{facts['surfels']:,}",
+        "model file": f"{facts['megabytes']:.1f} MB",
+        "training": f"{facts['seconds']:.0f} s, {rate:.1f} it/s",
+        "run": str(run),
+    }
+    console.print(display.results_table(rows, f"{len(scene.test)} test views"))
+    if scene.test:
+        first = Path(scene.test[0].name).with_suffix("")
+        console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
+
+
+def _evaluate(
+    model: Model, scene: Scene, run: Path, console: Console, facts: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Evaluate a model on its test views and write metrics.json, keeping the facts that an older one holds."""
+    if not scene.test:
+        raise ValueError(f"{scene.path}: expected test views, found none")
+    with display.counting(console, "evaluating", len(scene.test)) as done:
+        results = evaluate(
+            model.surfels,
+            model.texture,
+            scene.test,
+            options=model.render_options,
+            renders=run / "renders",
+            progress=done,
+        )
+    file = run / METRICS_FILE
+    if facts is None:
+        facts = json.loads(file.read_text()) if file.is_file() else {}
+    metrics = {**facts, **results}
+    write_json(file, metrics)
+    return metrics
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; bad input gives one line on stderr and exit code 2."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    commands = {"train": Train, "eval": Eval, "render": Render, "info": Info}
+    command = tyro.extras.subcommand_cli_from_dict(
+        commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments
+    )
+    console = Console()
+    try:
+        command(console)
+    except (ValueError, OSError) as error:
+        Console(stderr=True, soft_wrap=True, highlight=False).print(f"nexwarp: error: {error}", markup=False)
+        return 2
+    except KeyboardInterrupt:
+        Console(stderr=True).print("nexwarp: interrupted; continue with --resume")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""Run folders: what a training leaves behind, and how it is found again.
+
+A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `renders/` and `checkpoint/`.
+"""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nexwarp.checkpoint import write_json
+from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.trainer import Config
+
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.json"
+CAMERAS_FILE = "cameras.json"
+DEMO = "demo"
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Where a run's photos come from."""
+
+    path: str
+    """A COLMAP folder, or "demo"."""
+    images: str = "images"
+    """Folder of the photos below it."""
+    downscale: int = 1
+    """Factor by which photos are reduced, by area."""
+
+    @property
+    def name(self) -> str:
+        """Name of the scene, for folders and tables."""
+        return DEMO if self.path == DEMO else Path(self.path).resolve().name
+
+    def load(self) -> Scene:
+        """Load the scene; the demo is made on first use."""
+        folder = demo_folder() if self.path == DEMO else self.path
+        return load_scene(folder, images=self.images, downscale=self.downscale)
+
+
+def prepare_run(run: Path, *, resume: bool, overwrite: bool) -> None:
+    """Refuse a run folder that must not be touched; change nothing.
+
+    Raises:
+        ValueError: the folder exists and neither flag is given, or both are, or it is no run.
+        FileNotFoundError: there is nothing to resume.
+    """
+    if resume and overwrite:
+        raise ValueError("--resume, --overwrite: expected at most one of them, got both")
+    exists = run.exists() and (not run.is_dir() or any(run.iterdir()))
+    if resume:
+        if not (run / CONFIG_FILE).is_file():
+            raise FileNotFoundError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
+    elif exists and not overwrite:
+        raise ValueError(
+            f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
+        )
+    elif exists and not (run / CONFIG_FILE).is_file():
+        raise ValueError(
+            f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it"
+        )
+
+
+def create_run(run: Path, source: SceneSource, config: Config, device: str) -> None:
+    """Make an empty run folder (in place of an old one, see `prepare_run`) with its config."""
+    if run.exists():
+        shutil.rmtree(run)
+    run.mkdir(parents=True)
+    path = source.path if source.path == DEMO else str(Path(source.path).resolve())
+    scene = {"path": path, "images": source.images, "downscale": source.downscale}
+    write_json(run / CONFIG_FILE, {"scene": scene, "device": device, "config": config.as_dict()})
+
+
+def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
+    """Read a run's config.
+
+    Returns:
+        The scene's source, the settings, and everything in the file.
+    """
+    path = run / CONFIG_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
+    try:
+        data = json.loads(path.read_text())
+        return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None
+
+
+def pick_device(name: str | None) -> torch.device:
+    """Return the device asked for, or CUDA where there is one, else the CPU."""
+    if name is None:
+        return (
+            torch.device("cuda", torch.cuda.current_device())
+            if torch.cuda.is_available()
+            else torch.device("cpu")
+        )
+    if name not in ("cuda", "cpu"):
+        raise ValueError(f"--device: expected cuda or cpu, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device: cuda was asked for, but torch finds no CUDA device; use --device cpu")
+    return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
