@@ -73,9 +73,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """Return this camera with `viewmat` and `K` moved like `torch.Tensor.to` does."""
-        return Camera(
-            self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near
-        )
+        return Camera(self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near)
 
 
 def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
@@ -100,12 +98,8 @@ def _check_rigid(viewmat: torch.Tensor) -> None:
             f"viewmat: expected an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g}), got {error:.3g}"
         )
     if torch.linalg.det(rotation) < 0:
-        raise ValueError(
-            "viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)"
-        )
-    if (
-        viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)
-    ).abs().max() > ROTATION_TOLERANCE:
+        raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
+    if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
         raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
 
 

@@ -43,10 +43,7 @@ class Model:
     @property
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments that the model was trained with, for `nexwarp.render`."""
-        return {
-            name: self.meta[name]
-            for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
-        }
+        return {name: self.meta[name] for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")}
 
 
 def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
@@ -90,15 +87,11 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise ValueError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     meta = json.loads(header)
     if meta.get("format_version") != FORMAT_VERSION:
-        raise ValueError(
-            f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}"
-        )
+        raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
         texture = NeuralTexture(**meta.pop("texture"))
-        texture.load_state_dict(
-            {name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")}
-        )
+        texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: the tensors do not make a model ({error})") from None
     return Model(surfels, texture, meta)
@@ -112,9 +105,7 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
     for leftover in (aside, old):
         shutil.rmtree(leftover, ignore_errors=True)
     aside.mkdir()
-    save_file(
-        {name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors"
-    )
+    save_file({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors")
     write_atomically(aside / "state.json", json.dumps(state).encode())
     if folder.exists():
         folder.rename(old)
@@ -166,9 +157,7 @@ def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
         data = json.loads(path.read_text())
         return {
             group: {
-                name: Camera(
-                    torch.tensor(c["viewmat"]), torch.tensor(c["K"]), c["width"], c["height"], near=c["near"]
-                )
+                name: Camera(torch.tensor(c["viewmat"]), torch.tensor(c["K"]), c["width"], c["height"], near=c["near"])
                 for name, c in members.items()
             }
             for group, members in data.items()

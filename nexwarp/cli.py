@@ -11,7 +11,6 @@ import torch
 import tyro
 from rich.console import Console
 
-import nexwarp
 from nexwarp import console as display
 from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
 from nexwarp.data import Scene
@@ -20,6 +19,7 @@ from nexwarp.kernels.types import MAX_HITS
 from nexwarp.metrics import to_uint8
 from nexwarp.paths import ellipse
 from nexwarp.pictures import save_png
+from nexwarp.render import render
 from nexwarp.runs import (
     CAMERAS_FILE,
     DEMO,
@@ -83,7 +83,7 @@ class Train:
         if self.downscale < 1:
             raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
         name = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
-        console.print(f"nexwarp {nexwarp.__version__}: {source.name} on {name}, preset {config.preset}")
+        console.print(f"{source.name} on {name}, preset {config.preset}")
         scene = source.load()
         size = scene.train[0].camera
         console.print(
@@ -110,9 +110,7 @@ class Train:
             for name, value in given.items():
                 if getattr(config, name) != value:
                     flag = f"--{name.replace('_', '-')}"
-                    raise ValueError(
-                        f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}"
-                    )
+                    raise ValueError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
             return config
         base = preset(self.preset)
         if self.scene == DEMO:
@@ -164,15 +162,13 @@ class Render:
         model = load(self.run).to(device)
         cameras = load_cameras(self.run / CAMERAS_FILE)
         renders = self.run / "renders"
-        jobs = {
-            renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras["test"].items()
-        }
+        jobs = {renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras["test"].items()}
         if self.frames:
             path = ellipse(list(cameras["train"].values()), self.frames)
             jobs |= {renders / "ellipse" / f"{i:04d}.png": camera for i, camera in enumerate(path)}
         with display.counting(console, "rendering", len(jobs)) as done:
             for file, camera in jobs.items():
-                out = nexwarp.render(model.surfels, model.texture, camera.to(device), **model.render_options)
+                out = render(model.surfels, model.texture, camera.to(device), **model.render_options)
                 save_png(file, to_uint8(out.image).cpu())
                 done()
         console.print(f"{len(jobs)} pictures in {renders}")
@@ -210,9 +206,7 @@ class Info:
 def _train(trainer: Trainer, run: Path, console: Console) -> None:
     """Run the loop with its display; keep checkpoints on the way and when interrupted."""
     every = max(trainer.config.iterations // CHECKPOINTS, 1)
-    with display.TrainingDisplay(
-        console, trainer.config.iterations, trainer.iteration, trainer.device
-    ) as shown:
+    with display.TrainingDisplay(console, trainer.config.iterations, trainer.iteration, trainer.device) as shown:
 
         def observe(step: Any) -> None:
             shown(step)
@@ -230,9 +224,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
     """Write the model, then evaluate what was written."""
     file = save_model(run, trainer.model())
     sets = {"train": scene.train, "test": scene.test}
-    save_cameras(
-        run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()}
-    )
+    save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
     model = load(run).to(device)
     rate = trainer.iteration / max(trainer.seconds, 1e-9)
     facts = {

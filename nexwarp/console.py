@@ -59,9 +59,7 @@ class TrainingDisplay:
             return
         self.shown = now
         rate = (step.iteration - self.done) / max(now - self.start, 1e-9)
-        text = (
-            f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
-        )
+        text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
         text += f"  {memory(self.device)}"
         self.progress.update(self.task, completed=step.iteration, text=text)
         if not self.console.is_terminal:

@@ -63,9 +63,7 @@ class Densifier:
         """Add the blended errors (N,) of one view."""
         self.errors += errors
 
-    def step(
-        self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator
-    ) -> tuple[int, int]:
+    def step(self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> tuple[int, int]:
         """Split, then prune, in place; children start with zero Adam moments.
 
         Args:

@@ -115,9 +115,7 @@ def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Te
         target: (H, W, 3).
     """
     image = ("H", "W", 3)
-    check_tensors(
-        {"textured": (textured, image), "weights": (weights, ("H", "W", "K")), "target": (target, image)}
-    )
+    check_tensors({"textured": (textured, image), "weights": (weights, ("H", "W", "K")), "target": (target, image)})
     return F.l1_loss(textured / (weights.sum(-1, keepdim=True) + WEIGHT_EPSILON), target)
 
 

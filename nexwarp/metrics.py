@@ -77,9 +77,7 @@ def _lpips_network(device: torch.device) -> Any:
             warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
             return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
     except (ImportError, OSError, RuntimeError) as error:
-        warnings.warn(
-            f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3
-        )
+        warnings.warn(f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3)
         return None
 
 

@@ -29,9 +29,7 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     viewmats, centres = _poses(cameras)
     target, up = focus(cameras), -viewmats[:, 1, :3].mean(0)
     if (centres - centres.mean(0)).norm(dim=1).max() <= DEGENERATE * (centres - target).norm(dim=1).max():
-        raise ValueError(
-            f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place"
-        )
+        raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
     centre, axes, semi = _fit_ellipse(viewmats, centres)
     x, y = ((axes @ (centres[0] - centre)) / semi.clamp(min=DEGENERATE * semi.max().item())).tolist()
     angles = math.atan2(y, x) + torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
@@ -65,9 +63,7 @@ def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> t
     forward = target - position
     right = torch.linalg.cross(forward, up)
     if right.norm() <= DEGENERATE * forward.norm() or forward.norm() == 0:
-        raise ValueError(
-            "up: expected a direction across the line from position to target, got none or one along it"
-        )
+        raise ValueError("up: expected a direction across the line from position to target, got none or one along it")
     forward, right = forward / forward.norm(), right / right.norm()
     viewmat = torch.eye(4, dtype=position.dtype, device=position.device)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -83,9 +79,7 @@ def _poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
     return viewmats, -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
 
 
-def _fit_ellipse(
-    viewmats: torch.Tensor, centres: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Centre (3,), unit axes (2, 3) and semi-axes (2,) of the ellipse, counter-clockwise from above."""
     mean = centres.mean(0)
     axes = torch.linalg.svd(centres - mean)[2][:2]

@@ -42,9 +42,7 @@ def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return _viridis()[(error / ERROR_SCALE * 255.0).round().clamp(max=255.0).long()]
 
 
-def side_by_side(
-    images: Sequence[torch.Tensor], gap: int = 4, captions: Sequence[str] | None = None
-) -> torch.Tensor:
+def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequence[str] | None = None) -> torch.Tensor:
     """Join (H, W_i, 3) images of one height, uint8 or float in [0, 1], into one uint8 strip with white gaps.
 
     Args:
@@ -60,15 +58,12 @@ def side_by_side(
         raise ValueError("images: expected at least one, got none")
     panels = [_to_uint8(f"images[{i}]", image) for i, image in enumerate(images)]
     if len({len(panel) for panel in panels}) > 1:
-        raise ValueError(
-            f"images: expected images of one height, got heights {[len(panel) for panel in panels]}"
-        )
+        raise ValueError(f"images: expected images of one height, got heights {[len(panel) for panel in panels]}")
     if captions is not None:
         if len(captions) != len(panels):
             raise ValueError(f"captions: expected {len(panels)}, one for each image, got {len(captions)}")
         panels = [
-            torch.cat([_caption(text, panel.shape[1]), panel])
-            for text, panel in zip(captions, panels, strict=True)
+            torch.cat([_caption(text, panel.shape[1]), panel]) for text, panel in zip(captions, panels, strict=True)
         ]
     white = torch.full((len(panels[0]), gap, 3), 255, dtype=torch.uint8)
     return torch.cat([part for panel in panels for part in (white, panel)][1:], dim=1)
@@ -101,8 +96,4 @@ def _to_uint8(name: str, image: torch.Tensor) -> torch.Tensor:
     if image.ndim != 3 or image.shape[-1] != 3:
         raise ValueError(f"{name}: expected shape (H, W, 3), got {tuple(image.shape)}")
     image = image.detach().cpu()
-    return (
-        image
-        if image.dtype == torch.uint8
-        else (image.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    )
+    return image if image.dtype == torch.uint8 else (image.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)

@@ -83,17 +83,13 @@ def render(
     """
     background = _check(surfels, texture, camera, max_hits, background, sh_degree)
     shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
-    pinhole = ops.Pinhole(
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near
-    )
+    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     if texture is None:
-        texels = (
-            colors[hits.ids.clamp_min(0).long()] if len(surfels) else colors.new_zeros(*hits.ids.shape, 3)
-        )
+        texels = colors[hits.ids.clamp_min(0).long()] if len(surfels) else colors.new_zeros(*hits.ids.shape, 3)
     else:
         positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
         texels = texture.colors(
@@ -127,9 +123,7 @@ def _check(
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
     if not isinstance(background, torch.Tensor):
         if not isinstance(background, Sequence) or isinstance(background, str):
-            raise TypeError(
-                f"background: expected three numbers or a tensor, got {type(background).__name__}"
-            )
+            raise TypeError(f"background: expected three numbers or a tensor, got {type(background).__name__}")
         if len(background) != 3:
             raise ValueError(f"background: expected 3 values, got {len(background)}")
         background = torch.stack([means.new_full((), float(x)) for x in background])

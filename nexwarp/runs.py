@@ -61,9 +61,7 @@ def prepare_run(run: Path, *, resume: bool, overwrite: bool) -> None:
             f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
         )
     elif exists and not (run / CONFIG_FILE).is_file():
-        raise ValueError(
-            f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it"
-        )
+        raise ValueError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it")
 
 
 def create_run(run: Path, source: SceneSource, config: Config, device: str) -> None:
@@ -95,11 +93,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
 def pick_device(name: str | None) -> torch.device:
     """Return the device asked for, or CUDA where there is one, else the CPU."""
     if name is None:
-        return (
-            torch.device("cuda", torch.cuda.current_device())
-            if torch.cuda.is_available()
-            else torch.device("cpu")
-        )
+        return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
     if name not in ("cuda", "cpu"):
         raise ValueError(f"--device: expected cuda or cpu, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():

@@ -86,12 +86,7 @@ class Surfels(nn.Module):
             "sh0": sh[:, :1],
             "shN": sh[:, 1:],
         }
-        return cls(
-            {
-                name: tensor.detach().clone(memory_format=torch.contiguous_format)
-                for name, tensor in raw.items()
-            }
-        )
+        return cls({name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in raw.items()})
 
     def __len__(self) -> int:
         return self.means.shape[0]

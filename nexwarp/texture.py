@@ -95,9 +95,7 @@ class NeuralTexture(nn.Module):
         """Device of the parameters."""
         return self.grid.device
 
-    def forward(
-        self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor
-    ) -> torch.Tensor:
+    def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
         """Return the field's spherical harmonics coefficients.
 
         Args:

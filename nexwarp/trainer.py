@@ -102,6 +102,8 @@ class Config:
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
     """Drop uncertain points of the cloud before sampling."""
+    orient_points: bool = True
+    """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
     seed: int = 0
     """Of every random choice."""
     losses: LossWeights = field(default_factory=LossWeights)
@@ -153,6 +155,7 @@ PRESETS: dict[str, Config] = {
         preset="paper",
         clamp_image=True,
         filter_points=False,
+        orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
         texture=TextureConfig(min_resolution=16.0, max_resolution=256.0),
         densify=DensifyConfig(prune_at_cap=False),
@@ -204,9 +207,7 @@ class Trainer:
         _seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
-        self.texture = NeuralTexture(**texture_shape(scene, config), sh_degree=config.sh_degree).to(
-            self.device
-        )
+        self.texture = NeuralTexture(**texture_shape(scene, config), sh_degree=config.sh_degree).to(self.device)
         self.optimizer = _make_optimizer(self.surfels, self.texture, config, scene.scale)
         self.densifier = Densifier(_densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration = 0
@@ -296,9 +297,7 @@ class Trainer:
         try:
             self._restore(tensors, state)
         except (KeyError, TypeError, RuntimeError) as error:
-            raise ValueError(
-                f"{run}: expected a checkpoint of this run, but it does not fit ({error})"
-            ) from None
+            raise ValueError(f"{run}: expected a checkpoint of this run, but it does not fit ({error})") from None
 
     def _restore(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
         raw = {k[8:]: v for k, v in tensors.items() if k.startswith("surfels.")}
@@ -388,9 +387,10 @@ def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) ->
         filter_outliers=config.filter_points,
     )
     count = len(points.means)
+    quats = torch.randn(count, 4, generator=generator)
     raw = {
         "means": points.means,
-        "raw_quats": torch.randn(count, 4, generator=generator),
+        "raw_quats": quats_towards(points.normals, quats) if config.orient_points else quats,
         "log_scales": points.scales.log()[:, None].repeat(1, 2),
         "logit_opacities": torch.logit(torch.full((count,), INITIAL_OPACITY)),
         "raw_gammas": torch.full((count, 2), INITIAL_RAW_GAMMA),
@@ -398,6 +398,33 @@ def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) ->
         "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     return Surfels(raw)
+
+
+def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
+    """Turn rotations by the least angle so that their z axes lie along normals.
+
+    Args:
+        normals: (N, 3) unit.
+        quats: (N, 4) wxyz, any length but zero.
+
+    Returns:
+        (N, 4) unit, wxyz.
+    """
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+    normals = torch.where((axis * normals).sum(-1, keepdim=True) < 0, -normals, normals)
+    # Half-way quaternion from axis to normal; their angle is at most 90 degrees, so it is never 0.
+    turn = torch.cat([1 + (axis * normals).sum(-1, keepdim=True), torch.linalg.cross(axis, normals)], dim=-1)
+    a, b, c, d = torch.nn.functional.normalize(turn, dim=-1).unbind(-1)
+    return torch.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        dim=-1,
+    )
 
 
 def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
@@ -432,9 +459,7 @@ def _pixel_resolution(scene: Scene) -> float:
     return float(np.quantile(density.numpy(), 0.95))
 
 
-def _make_optimizer(
-    surfels: Surfels, texture: NeuralTexture, config: Config, scale: float
-) -> torch.optim.Adam:
+def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:
     rates = config.rates
     ends: dict[str, tuple[float, float]] = {
         "means": (rates.means[0] * scale, rates.means[1] * scale),
@@ -445,9 +470,7 @@ def _make_optimizer(
         "sh0": (rates.sh0,) * 2,
         "shN": (rates.shN,) * 2,
     }
-    groups = [
-        {"params": [getattr(surfels, name)], "ends": ends[name], "lr": ends[name][0]} for name in PARAMETERS
-    ]
+    groups = [{"params": [getattr(surfels, name)], "ends": ends[name], "lr": ends[name][0]} for name in PARAMETERS]
     if config.max_hits:
         groups.append({"params": [texture.grid], "ends": rates.grid, "lr": rates.grid[0]})
         groups.append({"params": list(texture.mlp.parameters()), "ends": rates.mlp, "lr": rates.mlp[0]})

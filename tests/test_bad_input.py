@@ -20,9 +20,7 @@ from tests.scenes import (
 from tests.tolerances import ACTIVATION
 
 
-def assert_refused(
-    error: type[Exception], argument: str, call: Callable[..., Any], *args: Any, **kw: Any
-) -> None:
+def assert_refused(error: type[Exception], argument: str, call: Callable[..., Any], *args: Any, **kw: Any) -> None:
     """Fail unless the call raises `error` and its message contains the word `argument`."""
     with pytest.raises(error) as caught:
         call(*args, **kw)

@@ -16,9 +16,7 @@ def test_every_kernel_compiles_for_cuda(arch: int, tmp_path: Path) -> None:
 
     def compile_one(kernel: wp.Kernel) -> int:
         folder = tmp_path / kernel.module.name
-        wp.compile_aot_module(
-            kernel.module, arch=arch, module_dir=str(folder), strip_hash=True, use_ptx=False
-        )
+        wp.compile_aot_module(kernel.module, arch=arch, module_dir=str(folder), strip_hash=True, use_ptx=False)
         return sum(path.stat().st_size for path in folder.glob("*.cubin"))
 
     with ThreadPoolExecutor(2) as pool:

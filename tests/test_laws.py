@@ -27,9 +27,7 @@ MAX_HITS = 8
 
 def draw(scene: Scene, texture: nw.NeuralTexture | None = None, **options: Any) -> Any:
     """Render `scene` over the test background."""
-    return nw.render(
-        make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options)
-    )
+    return nw.render(make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options))
 
 
 def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
@@ -141,9 +139,7 @@ def test_render_agrees_with_the_reference(
     flips = 0.0 if dtype == torch.float64 else FLIPS
 
     surfels64, texture64 = twin(surfels), twin(texture)
-    camera64 = make_camera(
-        scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()}
-    )
+    camera64 = make_camera(scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()})
     out = nw.render(surfels, texture, camera, **options)
     expected = reference_render(surfels64, texture64, camera64, **options)
     loss(out).backward()
@@ -170,8 +166,7 @@ def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: to
     parameters = dict(actual.named_parameters())
     for name, parameter in expected.named_parameters():
         gradients = [
-            torch.zeros_like(value) if value.grad is None else value.grad
-            for value in (parameters[name], parameter)
+            torch.zeros_like(value) if value.grad is None else value.grad for value in (parameters[name], parameter)
         ]
         assert_close(*gradients, kind="gradient", name=name, precision=row)
 
@@ -323,9 +318,7 @@ def awkward_scene(device: torch.device, dtype: torch.dtype = torch.float32) -> S
     scene["gammas"][20:22] = 60.0
     scene["gammas"][22] = 1.0
     scene["opacities"][20:23] = torch.tensor([1.0, 0.0, 1.0], dtype=dtype)
-    return {
-        key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in scene.items()
-    }
+    return {key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in scene.items()}
 
 
 @pytest.mark.parametrize("low_pass", [False, True])

@@ -83,9 +83,7 @@ def fresh_imports(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[float]
     environment = os.environ | {"WARP_CACHE_PATH": str(cache)}
     seconds = []
     for _ in range(3):
-        run = subprocess.run(
-            command, env=environment, cwd=ROOT.parent, capture_output=True, text=True, check=True
-        )
+        run = subprocess.run(command, env=environment, cwd=ROOT.parent, capture_output=True, text=True, check=True)
         seconds.append(float(run.stdout.splitlines()[-1]))
     return seconds, [path for path in cache.rglob("*") if path.is_file()]
 

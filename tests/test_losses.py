@@ -86,9 +86,7 @@ def test_dssim_of_constant_images_by_hand() -> None:
     g = 1 / sum(math.exp(-(i * i) / 4.5) for i in range(-5, 6)) ** 2
     variances = g * (1 - g) * (a * a + b * b)
     top = (2 * g * g * a * b + 1e-4) * (2 * g * (1 - g) * a * b + 9e-4)
-    assert one.item() == pytest.approx(
-        1 - top / ((g * g * (a * a + b * b) + 1e-4) * (variances + 9e-4)), abs=1e-13
-    )
+    assert one.item() == pytest.approx(1 - top / ((g * g * (a * a + b * b) + 1e-4) * (variances + 9e-4)), abs=1e-13)
 
 
 def test_dssim_scales_its_gradient_and_skips_it_for_data() -> None:
@@ -133,9 +131,7 @@ def test_image_loss_mixes_l1_and_dssim() -> None:
     l1, dssim = (image - target).abs().mean(), losses.dssim(image, target)
     for weight in (0.0, 0.2, 1.0):
         expected = (1 - weight) * l1 + weight * dssim
-        assert_close(
-            losses.image_loss(image, target, weight), expected, kind="value", name=f"weight {weight}"
-        )
+        assert_close(losses.image_loss(image, target, weight), expected, kind="value", name=f"weight {weight}")
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

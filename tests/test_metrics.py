@@ -57,9 +57,7 @@ def test_psnr_by_hand() -> None:
     black, white = torch.zeros(4, 6, 3), torch.ones(4, 6, 3)
     assert metrics.psnr(black, white) == 0.0
     assert metrics.psnr(black, black) == math.inf
-    assert metrics.psnr(black, torch.full((4, 6, 3), 51, dtype=torch.uint8)) == pytest.approx(
-        20 * math.log10(5)
-    )
+    assert metrics.psnr(black, torch.full((4, 6, 3), 51, dtype=torch.uint8)) == pytest.approx(20 * math.log10(5))
     one = torch.zeros(4, 6, 3, dtype=torch.uint8)
     one[1, 2, 0] = 255
     assert metrics.psnr(one, black) == pytest.approx(10 * math.log10(4 * 6 * 3))
@@ -151,9 +149,7 @@ def test_lpips_is_left_out_with_one_warning(monkeypatch: pytest.MonkeyPatch, fre
         assert metrics.lpips_vgg(image, image) is None
 
 
-def test_lpips_is_left_out_when_the_weights_do_not_come(
-    monkeypatch: pytest.MonkeyPatch, fresh_network: None
-) -> None:
+def test_lpips_is_left_out_when_the_weights_do_not_come(monkeypatch: pytest.MonkeyPatch, fresh_network: None) -> None:
     def offline(**_: object) -> None:
         raise OSError("no network")
 

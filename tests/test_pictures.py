@@ -80,9 +80,7 @@ def test_wrong_inputs_name_the_argument(tmp_path: Path) -> None:
     image = torch.zeros(4, 5, 3)
     with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(4, 5\)"):
         save_png(tmp_path / "a.png", image[..., 0])
-    with pytest.raises(
-        TypeError, match=r"image: expected a uint8 or floating torch\.Tensor, got torch\.int64"
-    ):
+    with pytest.raises(TypeError, match=r"image: expected a uint8 or floating torch\.Tensor, got torch\.int64"):
         save_png(tmp_path / "a.png", image.long())
     with pytest.raises(ValueError, match=r"target: expected shape \(4, 5, 3\), got \(5, 4, 3\)"):
         error_map(image, image.transpose(0, 1))

@@ -78,9 +78,7 @@ def test_points_keep_their_colors_and_follow_scaling():
     points = torch.from_numpy(cloud(400)).float()
     colors = torch.randint(0, 256, (400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     chosen = initial_points(points, colors, 150)
-    assert (
-        chosen.means.shape == (150, 3) and chosen.colors.shape == (150, 3) and chosen.scales.shape == (150,)
-    )
+    assert chosen.means.shape == (150, 3) and chosen.colors.shape == (150, 3) and chosen.scales.shape == (150,)
     assert all(tensor.dtype == torch.float32 for tensor in (chosen.means, chosen.colors, chosen.scales))
     index = torch.cdist(chosen.means.double(), points.double()).argmin(dim=1)
     assert torch.equal(points[index], chosen.means) and len(index.unique()) == 150
@@ -108,9 +106,7 @@ def test_filter_drops_planted_outliers_and_little_else():
     colors = torch.zeros(1000, 3)
     kept = initial_points(points, colors, 1000, track_lengths=tracks, errors=errors)
     assert kept.means[:, 0].max() < 60.0 and 940 <= len(kept.means) <= 950
-    everything = initial_points(
-        points, colors, 1000, track_lengths=tracks, errors=errors, filter_outliers=False
-    )
+    everything = initial_points(points, colors, 1000, track_lengths=tracks, errors=errors, filter_outliers=False)
     assert len(everything.means) == 1000
 
 

@@ -174,9 +174,7 @@ def test_low_pass_by_hand() -> None:
     value_of(hits.alpha[1, 1], 0.8 * math.exp(-2.0), "r^2 = 2")
     value_of(hits.depths[1, 1, 0], 2.0, "depth")
     value_of(collect(**speck, **VIEW, max_hits=1).alpha[2, 3], 0.0, "without")
-    value_of(
-        collect(**speck, **(VIEW | {"near": 2.0}), max_hits=1, low_pass=True).alpha[2, 2], 0.0, "before near"
-    )
+    value_of(collect(**speck, **(VIEW | {"near": 2.0}), max_hits=1, low_pass=True).alpha[2, 2], 0.0, "before near")
     large = sheets((2.0, 0.8), scale=(3.0, 3.0))
     plain, filtered = (collect(**large, **VIEW, max_hits=1, low_pass=flag).alpha for flag in (False, True))
     assert_close(filtered[2, 3], plain[2, 3], kind="value", name="large")

@@ -45,9 +45,7 @@ def make_scene(
     camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(params), camera_id=1)
     reconstruction.add_camera_with_trivial_rig(camera)
     for index, name in enumerate(names):
-        image = pycolmap.Image(
-            name=name, keypoints=np.ones((len(points), 2)), camera_id=1, image_id=index + 1
-        )
+        image = pycolmap.Image(name=name, keypoints=np.ones((len(points), 2)), camera_id=1, image_id=index + 1)
         rigid = pycolmap.Rigid3d(pose(index) if poses is None else poses[index])
         reconstruction.add_image_with_trivial_frame(image, rigid)
     for index, point in enumerate(points):
@@ -98,9 +96,7 @@ def test_text_and_binary_load_identically(tmp_path, where):
 
 def test_loads_what_was_written(tmp_path):
     scene = load_scene(make_scene(tmp_path))
-    assert (
-        scene.path == tmp_path and scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8
-    )
+    assert scene.path == tmp_path and scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8
     expected = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3)).astype(np.float32)
     assert np.array_equal(scene.points.numpy(), expected)
     assert scene.track_lengths.tolist() == [2 + index % 4 for index in range(20)]
@@ -117,9 +113,7 @@ def test_loads_what_was_written(tmp_path):
 
 
 def test_simple_pinhole_has_one_focal_length(tmp_path):
-    camera = (
-        load_scene(make_scene(tmp_path, model="SIMPLE_PINHOLE", params=(41.0, 20.5, 19.75))).train[0].camera
-    )
+    camera = load_scene(make_scene(tmp_path, model="SIMPLE_PINHOLE", params=(41.0, 20.5, 19.75))).train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 41.0, 20.5, 19.75)
 
 
@@ -168,9 +162,7 @@ def test_downscale_scales_pixels_and_keeps_areas(tmp_path, downscale):
             atol=1e-5,
         )
         for row, column in ((0, 0), (rows - 1, columns - 1), (3, 4)):
-            block = one.image[
-                row * downscale : (row + 1) * downscale, column * downscale : (column + 1) * downscale
-            ]
+            block = one.image[row * downscale : (row + 1) * downscale, column * downscale : (column + 1) * downscale]
             mean = block.double().mean(dim=(0, 1))
             assert (other.image[row, column].double() - mean).abs().max() <= 0.5
 
@@ -278,9 +270,7 @@ def test_bad_scenes_are_told_in_one_line(tmp_path, kind):
 def test_absent_images_folder_lists_those_that_exist(tmp_path):
     path = make_scene(tmp_path)
     (path / "images_2").mkdir()
-    with pytest.raises(
-        FileNotFoundError, match=r"images: no folder 'images_8' in .* which has images, images_2$"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"images: no folder 'images_8' in .* which has images, images_2$"):
         load_scene(path, images="images_8")
 
 
@@ -305,9 +295,7 @@ def test_real_scene():
         assert (camera.width, camera.height) == (265, 473) and view.image.shape == (473, 265, 3)
         depths = (scene.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2]
         pixels = project(camera, scene.points)
-        inside = (
-            (pixels >= 0).all(dim=1) & (pixels[:, 0] < 265) & (pixels[:, 1] < 473) & (depths > camera.near)
-        )
+        inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < 265) & (pixels[:, 1] < 473) & (depths > camera.near)
         shares.append(inside.double().mean().item())
     # The mean track has 6.9 of the 50 photos, and a point lies in at least those it was triangulated from.
     assert min(shares) > 0.05 and np.mean(shares) > 6.9 / 50

@@ -63,31 +63,25 @@ def assert_close(
     good = relative <= tolerance and (precision != torch.float64 or worst <= tolerance)
     assert good, (
         f"{name}: {kind} off by {relative:.3g} (relative L2), {worst:.3g} (largest error / largest value). "
-        f"{str(precision).removeprefix('torch.')} allows {tolerance:g}. "
-        + describe_worst(error, actual, expected)
+        f"{str(precision).removeprefix('torch.')} allows {tolerance:g}. " + describe_worst(error, actual, expected)
     )
 
 
-def assert_same_ids(
-    actual: torch.Tensor, expected: torch.Tensor, *, name: str, allow_flips: float = 0.0
-) -> None:
+def assert_same_ids(actual: torch.Tensor, expected: torch.Tensor, *, name: str, allow_flips: float = 0.0) -> None:
     """Fail unless the integer images (H, W, K) agree in all pixels but at most the fraction `allow_flips`."""
     assert actual.shape == expected.shape, f"{name}: shape {tuple(actual.shape)}, not {tuple(expected.shape)}"
     actual, expected = actual.long().cpu(), expected.long().cpu()
     error = (actual != expected).double()
     flipped = error.flatten(2).amax(-1) if error.numel() else error.new_zeros(error.shape[:2])
     assert flipped.sum().item() <= allow_flips * flipped.numel(), (
-        f"{name}: {int(flipped.sum())} of {flipped.numel()} pixels differ. "
-        + describe_worst(error, actual, expected)
+        f"{name}: {int(flipped.sum())} of {flipped.numel()} pixels differ. " + describe_worst(error, actual, expected)
     )
 
 
 def assert_finite(tensor: torch.Tensor, name: str) -> None:
     """Fail, naming the first element that is NaN or infinite."""
     bad = ~torch.isfinite(tensor)
-    assert not bad.any(), (
-        f"{name}: {int(bad.sum())} elements are not finite, first {bad.nonzero()[0].tolist()}"
-    )
+    assert not bad.any(), f"{name}: {int(bad.sum())} elements are not finite, first {bad.nonzero()[0].tolist()}"
 
 
 def without_flips(error: torch.Tensor, fraction: float) -> torch.Tensor:

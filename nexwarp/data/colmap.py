@@ -106,9 +106,7 @@ def read_model(path: Path) -> ColmapModel:
         read(str(folder))
     except READ_ERRORS as error:
         detail = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(
-            f"{folder}: not a readable COLMAP model ({suffix}), damaged or truncated: {detail}"
-        ) from error
+        raise ValueError(f"{folder}: not a readable COLMAP model ({suffix}), damaged or truncated: {detail}") from error
     if suffix == "bin":
         _check_cameras_size(folder / "cameras.bin", reconstruction.cameras.values())
     images = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
@@ -127,12 +125,8 @@ def _check_cameras_size(path: Path, cameras: Any) -> None:
 
 def _photo(image: Any, folder: Path) -> Photo:
     name, camera = image.name, image.camera
-    if not name or any(
-        ".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name))
-    ):
-        raise ValueError(
-            f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it"
-        )
+    if not name or any(".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name))):
+        raise ValueError(f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it")
     model = camera.model.name
     if model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         raise ValueError(

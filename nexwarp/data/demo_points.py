@@ -57,9 +57,7 @@ class Rig:
         local = np.einsum("vij,nj->vni", self.viewmats[:, :3, :3], points) + self.viewmats[:, None, :3, 3]
         depth = local[..., 2:]
         ahead = depth[..., 0] > 0.1
-        pixels = (
-            local[..., :2] / np.where(ahead[..., None], depth, 1.0) * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
-        )
+        pixels = local[..., :2] / np.where(ahead[..., None], depth, 1.0) * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         inside = (pixels >= BORDER).all(axis=-1) & (pixels <= np.array(self.size) - BORDER).all(axis=-1)
         return pixels, ahead & inside
 

@@ -146,9 +146,7 @@ def _courtyard(pictures: dict[str, np.ndarray], width: int) -> list[Rectangle]:
         room.append(_rectangle(corner, along * 2 * side, (0, 0, -height), brick))
         paper = _picture(poster, far, frame=0.07)
         white = _stripes([(0.9, 0.9, 0.88)], far, 1.0)
-        room += _box(
-            -inward * (side - 0.03) + [0, 0, 0.6], (2.1, 0.06, 1.45), 90.0 * quarter, [paper, white], white
-        )
+        room += _box(-inward * (side - 0.03) + [0, 0, 0.6], (2.1, 0.06, 1.45), 90.0 * quarter, [paper, white], white)
     lawn = _tiles(pictures["grass"], near, 1.7, (0.86, 1.12, 0.45))
     curb = _tiles(pictures["brick"], near, 1.3, (1.5, 1.3, 1.1))
     return room + _box((0, 0, 0), (2.9, 2.3, LAWN_HEIGHT), 0.0, [curb], lawn)
@@ -196,9 +194,7 @@ def _bake_light(rectangles: list[Rectangle]) -> list[Rectangle]:
     """Multiply Lambert's law and soft shadows into the textures: matt surfaces look alike from everywhere."""
     grids = [_light_grid(rectangle) for rectangle in rectangles]
     points = np.concatenate([grid.reshape(-1, 3) for grid in grids])
-    normals = np.repeat(
-        [rectangle.normal for rectangle in rectangles], [grid[..., 0].size for grid in grids], axis=0
-    )
+    normals = np.repeat([rectangle.normal for rectangle in rectangles], [grid[..., 0].size for grid in grids], axis=0)
     # An empty room is convex: its walls shade nothing in it.
     blockers = [rectangle for rectangle in rectangles if np.abs(rectangle.origin[:2]).max() < HALF_SIDE - 0.1]
 
@@ -217,9 +213,7 @@ def _bake_light(rectangles: list[Rectangle]) -> list[Rectangle]:
         rows, columns = grid.shape[:2]
         light = total[start : start + rows * columns].reshape(rows, columns, 1).astype(np.float32)
         start += rows * columns
-        baked.append(
-            replace(rectangle, texture=np.clip(rectangle.texture * _spread(light, rectangle), 0.0, 1.0))
-        )
+        baked.append(replace(rectangle, texture=np.clip(rectangle.texture * _spread(light, rectangle), 0.0, 1.0)))
     return baked
 
 
@@ -229,10 +223,7 @@ def _lights() -> list[tuple[np.ndarray, float]]:
     lamp = [LAMP + LAMP_SIDE * np.array([x, y, 0.0]) for x in steps for y in steps]
     angles = np.arange(FILL_LIGHTS) * np.pi * (3.0 - 5.0**0.5)  # the golden angle spreads them evenly
     radii = 3.8 * np.sqrt((np.arange(FILL_LIGHTS) + 0.5) / FILL_LIGHTS)
-    dome = [
-        np.array([r * np.cos(t), r * np.sin(t), 3.3 - 0.1 * r * r])
-        for r, t in zip(radii, angles, strict=True)
-    ]
+    dome = [np.array([r * np.cos(t), r * np.sin(t), 3.3 - 0.1 * r * r]) for r, t in zip(radii, angles, strict=True)]
     return [(p, LAMP_POWER / len(lamp)) for p in lamp] + [(p, FILL_POWER / len(dome)) for p in dome]
 
 

@@ -183,9 +183,7 @@ def render(
     rotation, start = viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]
     x = (np.arange(width * samples) + 0.5 - fine[0, 2]) / fine[0, 0]
     y = (np.arange(height * samples) + 0.5 - fine[1, 2]) / fine[1, 1]
-    directions = (x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2]).astype(
-        np.float32
-    )
+    directions = (x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1] + rotation[2]).astype(np.float32)
     windows = [_window(rectangle, viewmat, fine, directions.shape[:2]) for rectangle in rectangles]
     hits = first_hits(rectangles, start, directions, windows)
     image = shade(rectangles, hits, start, light)
@@ -193,9 +191,7 @@ def render(
     return np.floor(pixels * 255.0 + 0.5).astype(np.uint8)
 
 
-def _window(
-    rectangle: Rectangle, viewmat: np.ndarray, K: np.ndarray, shape: tuple[int, int]
-) -> tuple[slice, slice]:
+def _window(rectangle: Rectangle, viewmat: np.ndarray, K: np.ndarray, shape: tuple[int, int]) -> tuple[slice, slice]:
     """Rows and columns that the projected rectangle can cover: all when it reaches behind the camera."""
     edges = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
     corners = rectangle.at(*edges) @ viewmat[:3, :3].T + viewmat[:3, 3]

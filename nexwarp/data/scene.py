@@ -88,9 +88,7 @@ def load_scene(path: str | os.PathLike, images: str = "images", downscale: int =
         raise FileNotFoundError(f"{path}: no such folder, expected a COLMAP scene")
     model = read_model(path)
     if len(model.photos) < 2:
-        raise ValueError(
-            f"{model.folder}: expected at least 2 registered images (1 to train, 1 to test), got 1"
-        )
+        raise ValueError(f"{model.folder}: expected at least 2 registered images (1 to train, 1 to test), got 1")
     folder = _images_folder(path, images)
     scale = _scene_scale(model)
     with ThreadPoolExecutor() as pool:  # decoding frees the GIL

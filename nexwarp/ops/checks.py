@@ -46,8 +46,7 @@ def check_tensors(
             fits &= size == expected
         if not fits:
             text = ", ".join(
-                f"{want}={sizes[want]}" if isinstance(want, str) and want in sizes else str(want)
-                for want in shape
+                f"{want}={sizes[want]}" if isinstance(want, str) and want in sizes else str(want) for want in shape
             )
             raise ValueError(f"{name}: expected shape ({text}), got {tuple(tensor.shape)}")
     return sizes

@@ -37,13 +37,7 @@ def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
     plain, colors, weights, alpha, background = tensors
 
     def flat(x: torch.Tensor | None, *shape: int) -> torch.Tensor | None:
-        return (
-            None
-            if x is None
-            else x.reshape(-1, *shape)
-            if x.numel()
-            else x.view(x.shape[0] * x.shape[1], *shape)
-        )
+        return None if x is None else x.reshape(-1, *shape) if x.numel() else x.view(x.shape[0] * x.shape[1], *shape)
 
     hits = next((x.shape[2] for x in (weights, colors) if x is not None), 0)
     return [
@@ -62,17 +56,13 @@ class _Compose(torch.autograd.Function):
         real = real_of(plain)
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
         outputs = [array(x.view(-1, 3), types(real).vec3) for x in (image, textured)]
-        launch(
-            plain, compose_kernel(real), plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs
-        )
+        launch(plain, compose_kernel(real), plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs)
         ctx.save_for_backward(*inputs)
         return image, textured
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, grad_image: torch.Tensor, grad_textured: torch.Tensor
-    ) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, grad_image: torch.Tensor, grad_textured: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         plain, alpha = inputs[0], inputs[3]
         real = real_of(plain)

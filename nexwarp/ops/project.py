@@ -90,9 +90,7 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor
-    ) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         means, viewmat = inputs[0], inputs[6]
         real, count = real_of(means), len(means)

@@ -30,9 +30,7 @@ def plain_colors(sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, 
 
 class _PlainColors(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
-    ) -> torch.Tensor:
+    def forward(ctx: Any, sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int) -> torch.Tensor:
         real = real_of(means)
         vec3 = types(real).vec3
         colors = torch.empty_like(means)

@@ -204,9 +204,7 @@ def _lookup_backward(
     return grad_grid, point_slots.sum(0), depth_slots.sum(0)
 
 
-def _colors(
-    coefficients: torch.Tensor, directions: torch.Tensor, count: int, clamp: bool
-) -> tuple[Any, list[Any]]:
+def _colors(coefficients: torch.Tensor, directions: torch.Tensor, count: int, clamp: bool) -> tuple[Any, list[Any]]:
     real, storage = real_of(directions), STORAGES[coefficients.dtype]
     degree = round((coefficients.shape[0] // 3) ** 0.5) - 1
     kernels = textured_colors_kernels(real, storage, degree, clamp)

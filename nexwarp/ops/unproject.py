@@ -11,9 +11,7 @@ from nexwarp.ops._interop import array, grad_like, launch, real_of
 from nexwarp.ops.pinhole import Pinhole
 
 
-def unproject(
-    depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
-) -> tuple[torch.Tensor, torch.Tensor]:
+def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the world points at the given z-depths along the pixels' rays, and the rays' directions.
 
     Args:
@@ -74,9 +72,7 @@ def _launch(
     pixels = depths.shape[0] * depths.shape[1]
     intrinsics = t.vec4(*camera.intrinsics)
     inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, intrinsics, camera.width]
-    arrays = [
-        array(outputs[0].view(pixels, -1, 3) if depths.shape[2] else outputs[0].view(pixels, 0, 3), t.vec3)
-    ]
+    arrays = [array(outputs[0].view(pixels, -1, 3) if depths.shape[2] else outputs[0].view(pixels, 0, 3), t.vec3)]
     arrays.append(array(outputs[1].view(pixels, 3), t.vec3))
     if grads is None:
         launch(depths, unproject_kernel(real), pixels, inputs, arrays)

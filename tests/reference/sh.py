@@ -38,9 +38,7 @@ def evaluate(coefficients: torch.Tensor, directions: torch.Tensor, degree: int) 
     return (values[..., None] * coefficients[..., : values.shape[-1], :]).sum(dim=-2)
 
 
-def plain_colors(
-    sh: torch.Tensor, means: torch.Tensor, camera_position: torch.Tensor, degree: int
-) -> torch.Tensor:
+def plain_colors(sh: torch.Tensor, means: torch.Tensor, camera_position: torch.Tensor, degree: int) -> torch.Tensor:
     """Plain colours (N, 3) of surfels `sh` (N, C, 3) seen from `camera_position` (3,)."""
     directions = torch.nn.functional.normalize(means - camera_position, dim=-1)
     return (0.5 + evaluate(sh, directions, degree)).clamp_min(0)
