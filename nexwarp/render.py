@@ -48,6 +48,20 @@ class Rendering:
     alpha: torch.Tensor
     passes: Passes
 
+    def watch_error(self, errors: torch.Tensor) -> ops.ErrorWatch:
+        """Ask the coming backward pass for `splat_error(errors)`, at hardly any cost.
+
+        Args:
+            errors: (H, W) error of each pixel, >= 0.
+
+        Returns:
+            An object whose `sums` (N,) are there once `backward` has run.
+        """
+        watch = self.passes.hits.watch
+        check_tensors({"errors": (errors, self.alpha.shape)}, dtype=self.alpha.dtype, device=self.alpha.device)
+        watch.errors = errors.detach().contiguous()
+        return watch
+
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
         """Return (N,): each surfel's sum over pixels of blending weight * errors (H, W). Not differentiable."""
         p = self.passes

@@ -234,10 +234,12 @@ class Trainer:
         self._schedule_rates()
         out = render(self.surfels, self.texture if config.max_hits else None, camera, **self.render_options())
         losses = self._losses(out, target)
-        sum(losses.values()).backward()
+        watch = None
         if self.densifier.active(self.iteration):
-            errors = (out.image.detach() - target).abs().mean(dim=-1)
-            self.densifier.accumulate(out.splat_error(errors))
+            watch = out.watch_error((out.image.detach() - target).abs().mean(dim=-1))
+        sum(losses.values()).backward()
+        if watch is not None:
+            self.densifier.accumulate(watch.sums)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         if self.densifier.due(self.iteration):

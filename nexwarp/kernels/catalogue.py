@@ -42,4 +42,5 @@ def all_kernels(
         yield from (lists.count, lists.emit, splat_error_kernel(real, low_pass, tile_size))
         for hits in max_hits:
             yield collect_kernel(real, hits, low_pass, tile_size)
-            yield collect_backward_kernel(real, hits, low_pass, tile_size)
+            for watch in (False, True):
+                yield collect_backward_kernel(real, hits, low_pass, tile_size, watch)

@@ -166,8 +166,10 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
 
 
 @functools.cache
-def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
-    """Make the backward kernel."""
+def collect_backward_kernel(
+    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False
+) -> wp.Kernel:
+    """Make the backward kernel; with `watch` it also adds up weight * error a row, as `splat_error` does alone."""
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
@@ -175,7 +177,7 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
     vec, ivec = buffer_types(real, max_hits)
     pixel_of = pixel_function(tile_size)
     pixels = tile_size * tile_size
-    sum3, sum4 = lane_sum(vec3), lane_sum(vec4)
+    sum1, sum3, sum4 = lane_sum(real), lane_sum(vec3), lane_sum(vec4)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -204,9 +206,11 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
         grad_depths: wp.array2d(dtype=real),
         grad_weights: wp.array2d(dtype=real),
         grad_alphas: wp.array(dtype=real),
+        errors: wp.array(dtype=real),
         # outputs
         grad_records: wp.array2d(dtype=vec4),
         grad_centers: wp.array(dtype=vec3),
+        error_sums: wp.array(dtype=real),
     ):
         thread = first + wp.tid()
         tile = thread // pixels
@@ -233,6 +237,9 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
             gw[j] = grad_weights[p, j]
             gd[j] = grad_depths[p, j]
             rest += gw[j] * weights[p, j]
+        error = real(0.0)
+        if wp.static(watch):
+            error = errors[p]
         transmittance = real(1.0)
         me = lane()
         for k in range(tile_offsets[tile], tile_offsets[tile + 1]):
@@ -265,8 +272,10 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
             g2 = vec4()
             g3 = vec4()
             gc = vec3()
+            share = real(0.0)
             if counts == 1:
                 weight = alpha * transmittance
+                share = weight * error
                 q = ga
                 gt = real(0.0)
                 buffered = int(0)
@@ -292,7 +301,11 @@ def collect_backward_kernel(real: type, max_hits: int, low_pass: bool, tile_size
             g3 = sum4(g3)
             if wp.static(low_pass):
                 gc = sum3(gc)
+            if wp.static(watch):
+                share = sum1(share)
             if me == 0:
+                if wp.static(watch):
+                    wp.atomic_add(error_sums, row, share)
                 wp.atomic_add(grad_records, row, 0, g0)
                 wp.atomic_add(grad_records, row, 1, g1)
                 wp.atomic_add(grad_records, row, 2, g2)

@@ -1,6 +1,6 @@
 """What a tensor means and how it differentiates: one torch op a stage, the only torch <-> Warp boundary."""
 
-from nexwarp.ops.collect import Hits, collect, splat_error
+from nexwarp.ops.collect import ErrorWatch, Hits, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
@@ -10,6 +10,7 @@ from nexwarp.ops.tiles import Tiles, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
+    "ErrorWatch",
     "Hits",
     "Pinhole",
     "Projection",

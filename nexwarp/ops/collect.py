@@ -22,6 +22,19 @@ from nexwarp.ops.project import Projection
 from nexwarp.ops.tiles import Tiles
 
 
+@dataclass
+class ErrorWatch:
+    """Lets the backward pass add up blended errors on its way; see `Rendering.watch_error`.
+
+    Attributes:
+        errors: (H, W) error of each pixel, set between forward and backward; None watches nothing.
+        sums: (N,) what `splat_error` would give, there after the backward pass.
+    """
+
+    errors: torch.Tensor | None = None
+    sums: torch.Tensor | None = None
+
+
 @dataclass(frozen=True)
 class Hits:
     """What the collection pass found.
@@ -33,6 +46,7 @@ class Hits:
         weights: (H, W, K), 0 in empty slots; differentiable.
         alpha: (H, W) 1 - final transmittance; differentiable.
         stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
+        watch: asks the backward pass for blended errors.
     """
 
     plain: torch.Tensor
@@ -41,6 +55,7 @@ class Hits:
     weights: torch.Tensor
     alpha: torch.Tensor
     stops: torch.Tensor
+    watch: ErrorWatch
 
 
 def collect(
@@ -57,7 +72,9 @@ def collect(
     """
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
-    return Hits(*_Collect.apply(projection.records, projection.centers, tiles, camera, max_hits, low_pass))
+    watch = ErrorWatch()
+    buffers = _Collect.apply(projection.records, projection.centers, tiles, camera, max_hits, low_pass, watch)
+    return Hits(*buffers, watch)
 
 
 def splat_error(
@@ -143,6 +160,7 @@ class _Collect(torch.autograd.Function):
         camera: Pinhole,
         max_hits: int,
         low_pass: bool,
+        watch: ErrorWatch,
     ) -> tuple[torch.Tensor, ...]:
         real = real_of(records)
         shape = (camera.height, camera.width)
@@ -164,7 +182,7 @@ class _Collect(torch.autograd.Function):
         launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
         ctx.save_for_backward(records, centers, plain, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
-        ctx.rest = (tiles, camera, max_hits, low_pass)
+        ctx.rest = (tiles, camera, max_hits, low_pass, watch)
         return plain, ids, depths, weights, alphas, stops
 
     @staticmethod
@@ -179,7 +197,7 @@ class _Collect(torch.autograd.Function):
         _stops: None,
     ) -> tuple[torch.Tensor | None, ...]:
         records, centers, plain, ids, weights, alphas, stops = ctx.saved_tensors
-        tiles, camera, max_hits, low_pass = ctx.rest
+        tiles, camera, max_hits, low_pass, watch = ctx.rest
         real = real_of(records)
         t = types(real)
         slots = max(max_hits, 1)
@@ -202,12 +220,16 @@ class _Collect(torch.autograd.Function):
             buffer(grad_depths, real),
             buffer(grad_weights, real),
             array(grad_alphas.contiguous().view(-1), real),
+            array(None if watch.errors is None else watch.errors.view(-1), real),
         ]
-        outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3)]
-        kernel = collect_backward_kernel(real, max_hits, low_pass, tiles.tile_size)
+        error_rows = None if watch.errors is None else records.new_zeros(count)
+        outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
+        kernel = collect_backward_kernel(real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
         launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
+        if error_rows is not None:
+            watch.sums = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
         grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)
         grad_centers = None
         if low_pass:
             grad_centers = _reduce(grad_center_rows[:, None], tiles, len(records), t.vec3)[:, 0]
-        return grad_records, grad_centers, None, None, None, None
+        return grad_records, grad_centers, *(None,) * 5
