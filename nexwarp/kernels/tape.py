@@ -1,0 +1,249 @@
+"""The passes for Warp-only programs: every one records itself on a `wp.Tape`, so `tape.backward()` differentiates a render.
+
+Arrays are Warp arrays of one scalar type (float32 or float64) on one device; what is to receive gradients is made with
+`requires_grad=True`. Outputs own gradients. The generated adjoints record themselves, since the calls launch under the
+tape; the hand-structured pairs go through `tape.record_func`. The same kernels serve torch in `nexwarp.ops`.
+
+    with-less use:  tape = wp.Tape(); records, centers = project(tape, ...); ...; tape.backward(loss)
+"""
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from nexwarp.kernels.collect import BLOCK_DIM, collect_backward_kernel, collect_kernel
+from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.sh import plain_colors_kernel, textured_colors_kernels
+from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.types import types
+from nexwarp.kernels.unproject import unproject_kernel
+
+
+class Image(NamedTuple):
+    """The image plane: (fx, fy, cx, cy) and (width, height) in pixels, near depth in world units."""
+
+    intrinsics: tuple[float, float, float, float]
+    size: tuple[int, int]
+    near: float
+
+
+class Lists(NamedTuple):
+    """Tile lists, see `nexwarp.ops.Tiles`."""
+
+    surfel_ids: wp.array
+    tile_offsets: wp.array
+    tile_size: int
+    columns: int
+
+
+class Hits(NamedTuple):
+    """Buffers of the collection pass over the pixels P = height * width, see `nexwarp.ops.Hits`."""
+
+    plain: wp.array
+    ids: wp.array
+    depths: wp.array
+    weights: wp.array
+    alphas: wp.array
+    stops: wp.array
+
+
+def _real(array: wp.array) -> type:
+    return getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+
+
+def _new(like: wp.array, shape: Any, dtype: type, requires_grad: bool = True) -> wp.array:
+    return wp.zeros(shape, dtype=dtype, device=like.device, requires_grad=requires_grad)
+
+
+def _launch(tape: wp.Tape, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+    with tape:
+        wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=outputs[0].device)
+
+
+def _silent(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any], block_dim: int = 256) -> None:
+    device = next(x.device for x in outputs if x is not None)
+    wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=device, record_tape=False, block_dim=block_dim)
+
+
+def plain_colors(tape: wp.Tape, sh: wp.array, means: wp.array, position: wp.array, degree: int) -> wp.array:
+    """Plain colours (N) vec3 from sh (N, C) vec3, means (N) vec3 and the camera's position (1) vec3, world."""
+    colors = _new(means, means.shape, means.dtype)
+    kernel = plain_colors_kernel(_real(means), degree)
+    _launch(tape, kernel, len(means), [sh, means, position, 0], [colors])
+    return colors
+
+
+def project(
+    tape: wp.Tape,
+    means: wp.array,
+    quats: wp.array,
+    scales: wp.array,
+    opacities: wp.array,
+    gammas: wp.array,
+    colors: wp.array,
+    viewmat: wp.array,
+) -> tuple[wp.array, wp.array]:
+    """Records (N, 4) vec4 and centers (N) vec3 of activated surfels; viewmat is (1) mat44."""
+    real = _real(means)
+    records = _new(means, (len(means), 4), types(real).vec4)
+    centers = _new(means, len(means), means.dtype)
+    inputs = [means, quats, scales, opacities, gammas, colors, viewmat, 0]
+    _launch(tape, project_kernel(real), len(means), inputs, [records, centers])
+    return records, centers
+
+
+def intersect_tiles(
+    means: wp.array,
+    quats: wp.array,
+    scales: wp.array,
+    opacities: wp.array,
+    gammas: wp.array,
+    centers: wp.array,
+    viewmat: wp.array,
+    image: Image,
+    low_pass: bool = False,
+    tile_size: int = 16,
+) -> Lists:
+    """Tile lists; integers, so no tape is needed."""
+    real, count = _real(means), len(means)
+    t = types(real)
+    columns, rows = (-(-pixels // tile_size) for pixels in image.size)
+
+    def integers(length: int, dtype: type = wp.int32) -> wp.array:
+        return _new(means, length, dtype, requires_grad=False)
+
+    keys, order, ends = integers(2 * count, wp.uint32), integers(2 * count), integers(count)
+    kernels = list_kernels(real, low_pass, tile_size)
+    surfels = [means, quats, scales, opacities, gammas, viewmat]
+    view = [t.vec4(*image.intrinsics), image.near, wp.vec2i(columns, rows)]
+    total = 0
+    if count:
+        _silent(depth_keys_kernel(real), count, [centers], [keys, order])
+        wp.utils.radix_sort_pairs(keys, order, count)
+        _silent(kernels.count, count, [order, *surfels, *view], [ends])
+        wp.utils.array_scan(ends, ends, inclusive=True)
+        total = int(ends[count - 1 :].numpy()[0])
+    tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
+    if total:
+        tile_ids = tiles.view(wp.int32)
+        _silent(kernels.emit, count, [order, *surfels, *view, ends], [tile_ids, entries, emitted])
+        wp.utils.radix_sort_pairs(tiles, entries, total, end_bit=(columns * rows).bit_length())
+        _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
+    offsets = integers(columns * rows + 1)
+    _silent(tile_offsets_kernel, len(offsets), [tiles.view(wp.int32), total], [offsets])
+    return Lists(ids, offsets, tile_size, columns)
+
+
+def collect(
+    tape: wp.Tape,
+    records: wp.array,
+    centers: wp.array,
+    lists: Lists,
+    image: Image,
+    max_hits: int,
+    low_pass: bool = False,
+) -> Hits:
+    """Collection pass; plain, depths, weights and alphas differentiate to records and, with low_pass, centers."""
+    real = _real(records)
+    t = types(real)
+    pixels, slots = image.size[0] * image.size[1], max(max_hits, 1)
+    hits = Hits(
+        plain=_new(records, pixels, t.vec3),
+        ids=_new(records, (pixels, slots), wp.int32, requires_grad=False),
+        depths=_new(records, (pixels, slots), real),
+        weights=_new(records, (pixels, slots), real),
+        alphas=_new(records, pixels, real),
+        stops=_new(records, pixels, wp.int32, requires_grad=False),
+    )
+    threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
+    view = [wp.vec2i(*image.size), lists.columns, t.vec4(*image.intrinsics), image.near]
+    inputs = [records, centers, lists.surfel_ids, lists.tile_offsets, *view]
+    kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
+    _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
+
+    def backward() -> None:
+        found = [hits.plain, hits.ids, hits.weights, hits.alphas, hits.stops]
+        grads = [hits.plain.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
+        rows = [records, centers, lists.surfel_ids, lists.surfel_ids, lists.tile_offsets]
+        kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
+        outputs = [records.grad, centers.grad, None]
+        _silent(kernel, threads, [*rows, *view, *found, *grads, None], outputs, BLOCK_DIM)
+
+    tape.record_func(backward, [records, centers, hits.plain, hits.depths, hits.weights, hits.alphas])
+    return hits
+
+
+def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) -> tuple[wp.array, wp.array]:
+    """Hit positions (P, K) vec3 and unit ray directions (P) vec3, world, of depths (P, K)."""
+    real = _real(depths)
+    t = types(real)
+    positions, directions = _new(depths, depths.shape, t.vec3), _new(depths, depths.shape[0], t.vec3)
+    inputs = [depths, viewmat, 0, t.vec4(*image.intrinsics), image.size[0]]
+    _launch(tape, unproject_kernel(real), depths.shape[0], inputs, [positions, directions])
+    return positions, directions
+
+
+def hashgrid(
+    tape: wp.Tape, table: wp.array, positions: wp.array, depths: wp.array, resolutions: wp.array, focal: wp.array
+) -> wp.array:
+    """Features (L * F, n) of table (L, T) vecF at positions (n) vec3 seen at depths (n); focal is (1)."""
+    real, features = _real(positions), table.dtype._length_
+    levels, size = table.shape
+    count = len(positions)
+    kernels = hashgrid_kernels(real, real, features)
+    encoded = _new(positions, (levels * features, count), real)
+    inputs = [table, positions, depths, resolutions, focal, wp.uint32(size - 1)]
+    _silent(kernels.forward, (levels, count), inputs, [encoded])
+    one = wp.ones(1, dtype=real, device=table.device)
+
+    def shared(grad: wp.array) -> wp.array:
+        strides = (0, grad.strides[0])
+        return wp.array(ptr=grad.ptr, dtype=grad.dtype, shape=(levels, count), strides=strides, device=grad.device)
+
+    def backward() -> None:
+        outputs = [table.grad, shared(positions.grad), shared(depths.grad)]
+        _silent(kernels.backward, (levels, count), [*inputs, encoded.grad, one], outputs)
+
+    tape.record_func(backward, [table, positions, depths, encoded])
+    return encoded
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _add_runs(first: wp.int32, values: wp.array(dtype=Any), length: wp.int32, sums: wp.array(dtype=Any)):
+    i = first + wp.tid()
+    for k in range(length):
+        sums[i] += values[i * length + k]
+
+
+def textured_colors(
+    tape: wp.Tape, coefficients: wp.array, directions: wp.array, degree: int, clamp: bool = False
+) -> wp.array:
+    """Colours (n) vec3 of coefficients (3 (degree + 1)^2, n) along directions (P) vec3, n = P * K."""
+    real, count = _real(coefficients), coefficients.shape[1]
+    hits = count // max(len(directions), 1)
+    kernels = textured_colors_kernels(real, real, degree, clamp)
+    colors = _new(coefficients, count, directions.dtype)
+    _silent(kernels.forward, count, [coefficients, directions, hits], [colors])
+    one = wp.ones(1, dtype=real, device=coefficients.device)
+
+    def backward() -> None:
+        points = _new(colors, count, directions.dtype, requires_grad=False)
+        # The kernel stores the gradient of the coefficients, which nothing else reads.
+        inputs = [coefficients, directions, hits, one, colors.grad]
+        _silent(kernels.backward, count, inputs, [coefficients.grad, points])
+        _silent(_add_runs, len(directions), [points, hits], [directions.grad])
+
+    tape.record_func(backward, [coefficients, directions, colors])
+    return colors
+
+
+def compose(
+    tape: wp.Tape, plain: wp.array, colors: wp.array, weights: wp.array, alphas: wp.array, background: wp.array
+) -> tuple[wp.array, wp.array]:
+    """Image and textured, (P) vec3 each, of plain (P) vec3, colors (P, K) vec3, weights (P, K), alphas (P)."""
+    image, textured = _new(plain, plain.shape, plain.dtype), _new(plain, plain.shape, plain.dtype)
+    inputs = [plain, colors, weights, alphas, background]
+    _launch(tape, compose_kernel(_real(plain)), len(plain), inputs, [image, textured])
+    return image, textured
