@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
 from nexwarp.data import Scene, View, initial_points
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
@@ -92,6 +93,8 @@ class Config:
     """Highest degree of both appearances; one more is unlocked every 1,000 iterations."""
     sh_every: int = 1000
     """Iterations, of a run of 30,000, between those."""
+    coarse: float = 0.0
+    """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything."""
     low_pass: bool = False
@@ -120,6 +123,7 @@ class Config:
         check_range("max_surfels", self.max_surfels, MIN_SURFELS)
         check_range("max_hits", self.max_hits, 0, MAX_HITS)
         check_range("sh_degree", self.sh_degree, 0, 3)
+        check_range("coarse", self.coarse, 0.0, 1.0)
 
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""
@@ -230,7 +234,8 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, Adam, and density control when it is due."""
         self.iteration += 1
         config = self.config
-        camera, target = self.views[self._next_view()]
+        coarse = self.iteration <= config.coarse * config.iterations
+        camera, target = self.views.get(self._next_view(), 2 if coarse else 1)
         self._schedule_rates()
         out = render(self.surfels, self.texture if config.max_hits else None, camera, **self.render_options())
         losses = self._losses(out, target)
@@ -369,13 +374,24 @@ class _Views:
             else:
                 photos = [p.pin_memory() for p in photos]
         self.photos = photos
+        self.reduced: dict[tuple[int, int], Camera] = {}
 
     def __len__(self) -> int:
         return len(self.photos)
 
-    def __getitem__(self, index: int) -> tuple[Any, torch.Tensor]:
-        photo = self.photos[index].to(self.device, non_blocking=True)
-        return self.cameras[index], photo.float() / 255.0
+    def get(self, index: int, factor: int) -> tuple[Camera, torch.Tensor]:
+        """Camera and photo (H, W, 3) float in [0, 1], both reduced by a factor; what does not fill a pixel is cut off."""
+        photo = self.photos[index].to(self.device, non_blocking=True).float() / 255.0
+        camera = self.cameras[index]
+        if factor == 1 or min(camera.width, camera.height) < factor:
+            return camera, photo
+        if (index, factor) not in self.reduced:
+            K = camera.K.clone()
+            K[:2] /= factor
+            size = (camera.width // factor, camera.height // factor)
+            self.reduced[index, factor] = Camera(camera.viewmat, K, *size, near=camera.near)
+        small = torch.nn.functional.avg_pool2d(photo.permute(2, 0, 1), factor)
+        return self.reduced[index, factor], small.permute(1, 2, 0).contiguous()
 
 
 def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
