@@ -17,6 +17,7 @@ from nexwarp.texture import NeuralTexture
 FORMAT_VERSION = 1
 MODEL_FILE = "model.safetensors"
 FRAME = "COLMAP world, cameras x right, y down, z forward"
+RENDER_OPTIONS = ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
 
 
 @dataclass
@@ -43,7 +44,7 @@ class Model:
     @property
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments that the model was trained with, for `nexwarp.render`."""
-        return {name: self.meta[name] for name in ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")}
+        return {name: self.meta[name] for name in RENDER_OPTIONS}
 
 
 def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
@@ -85,15 +86,24 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
     if header is None:
         raise ValueError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
-    meta = json.loads(header)
+    try:
+        meta = json.loads(header)
+    except json.JSONDecodeError:
+        meta = None
+    if not isinstance(meta, dict):
+        raise ValueError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
     if meta.get("format_version") != FORMAT_VERSION:
         raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
+        missing = [name for name in RENDER_OPTIONS if name not in meta]
+        if missing:
+            raise ValueError(f"no {missing[0]} in the metadata")
         texture = NeuralTexture(**meta.pop("texture"))
         texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: the tensors do not make a model ({error})") from None
+        reason = " ".join(str(error).split())  # torch's go over several lines
+        raise ValueError(f"{path}: the tensors do not make a model ({reason})") from None
     return Model(surfels, texture, meta)
 
 
@@ -102,12 +112,12 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
     from safetensors.torch import save_file
 
     folder, aside, old = run / "checkpoint", run / "checkpoint.tmp", run / "checkpoint.old"
-    for leftover in (aside, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir()
     save_file({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors")
     write_atomically(aside / "state.json", json.dumps(state).encode())
-    if folder.exists():
+    if folder.exists():  # else `old` is all there is, after a kill between the two renames
+        shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
     aside.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
@@ -129,7 +139,7 @@ def load_checkpoint(run: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]
         raise FileNotFoundError(f"{run}: expected a checkpoint to resume from, found none")
     try:
         return load_file(folder / "tensors.safetensors"), json.loads((folder / "state.json").read_text())
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, ValueError) as error:  # bad JSON and bad UTF-8 are ValueErrors
         raise ValueError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
 
 

@@ -30,13 +30,25 @@ from nexwarp.runs import (
     prepare_run,
     read_run,
 )
-from nexwarp.trainer import Config, TextureConfig, Trainer, preset
+from nexwarp.trainer import Config, LearningRates, TextureConfig, Trainer, preset
 
-# The demo is small enough for two CPU cores.
+# The demo is small enough for two CPU cores: a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, Any] = {
-    "iterations": 1200,
-    "max_surfels": 2000,
-    "texture": TextureConfig(levels=8, table_size=2**15, width=32),
+    "iterations": 1500,
+    "max_surfels": 3000,
+    "coarse": 0.4,
+    "texture": TextureConfig(levels=12, table_size=2**15, width=32),
+    "rates": LearningRates(
+        means=(5e-4, 5e-6),
+        quats=5e-3,
+        scales=2.5e-2,
+        opacities=0.05,
+        gammas=5e-3,
+        sh0=1.25e-2,
+        shN=6e-4,
+        grid=(2e-2, 2e-4),
+        mlp=(3e-3, 3e-4),
+    ),
 }
 CHECKPOINTS = 10
 
@@ -53,9 +65,9 @@ class Train:
     run: Path | None = None
     """Folder to write to; runs/SCENE by default."""
     max_surfels: int | None = None
-    """Budget P of surfels, never exceeded (400,000; demo 2,000)."""
+    """Budget P of surfels, never exceeded (400,000; demo 3,000)."""
     iterations: int | None = None
-    """Training steps; schedules stretch with them (30,000; demo 1,200)."""
+    """Training steps; schedules stretch with them (30,000; demo 1,500)."""
     downscale: int = 1
     """Reduce photos by this factor, by area."""
     images: str = "images"

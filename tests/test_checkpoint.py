@@ -1,0 +1,376 @@
+"""Models, checkpoints and cameras on disk: what comes back is what went in, damage is one clear line."""
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from safetensors import safe_open
+
+import nexwarp as nw
+from nexwarp.checkpoint import (
+    FORMAT_VERSION,
+    MODEL_FILE,
+    Model,
+    load_cameras,
+    load_checkpoint,
+    save_cameras,
+    save_checkpoint,
+    save_model,
+    write_atomically,
+)
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+META = {
+    "max_hits": 2,
+    "background": (0.1, 0.2, 0.3),
+    "sh_degree": 3,
+    "low_pass": False,
+    "clamp_texture": True,
+    "near": 0.01,
+    "scene_scale": 1.25,
+    "preset": "default",
+    "iteration": 1200,
+}
+
+
+def make_model(count: int = 24) -> Model:
+    return Model(make_surfels(random_scene(count)), make_texture(), dict(META))
+
+
+def rewrite(file: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], None]) -> None:
+    """Let `change` alter tensors and metadata of a saved model."""
+    with safe_open(file, "pt") as opened:
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}
+        meta = json.loads(opened.metadata()["nexwarp"])
+    change(tensors, meta)
+    safetensors.torch.save_file(tensors, file, {"nexwarp": json.dumps(meta)})
+
+
+def refused(error: type[Exception], call: Callable[..., Any], *args: Any, names: Path, match: str) -> None:
+    """Fail unless `call` raises `error` with one line that begins with the path and contains `match`."""
+    with pytest.raises(error) as caught:
+        call(*args)
+    message = str(caught.value)
+    assert message.startswith(f"{names}: ") and "\n" not in message and match in message, message
+
+
+class Bomb:
+    """What a pickle must never get to do."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.marker,))
+
+
+# Models
+
+
+def test_loaded_model_renders_the_same_image(tmp_path):
+    model = make_model()
+    file = save_model(tmp_path, model)
+    assert file == tmp_path / MODEL_FILE and os.listdir(tmp_path) == [MODEL_FILE]
+    first, second = nw.load(tmp_path), nw.load(file)
+    camera = make_camera(random_scene(24))
+    with torch.no_grad():
+        images = [nw.render(m.surfels, m.texture, camera, **m.render_options).image for m in (model, first, second)]
+    assert torch.equal(images[1], images[2])
+    assert images[0].std() > 0.05
+    assert_close(images[1], images[0], kind="value", name="image", precision=torch.float16)
+
+
+def test_surfels_come_back_exactly_and_the_texture_in_half_precision(tmp_path):
+    model = make_model()
+    loaded = nw.load(save_model(tmp_path, model))
+    for name, value in model.surfels.state_dict().items():
+        assert torch.equal(loaded.surfels.state_dict()[name], value), name
+    for name, value in model.texture.state_dict().items():
+        now = loaded.texture.state_dict()[name]
+        assert now.dtype == torch.float32
+        assert torch.equal(now, value if name == "resolutions" else value.half().float()), name
+    assert loaded.texture.config == model.texture.config
+
+
+def test_saving_what_was_loaded_changes_nothing(tmp_path):
+    file = save_model(tmp_path, make_model())
+    written = file.read_bytes()
+    save_model(tmp_path, nw.load(tmp_path))
+    first, second = ((lambda m: (m.surfels, m.texture))(x) for x in (nw.load(file), nw.load(file)))
+    assert file.stat().st_size == len(written)
+    for one, other in zip(first, second, strict=True):
+        assert all(torch.equal(one.state_dict()[k], other.state_dict()[k]) for k in one.state_dict())
+
+
+def test_meta_survives(tmp_path):
+    loaded = nw.load(save_model(tmp_path, make_model()))
+    plain = json.loads(json.dumps(META))
+    assert {name: loaded.meta[name] for name in META} == plain
+    assert loaded.meta["format_version"] == FORMAT_VERSION and "COLMAP" in loaded.meta["frame"]
+    assert loaded.render_options == {name: plain[name] for name in list(META)[:5]}
+
+
+@pytest.mark.parametrize("count", [1, 700])
+def test_file_is_as_large_as_accounted(tmp_path, count):
+    """60 float32 a surfel, L T F half-precision features, a half-precision MLP (recipe.md 3.8), and a header."""
+    scene = random_scene(count)
+    texture = nw.NeuralTexture(levels=8, table_size=2**12, max_resolution=64.0)
+    size = save_model(tmp_path, Model(make_surfels(scene), texture, dict(META))).stat().st_size
+    mlp = 2 * (16 * 64 + 64 * 64 + 64 * 48)
+    accounted = 60 * 4 * count + 8 * 2**12 * 2 * 2 + mlp
+    assert 0 < size - accounted < 4096
+
+
+def test_missing_model(tmp_path):
+    refused(FileNotFoundError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a run folder")
+    refused(FileNotFoundError, nw.load, tmp_path / "no", names=tmp_path / "no", match="expected a run folder")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model at all", b"\xff" * 64, b"{}" * 100])
+def test_file_of_another_kind(tmp_path, content):
+    (tmp_path / MODEL_FILE).write_bytes(content)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
+def test_truncated_model(tmp_path, share):
+    file = save_model(tmp_path, make_model())
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(share * len(whole))])
+    refused(ValueError, nw.load, file, names=file, match="expected a safetensors file")
+
+
+def test_safetensors_of_another_program(tmp_path):
+    file = tmp_path / MODEL_FILE
+    safetensors.torch.save_file({"x": torch.zeros(3)}, file)
+    refused(ValueError, nw.load, file, names=file, match="no nexwarp metadata")
+
+
+@pytest.mark.parametrize("header", ["{", "[]", "3", '"text"'])
+def test_damaged_metadata(tmp_path, header):
+    file = tmp_path / MODEL_FILE
+    safetensors.torch.save_file({"x": torch.zeros(3)}, file, {"nexwarp": header})
+    refused(ValueError, nw.load, file, names=file, match="metadata")
+
+
+@pytest.mark.parametrize("version", [0, FORMAT_VERSION + 1, "1", None])
+def test_other_format_version(tmp_path, version):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda _, meta: meta.update(format_version=version))
+    refused(ValueError, nw.load, file, names=file, match=f"expected format version {FORMAT_VERSION}, got {version}")
+
+
+@pytest.mark.parametrize("name", ["surfels.means", "surfels.shN", "texture.grid", "texture.mlp.0.weight"])
+def test_missing_tensor(tmp_path, name):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, _: tensors.pop(name))
+    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+
+
+@pytest.mark.parametrize("name", ["surfels.means", "surfels.raw_gammas", "texture.grid", "texture.mlp.2.weight"])
+def test_tensors_that_do_not_fit(tmp_path, name):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, _: tensors.update({name: tensors[name][..., :1].contiguous()}))
+    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+
+
+@pytest.mark.parametrize("key", ["texture", "max_hits", "background", "sh_degree", "low_pass", "clamp_texture"])
+def test_missing_metadata(tmp_path, key):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda _, meta: meta.pop(key))
+    refused(ValueError, nw.load, file, names=file, match=key)
+
+
+def test_nothing_is_unpickled(tmp_path):
+    marker = tmp_path / "exploded"
+    content = pickle.dumps(Bomb(marker))
+    (tmp_path / MODEL_FILE).write_bytes(content)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+    torch.save({"x": Bomb(marker)}, tmp_path / MODEL_FILE)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+    folder = tmp_path / "checkpoint"
+    save_checkpoint(tmp_path, {"x": torch.zeros(1)}, {})
+    (folder / "tensors.safetensors").write_bytes(content)
+    refused(ValueError, load_checkpoint, tmp_path, names=folder, match="expected a whole checkpoint")
+    assert not marker.exists()
+    pickle.loads(content)  # the bomb does work
+    assert marker.exists()
+
+
+# Atomic writing
+
+
+def test_write_replaces_the_whole_file(tmp_path):
+    file = tmp_path / "file"
+    for content in (b"a long first content", b"short"):
+        write_atomically(file, content)
+        assert file.read_bytes() == content and os.listdir(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize("stage", ["write", "rename"])
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, stage):
+    file = tmp_path / "file"
+    file.write_bytes(b"old")
+
+    def full(path: Path, content: bytes) -> int:
+        with open(path, "wb") as half:
+            half.write(content[: len(content) // 2])
+        raise OSError("no space left on device")
+
+    def fail(*_: Any) -> None:
+        raise OSError("cannot rename")
+
+    if stage == "write":
+        monkeypatch.setattr(Path, "write_bytes", full)
+    else:
+        monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="no space|cannot rename"):
+        write_atomically(file, b"new and longer")
+    assert file.read_bytes() == b"old" and os.listdir(tmp_path) == ["file"]
+
+
+# Checkpoints
+
+
+def save_number(run: Path, number: int) -> None:
+    save_checkpoint(run, {"x": torch.full((3,), float(number))}, {"iteration": number})
+
+
+def saved_number(run: Path) -> int:
+    tensors, state = load_checkpoint(run)
+    assert tensors["x"].tolist() == [state["iteration"]] * 3
+    return state["iteration"]
+
+
+def test_checkpoint_round_trip(tmp_path):
+    tensors = {
+        "float": torch.randn(5, 0, 3),
+        "scalar": torch.tensor(7.0),
+        "bytes": torch.get_rng_state(),
+        "strided": torch.randn(4, 6).T,
+    }
+    state = {"iteration": 3, "order": [2, 0, 1], "python": [3, [1, 2], None], "seconds": 0.1}
+    save_checkpoint(tmp_path, tensors, state)
+    loaded, again = load_checkpoint(tmp_path)
+    assert again == state and loaded.keys() == tensors.keys()
+    assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
+    save_number(tmp_path, 4)
+    assert saved_number(tmp_path) == 4 and os.listdir(tmp_path) == ["checkpoint"]
+
+
+def test_kill_between_the_renames_still_resumes(tmp_path):
+    save_number(tmp_path, 1)
+    (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
+    assert saved_number(tmp_path) == 1
+    save_number(tmp_path, 2)
+    assert saved_number(tmp_path) == 2 and os.listdir(tmp_path) == ["checkpoint"]
+
+
+@pytest.mark.parametrize("after_kill", [False, True], ids=["checkpoint", "checkpoint.old"])
+@pytest.mark.parametrize("stage", ["tensors", "state", "first rename", "second rename"])
+def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_kill):
+    """A save may die anywhere, also the one after a kill that left only checkpoint.old."""
+    save_number(tmp_path, 1)
+    if after_kill:
+        (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
+    calls = []
+
+    def fail(*_: Any) -> None:
+        raise OSError("killed")
+
+    def rename(path: Path, target: Path) -> Path:
+        calls.append(path)
+        if (stage == "first rename") == (len(calls) == 1):
+            raise OSError("killed")
+        os.rename(path, target)
+        return target
+
+    with monkeypatch.context() as patch:
+        if stage == "tensors":
+            patch.setattr(safetensors.torch, "save_file", fail)
+        elif stage == "state":
+            patch.setattr("nexwarp.checkpoint.write_atomically", fail)
+        else:
+            patch.setattr(Path, "rename", rename)
+        if (stage, after_kill) != ("second rename", True):  # there is only one rename then
+            with pytest.raises(OSError, match="killed"):
+                save_number(tmp_path, 2)
+    assert saved_number(tmp_path) == 1
+    save_number(tmp_path, 3)
+    assert saved_number(tmp_path) == 3 and os.listdir(tmp_path) == ["checkpoint"]
+
+
+def test_no_checkpoint(tmp_path):
+    refused(FileNotFoundError, load_checkpoint, tmp_path, names=tmp_path, match="expected a checkpoint to resume from")
+
+
+@pytest.mark.parametrize("name", ["tensors.safetensors", "state.json"])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "binary"])
+def test_damaged_checkpoint(tmp_path, name, damage):
+    save_number(tmp_path, 1)
+    file = tmp_path / "checkpoint" / name
+    if damage == "missing":
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:-3] if damage == "truncated" else b"\xff\xfe\x00" * 9)
+    refused(ValueError, load_checkpoint, tmp_path, names=tmp_path / "checkpoint", match="expected a whole checkpoint")
+
+
+# Cameras
+
+
+def test_cameras_come_back_exactly(tmp_path):
+    cameras = {
+        "train": {f"{i}.png": make_camera(random_scene(2, off_centre=i == 1), near=0.1 * i) for i in range(3)},
+        "test": {"folder/a b.jpg": make_camera(random_scene(2, seed=5))},
+        "empty": {},
+    }
+    file = tmp_path / "cameras.json"
+    save_cameras(file, cameras)
+    loaded = load_cameras(file)
+    assert {group: list(members) for group, members in loaded.items()} == {g: list(m) for g, m in cameras.items()}
+    for group, members in cameras.items():
+        for name, camera in members.items():
+            now = loaded[group][name]
+            assert torch.equal(now.viewmat, camera.viewmat) and torch.equal(now.K, camera.K)
+            assert (now.width, now.height, now.near) == (camera.width, camera.height, camera.near)
+            assert now.viewmat.dtype == torch.float32
+
+
+ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+CAMERA = {"viewmat": ROWS, "K": [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]], "width": 8, "height": 6}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        "[1, 2]",
+        '{"train": [1]}',
+        '{"train": {"a": 3}}',
+        json.dumps({"train": {"a": CAMERA}}),  # no near
+        json.dumps({"train": {"a": CAMERA | {"near": "x"}}}),
+        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": ROWS[:3]}}}),
+        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": "text"}}}),
+        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "K": ROWS}}}),
+        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "width": 0}}}),
+        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": [[float("nan")] * 4] * 4}}}),
+    ],
+)
+def test_malformed_cameras(tmp_path, content):
+    file = tmp_path / "cameras.json"
+    file.write_text(content)
+    refused(ValueError, load_cameras, file, names=file, match="expected named cameras as JSON")
+
+
+def test_missing_cameras(tmp_path):
+    file = tmp_path / "cameras.json"
+    refused(FileNotFoundError, load_cameras, file, names=file, match="expected the run's cameras")
