@@ -18,8 +18,8 @@ from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.metrics import to_uint8
 from nexwarp.paths import ellipse
-from nexwarp.pictures import save_png
-from nexwarp.render import render
+from nexwarp.pictures import save_exr, save_png
+from nexwarp.render import Rendering, render
 from nexwarp.runs import (
     CAMERAS_FILE,
     DEMO,
@@ -162,6 +162,8 @@ class Render:
     """Run folder."""
     frames: int = 120
     """Views on the ellipse; 0 for none."""
+    buffers: bool = False
+    """Also write each test view's passes as a multi-part OpenEXR file."""
     device: str | None = None
     """`cuda` or `cpu`; CUDA where present by default."""
 
@@ -182,6 +184,8 @@ class Render:
             for file, camera in jobs.items():
                 out = render(model.surfels, model.texture, camera.to(device), **model.render_options)
                 save_png(file, to_uint8(out.image).cpu())
+                if self.buffers and file.is_relative_to(renders / "test"):
+                    save_exr(file.with_suffix(".exr"), pass_buffers(out))
                 done()
         console.print(f"{len(jobs)} pictures in {renders}")
 
@@ -213,6 +217,14 @@ class Info:
             metrics = json.loads((self.run / METRICS_FILE).read_text())
             rows |= {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
         console.print(display.results_table(rows, str(self.run)))
+
+
+def pass_buffers(out: Rendering) -> dict[str, torch.Tensor]:
+    """Name every pass of a rendering, for an OpenEXR file: (H, W), (H, W, 3) float or (H, W) int32 each."""
+    parts = {name: getattr(out, name) for name in ("image", "plain", "textured", "alpha")}
+    for k in range(out.ids.shape[2]):
+        parts |= {f"{name}.{k}": getattr(out, name)[..., k] for name in ("ids", "depths", "weights")}
+    return parts
 
 
 def _train(trainer: Trainer, run: Path, console: Console) -> None:
@@ -291,7 +303,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; bad input gives one line on stderr and exit code 2."""
     import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING
+    # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
+    wp.config.log_level = wp.LOG_ERROR
     commands = {"train": Train, "eval": Eval, "render": Render, "info": Info}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments

@@ -1,10 +1,11 @@
 """Pictures for people: written whole or not at all, error maps, strips with captions."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from nexwarp.ops.checks import check_range
@@ -25,6 +26,35 @@ def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         Image.fromarray(pixels).save(temporary, format="PNG")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_exr(path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor]) -> None:
+    """Write tensors as the named parts of one OpenEXR file, exactly: float32 as FLOAT, int32 as UINT.
+
+    Args:
+        path: where to; written aside, then renamed.
+        parts: name -> (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (channel Y; -1
+            becomes 4294967295).
+    """
+    import OpenEXR
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.exr")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    files = []
+    for name, tensor in parts.items():
+        values = np.ascontiguousarray(tensor.detach().cpu().numpy())
+        if values.dtype == np.int32:
+            values = values.view(np.uint32)
+        planes = {"R": 0, "G": 1, "B": 2} if values.ndim == 3 else {"Y": None}
+        channels = {c: np.ascontiguousarray(values if i is None else values[..., i]) for c, i in planes.items()}
+        files.append(OpenEXR.Part(dict(header), channels, name))
+    try:
+        OpenEXR.File(files).write(str(temporary))
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from nexwarp.metrics import to_uint8
-from nexwarp.pictures import error_map, save_png, side_by_side
+from nexwarp.pictures import error_map, save_exr, save_png, side_by_side
 
 
 def read(path: Path) -> torch.Tensor:
@@ -91,3 +91,21 @@ def test_wrong_inputs_name_the_argument(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="images: expected at least one, got none"):
         side_by_side([])
     assert not list(tmp_path.iterdir())
+
+
+def test_exr_parts_read_back_bit_for_bit(tmp_path: Path) -> None:
+    import OpenEXR
+
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randn(5, 7, 3, generator=generator) * 1e6
+    alpha = torch.rand(5, 7, generator=generator)
+    ids = torch.randint(-1, 2**31 - 1, (5, 7), generator=generator, dtype=torch.int32)
+    save_exr(tmp_path / "passes.exr", {"image": image, "alpha": alpha, "ids.0": ids})
+    with OpenEXR.File(str(tmp_path / "passes.exr"), separate_channels=True) as file:
+        read = {part.name(): {k: c.pixels for k, c in part.channels.items()} for part in file.parts}
+    for index, channel in enumerate("RGB"):
+        assert (read["image"][channel] == image[..., index].numpy()).all()
+    assert (read["alpha"]["Y"] == alpha.numpy()).all()
+    assert read["ids.0"]["Y"].dtype == "uint32"
+    assert (read["ids.0"]["Y"].view("int32") == ids.numpy()).all()
+    assert [path.name for path in tmp_path.iterdir()] == ["passes.exr"]

@@ -16,6 +16,8 @@ from nexwarp.kernels.types import types
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01
 RELATIVE_MARGIN = 4e-6
+# A typed constant: a bare literal of this size would be an int32.
+SIGN = wp.constant(wp.uint32(2147483648))
 
 
 @functools.cache
@@ -185,8 +187,7 @@ def depth_keys_kernel(real: type) -> wp.Kernel:
         i = first + wp.tid()
         # Adding 0 makes -0 and 0 tie, as they do in any comparison of floats.
         bits = wp.cast(wp.float32(centers[i][2]) + wp.float32(0.0), wp.uint32)
-        sign = wp.uint32(2147483648)
-        keys[i] = wp.where((bits & sign) != wp.uint32(0), ~bits, bits | sign)
+        keys[i] = wp.where((bits & SIGN) != wp.uint32(0), ~bits, bits | SIGN)
         indices[i] = i
 
     return depth_keys

@@ -1,0 +1,217 @@
+"""Results depend neither on how many threads there are nor on the size of the tiles; blended errors are what they say."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from nexwarp import ops
+from nexwarp.kernels import launch
+from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+BUFFERS = ("plain", "ids", "depths", "weights", "alpha")
+BIG = {"width": 61, "height": 45}
+
+
+@pytest.fixture(autouse=True)
+def restore_threads():
+    before = launch.get_num_threads()
+    yield
+    launch.set_num_threads(before)
+
+
+class Passes:
+    """The passes of one rendering, their inputs being leaves: project -> tiles -> collect, then a fixed random loss."""
+
+    def __init__(self, scene: Scene, *, tile_size: int = 16, max_hits: int = 2, low_pass: bool = False) -> None:
+        surfels, camera = make_surfels(scene), make_camera(scene)
+        shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
+        viewmat = camera.viewmat.detach().clone().requires_grad_()
+        shape = tuple(x.detach().clone().requires_grad_() for x in shape)
+        self.pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+        self.low_pass = low_pass
+        sh = surfels.sh.detach().clone().requires_grad_()
+        self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
+        self.projection = ops.project(*shape, self.colors, viewmat)
+        self.tiles = ops.intersect_tiles(
+            *shape, self.projection, viewmat, self.pinhole, low_pass=low_pass, tile_size=tile_size
+        )
+        self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits, low_pass=low_pass)
+        names = ("means", "quats", "scales", "opacities", "gammas", "sh", "viewmat")
+        self.leaves = dict(zip(names, (*shape, sh, viewmat), strict=True))
+
+    def buffers(self) -> dict[str, torch.Tensor]:
+        return {name: getattr(self.hits, name).detach() for name in BUFFERS}
+
+    def gradients(self) -> dict[str, torch.Tensor]:
+        generator = torch.Generator().manual_seed(2)
+        loss = sum(
+            (x * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)).sum()
+            for x in (self.hits.plain, self.hits.depths, self.hits.weights, self.hits.alpha)
+        )
+        loss.backward()
+        return {name: leaf.grad for name, leaf in self.leaves.items()}
+
+    def blended(self, errors: torch.Tensor) -> torch.Tensor:
+        return ops.splat_error(
+            self.projection, self.tiles, self.hits, self.pinhole, errors, low_pass=self.low_pass
+        ).detach()
+
+
+def errors_of(scene: Scene, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(9)
+    return torch.rand(scene["height"], scene["width"], generator=generator, dtype=torch.float64).to(dtype)
+
+
+def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
+    """Fail unless all results agree to the last bit, and hold something."""
+    for name, first in results[0].items():
+        assert bool(first.any()), name
+        assert all(torch.equal(first, other[name]) for other in results[1:]), name
+
+
+# Threads
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_collect_does_not_depend_on_threads(low_pass):
+    scene = random_scene(600, **BIG)
+    errors = errors_of(scene)
+    results = []
+    for count in (1, 2, 3):
+        launch.set_num_threads(count)
+        passes = Passes(scene, low_pass=low_pass)
+        watch = passes.hits.watch
+        watch.errors = errors
+        results.append(passes.buffers() | {"blended": passes.blended(errors)})
+        results[-1] |= {f"grad_{name}": grad for name, grad in passes.gradients().items()}
+        results[-1]["watched"] = watch.sums
+    assert len(launch.chunks(4 * 3 * 16**2)) > 3  # there was something to share out
+    assert_identical(results)
+
+
+@pytest.mark.parametrize("with_colors", [False, True], ids=["coefficients", "colors"])
+def test_texture_does_not_depend_on_threads(with_colors):
+    texture = make_texture()
+    generator = torch.Generator().manual_seed(4)
+    count, hits = 1500, 2
+    positions = 3 * torch.randn(count, hits, 3, generator=generator)
+    depths = 1 + torch.rand(count, hits, generator=generator)
+    depths[::7, 1] = 0.0  # empty slots
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    results = []
+    for threads in (1, 2, 3):
+        launch.set_num_threads(threads)
+        inputs = {"positions": positions, "depths": depths, "directions": directions}
+        leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+        if with_colors:
+            out = texture.colors(leaves["positions"], leaves["depths"], leaves["directions"], 24.0)
+        else:
+            out = texture(leaves["positions"], leaves["depths"], 24.0)
+            leaves.pop("directions")
+        factors = torch.randn(out.shape, generator=torch.Generator().manual_seed(1))
+        parameters = dict(texture.named_parameters())
+        grads = torch.autograd.grad((out * factors).sum(), [*leaves.values(), *parameters.values()])
+        results.append({"out": out.detach()} | dict(zip([*leaves, *parameters], grads, strict=True)))
+    assert_identical(results)
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_thread_count_must_be_positive(count):
+    before = launch.get_num_threads()
+    with pytest.raises(ValueError, match=f"^count: expected at least 1, got {count}$"):
+        launch.set_num_threads(count)
+    assert launch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("dim", [0, 1, 255, 256, 257, 4096, 4097, 1_000_003])
+def test_chunks_cover_the_range_once_whatever_the_threads(dim):
+    parts = launch.chunks(dim)
+    assert len(parts) <= launch.CHUNKS
+    covered = 0
+    for first, last in parts:
+        assert first == covered < last
+        covered = last
+    assert covered == dim
+    launch.set_num_threads(3)
+    assert launch.chunks(dim) == parts
+
+
+# Tiles
+
+
+@pytest.mark.parametrize("make", [random_scene, layered_scene])
+def test_hits_do_not_depend_on_the_size_of_tiles(make):
+    """Values to the last bit; gradients to rounding, as the sums over tiles change their order."""
+    scene = make(40, seed=1)
+    results: list[tuple[dict[str, Any], dict[str, Any], torch.Tensor]] = []
+    for tile_size in (8, 16, 32):
+        passes = Passes(scene, tile_size=tile_size)
+        assert len(passes.tiles.tile_offsets) - 1 == -(-23 // tile_size) * -(-18 // tile_size)
+        results.append((passes.buffers(), passes.gradients(), passes.blended(errors_of(scene))))
+    assert_identical([buffers for buffers, _, _ in results])
+    for _, gradients, blended in results[1:]:
+        for name, gradient in gradients.items():
+            assert_close(gradient, results[0][1][name], kind="gradient", name=name)
+        assert_close(blended, results[0][2], kind="value", name="blended")
+
+
+@pytest.mark.parametrize("tile_size", [0, 4, 12, -8])
+def test_tile_size_must_be_a_multiple_of_eight(tile_size):
+    with pytest.raises(ValueError, match=f"^tile_size: expected a multiple of 8, got {tile_size}$"):
+        Passes(random_scene(2), tile_size=tile_size)
+
+
+# Blended errors
+
+
+def summed(passes: Passes, errors: torch.Tensor, count: int) -> torch.Tensor:
+    """(N,) float64: sum over pixels of weight * error, from the K-buffer, which must hold all hits."""
+    ids, weights = passes.hits.ids.long(), passes.hits.weights.detach().double()
+    assert not passes.hits.plain.any()  # nothing fell out of the buffer
+    shares = torch.where(ids >= 0, weights * errors.double()[..., None], 0.0)
+    return torch.zeros(count, dtype=torch.float64).index_add(0, ids.clamp_min(0).flatten(), shares.flatten())
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
+    scene = random_scene(8, seed=6, dtype=dtype)
+    errors = errors_of(scene, dtype)
+    passes = Passes(scene, max_hits=8, low_pass=low_pass)
+    assert int((passes.hits.ids >= 0).sum(-1).max()) >= 3
+    assert_close(passes.blended(errors), summed(passes, errors, 8), kind="value", name="blended")
+
+
+@pytest.mark.parametrize("make", [random_scene, layered_scene])
+def test_blended_error_is_the_gradient_to_the_colours(make):
+    """With K = 0 the image is sum w c, so d(sum error * image) / dc = sum w error, for any number of hits."""
+    scene = make(40, seed=2)
+    errors = errors_of(scene)
+    passes = Passes(scene, max_hits=0)
+    (gradient,) = torch.autograd.grad((passes.hits.plain * errors[..., None]).sum(), passes.colors)
+    for channel in range(3):
+        assert_close(passes.blended(errors), gradient[:, channel], kind="value", name="blended")
+
+
+def test_watching_the_backward_pass_gives_the_blended_error():
+    scene = random_scene(40, seed=5)
+    errors = errors_of(scene)
+    passes = Passes(scene)
+    passes.hits.watch.errors = errors
+    watched = passes.gradients()
+    assert_close(passes.hits.watch.sums, passes.blended(errors), kind="value", name="sums")
+    plain = Passes(scene).gradients()
+    assert all(torch.equal(watched[name], plain[name]) for name in plain)
+
+
+def test_errors_must_have_the_size_of_the_image():
+    passes = Passes(random_scene(4))
+    with pytest.raises(ValueError, match=r"^errors: expected shape \(18, 23\), got \(23, 18\)"):
+        passes.blended(torch.zeros(23, 18))
+
+
+def test_no_error_blends_to_nothing():
+    scene = random_scene(8)
+    assert not Passes(scene).blended(0 * errors_of(scene)).any()
