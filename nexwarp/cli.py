@@ -1,8 +1,10 @@
 """Command line: `nexwarp train`, `eval`, `render`, `info`."""
 
 import dataclasses
-import json
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +30,7 @@ from nexwarp.runs import (
     create_run,
     pick_device,
     prepare_run,
+    read_metrics,
     read_run,
 )
 from nexwarp.trainer import Config, LearningRates, TextureConfig, Trainer, preset
@@ -90,6 +93,8 @@ class Train:
         source = SceneSource(self.scene, self.images, self.downscale)
         run = self.run or Path("runs") / source.name
         prepare_run(run, resume=self.resume, overwrite=self.overwrite)
+        if self.resume:
+            source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run)
         if self.downscale < 1:
@@ -110,6 +115,18 @@ class Train:
             create_run(run, source, config, device.type)
         _train(trainer, run, console)
         _finish(trainer, scene, run, device, console)
+
+    def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
+        """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
+        old, config, _ = read_run(run)
+        for flag, default, given, expected in (
+            ("--downscale", 1, self.downscale, old.downscale),
+            ("--images", "images", self.images, old.images),
+            ("--preset", "default", self.preset, config.preset),
+        ):
+            if given not in (default, expected):
+                raise ValueError(f"{flag}: expected {expected} as in the run to resume, got {given}")
+        return dataclasses.replace(old, path=source.path)
 
     def _config(self, run: Path) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
@@ -176,9 +193,11 @@ class Render:
         model = load(self.run).to(device)
         cameras = load_cameras(self.run / CAMERAS_FILE)
         renders = self.run / "renders"
-        jobs = {renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras["test"].items()}
+        jobs = {
+            renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras.get("test", {}).items()
+        }
         if self.frames:
-            path = ellipse(list(cameras["train"].values()), self.frames)
+            path = ellipse(list(cameras.get("train", {}).values()), self.frames)
             jobs |= {renders / "ellipse" / f"{i:04d}.png": camera for i, camera in enumerate(path)}
         with display.counting(console, "rendering", len(jobs)) as done:
             for file, camera in jobs.items():
@@ -213,8 +232,7 @@ class Info:
             }
         else:
             rows["model"] = "none yet: the training has not finished"
-        if (self.run / METRICS_FILE).is_file():
-            metrics = json.loads((self.run / METRICS_FILE).read_text())
+        if metrics := read_metrics(self.run):
             rows |= {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
         console.print(display.results_table(rows, str(self.run)))
 
@@ -229,19 +247,36 @@ def pass_buffers(out: Rendering) -> dict[str, torch.Tensor]:
 
 def _train(trainer: Trainer, run: Path, console: Console) -> None:
     """Run the loop with its display; keep checkpoints on the way and when interrupted."""
-    every = max(trainer.config.iterations // CHECKPOINTS, 1)
-    with display.TrainingDisplay(console, trainer.config.iterations, trainer.iteration, trainer.device) as shown:
+    total = trainer.config.iterations
+    every = max(total // CHECKPOINTS, 1)
+    shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
+    with shown, _deferred_interrupt() as interrupted:
 
         def observe(step: Any) -> None:
             shown(step)
-            if step.iteration % every == 0 or step.iteration == trainer.config.iterations:
+            if step.iteration % every == 0 or step.iteration == total or interrupted():
                 trainer.save(run)
+            if interrupted():
+                raise KeyboardInterrupt
 
-        try:
-            trainer.run(observe)
-        except KeyboardInterrupt:
-            trainer.save(run)
-            raise
+        trainer.run(observe)
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Let a first Ctrl-C wait until it is asked for, between steps: no half step is saved. A second does not wait."""
+    asked: list[int] = []
+
+    def handle(number: int, _frame: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
@@ -291,11 +326,8 @@ def _evaluate(
             renders=run / "renders",
             progress=done,
         )
-    file = run / METRICS_FILE
-    if facts is None:
-        facts = json.loads(file.read_text()) if file.is_file() else {}
-    metrics = {**facts, **results}
-    write_json(file, metrics)
+    metrics = {**(read_metrics(run) if facts is None else facts), **results}
+    write_json(run / METRICS_FILE, metrics)
     return metrics
 
 
@@ -313,7 +345,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command(console)
     except (ValueError, OSError) as error:
-        Console(stderr=True, soft_wrap=True, highlight=False).print(f"nexwarp: error: {error}", markup=False)
+        message = " ".join(f"nexwarp: error: {error}".split())
+        Console(stderr=True, soft_wrap=True, highlight=False).print(message, markup=False)
         return 2
     except KeyboardInterrupt:
         Console(stderr=True).print("nexwarp: interrupted; continue with --resume")

@@ -28,7 +28,8 @@ def evaluate(
     """Render views and compare them with their photos.
 
     Args:
-        surfels, texture: the model, on the device to render on.
+        surfels: of the model, on the device to render on.
+        texture: of the model, likewise.
         views: held-out views.
         options: keyword arguments of `nexwarp.render`.
         renders: folder for each view's picture and its strip of photo, render and error; None writes nothing.

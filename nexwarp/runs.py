@@ -1,6 +1,7 @@
 """Run folders: what a training leaves behind, and how it is found again.
 
-A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `renders/` and `checkpoint/`.
+A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `renders/` and
+`checkpoint/`.
 """
 
 import json
@@ -86,8 +87,17 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
     try:
         data = json.loads(path.read_text())
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None
+
+
+def read_metrics(run: Path) -> dict[str, Any]:
+    """Read a run's metrics; nothing where there are none yet."""
+    path = run / METRICS_FILE
+    try:
+        return dict(json.loads(path.read_text())) if path.is_file() else {}
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
 
 
 def pick_device(name: str | None) -> torch.device:

@@ -1,5 +1,7 @@
 """The neural texture: one field shared by all surfels, a hash grid and a small MLP (paper Sec. 3.1)."""
 
+import itertools
+
 import torch
 from torch import nn
 
@@ -14,11 +16,11 @@ LARGEST_RESOLUTION = 1e9
 class NeuralTexture(nn.Module):
     """World-space field F(x) = G(Delta H(x)) that gives spherical harmonics coefficients (paper Eq. 1 and 2).
 
-    Parameters: `grid` (levels, table_size, features), float32, in table order; `mlp`, a torch module without biases whose
-    `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, geometric.
+    Parameters: `grid` (levels, table_size, features), float32, in table order; `mlp`, a torch module without biases
+    whose `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, geometric.
 
-    On CUDA the lookup and the MLP run in half precision on a copy made for each call, with float32 parameters and gradient
-    sums; set `half_precision` to False to keep float32.
+    On CUDA the lookup and the MLP run in half precision on a copy made for each call, with float32 parameters and
+    gradient sums; set `half_precision` to False to keep float32.
     """
 
     resolutions: torch.Tensor
@@ -85,7 +87,7 @@ class NeuralTexture(nn.Module):
         self.register_buffer("resolutions", resolutions)
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in itertools.pairwise(sizes):
             # Linear's own initial values are U(+-1/sqrt(fan_in)), as the method wants.
             layers += [nn.Linear(fan_in, fan_out, bias=False), nn.ReLU()]
         self.mlp = nn.Sequential(*layers[:-1])

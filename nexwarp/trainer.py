@@ -135,7 +135,7 @@ class Config:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Config":
-        """Rebuild a config from `as_dict`; ValueError names an unknown or missing key."""
+        """Rebuild a config from `as_dict`; ValueError names an unknown key."""
         parts = {
             "losses": LossWeights,
             "rates": LearningRates,
@@ -292,6 +292,7 @@ class Trainer:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "order": self.order,
+            "views": len(self.views),
             "numpy": [kind, *rest],
             "python": random.getstate(),
             "config": self.config.as_dict(),
@@ -299,12 +300,17 @@ class Trainer:
         save_checkpoint(run, tensors, state)
 
     def restore(self, run: Path) -> None:
-        """Continue from a checkpoint of the same scene and settings."""
+        """Continue from a checkpoint of the same scene and settings; ValueError where they differ."""
         tensors, state = load_checkpoint(run)
         try:
+            if Config.from_dict(state["config"]) != self.config:
+                raise ValueError("its settings are others")
+            if state["views"] != len(self.views):
+                raise ValueError(f"it has seen {state['views']} training views, the scene has {len(self.views)}")
             self._restore(tensors, state)
-        except (KeyError, TypeError, RuntimeError) as error:
-            raise ValueError(f"{run}: expected a checkpoint of this run, but it does not fit ({error})") from None
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())  # torch's go over several lines
+            raise ValueError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def _restore(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
         raw = {k[8:]: v for k, v in tensors.items() if k.startswith("surfels.")}

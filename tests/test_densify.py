@@ -299,5 +299,5 @@ def test_settings_out_of_range_are_refused(name, value):
 
 
 def test_budget_must_be_positive():
-    with pytest.raises(ValueError, match="^max_surfels: expected at least 1, got 0$"):
+    with pytest.raises(ValueError, match=r"^max_surfels: expected at least 1, got 0$"):
         densifier_of(make(4)[0], budget=0)

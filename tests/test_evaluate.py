@@ -102,5 +102,5 @@ def test_nothing_learns_from_an_evaluation(surfels, texture):
 
 
 def test_no_views(surfels, texture):
-    with pytest.raises(ValueError, match="^views: expected at least one view"):
+    with pytest.raises(ValueError, match=r"^views: expected at least one view"):
         evaluate(surfels, texture, [], options=OPTIONS)

@@ -1,4 +1,4 @@
-"""Results depend neither on how many threads there are nor on the size of the tiles; blended errors are what they say."""
+"""Results depend neither on the number of threads nor on the size of tiles; blended errors are what they say."""
 
 from typing import Any
 

@@ -2,7 +2,7 @@
 
 Symbols, the same in every file of this package:
 
-    means, quats, scales     surfel centre (world), rotation surfel -> world (wxyz), extents along its x and y axes (world)
+    means, quats, scales     surfel centre, rotation surfel -> world (wxyz), extents along its x and y axes; world units
     opacities, gammas        o and (g1, g2) of the generalised Gaussian, paper Eq. 3
     viewmat                  world -> camera (4, 4); x right, y down, z forward
     fx, fy, cx, cy           intrinsics in pixels; pixel centres lie at +0.5
@@ -12,8 +12,8 @@ Symbols, the same in every file of this package:
     K                        length of the hit buffer (max_hits); id -1, weight 0, depth 0 mark an empty slot
     n                        number of texture points, H * W * K
 
-Kernels are made by cached factories over the scalar type, so that the float64 build that the proofs use is the same source.
+Kernels are made by cached factories over the scalar type, so that the float64 build of the proofs is the same source.
 A kernel's first argument is `first`, the offset of its thread range: a CPU launch is one serial loop, so `launch.py`
-splits the range over Python threads. Whatever is written is therefore owned by one thread: no kernel relies on CPU atomics
-across the split.
+splits the range over Python threads. Whatever is written is therefore owned by one thread: no kernel relies on CPU
+atomics across the split.
 """

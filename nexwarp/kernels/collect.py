@@ -18,8 +18,8 @@ and the sum over all i, which the walk then uses up hit by hit, is known from th
     rest = gN . N + sum_k gW_k W_k + gA A.
 
 Each hit is differentiated by `wp.grad` of the one function that the forward pass calls.
-Gradients of entry k go to row rows[k]: the surfel (CUDA: atomics after a sum over the warp) or the entry's own slot (CPU:
-owned by one thread, then added up in a fixed order by `reduce_rows_kernel`).
+Gradients of entry k go to row rows[k]: the surfel (CUDA: atomics after a sum over the warp) or the entry's own slot
+(CPU: owned by one thread, then added up in a fixed order by `reduce_rows_kernel`).
 """
 
 import functools
@@ -31,6 +31,31 @@ from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 
 BLOCK_DIM = 128
+
+
+@wp.func
+def overflowed(ends: wp.array(dtype=wp.int32), surfel_ids: wp.array(dtype=wp.int32)):
+    """Whether there are more entries than the lists have room for."""
+    count = ends.shape[0]
+    if count == 0:
+        return False
+    return ends[count - 1] > surfel_ids.shape[0]
+
+
+@wp.func
+def walk(tile: wp.int32, tile_offsets: wp.array(dtype=wp.int32), ends: wp.array(dtype=wp.int32), overflow: wp.bool):
+    """Range of the walk: the tile's list, or all surfels when lists lack entries (lists only cull: slow, but right)."""
+    if overflow:
+        return wp.vec2i(0, ends.shape[0])
+    return wp.vec2i(tile_offsets[tile], tile_offsets[tile + 1])
+
+
+@wp.func
+def surfel_at(k: wp.int32, listed: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), overflow: wp.bool):
+    """Surfel (or row) at place k of the walk."""
+    if overflow:
+        return order[k]
+    return listed[k]
 
 
 @functools.cache
@@ -83,6 +108,8 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         centers: wp.array(dtype=vec3),
         surfel_ids: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
         intrinsics: vec4,
@@ -113,10 +140,11 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         buffer_depths = vec()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
-        start = tile_offsets[tile]
-        stop = int(start)
-        for k in range(start, tile_offsets[tile + 1]):
-            i = surfel_ids[k]
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(tile, tile_offsets, ends, overflow)
+        stop = int(bounds[0])
+        for k in range(bounds[0], bounds[1]):
+            i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
             rn = records[i, 2]
@@ -193,6 +221,8 @@ def collect_backward_kernel(
         surfel_ids: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
         intrinsics: vec4,
@@ -242,13 +272,15 @@ def collect_backward_kernel(
             error = errors[p]
         transmittance = real(1.0)
         me = lane()
-        for k in range(tile_offsets[tile], tile_offsets[tile + 1]):
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(tile, tile_offsets, ends, overflow)
+        for k in range(bounds[0], bounds[1]):
             live = int(0)
             if k < stop:
                 live = 1
             if any_lane(live) == 0:
                 break
-            i = surfel_ids[k]
+            i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
             rn = records[i, 2]
@@ -294,7 +326,7 @@ def collect_backward_kernel(
                     ra, rb, rn, rc[3], center, d, focal, near, grad_alpha, gt
                 )
                 g3[3] = gm
-            row = rows[k]
+            row = surfel_at(k, rows, order, overflow)
             g0 = sum4(g0)
             g1 = sum4(g1)
             g2 = sum4(g2)
@@ -340,6 +372,8 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         surfel_ids: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
         intrinsics: vec4,
@@ -365,13 +399,15 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         error = errors[p]
         transmittance = real(1.0)
         me = lane()
-        for k in range(tile_offsets[tile], tile_offsets[tile + 1]):
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(tile, tile_offsets, ends, overflow)
+        for k in range(bounds[0], bounds[1]):
             live = int(0)
             if k < stop:
                 live = 1
             if any_lane(live) == 0:
                 break
-            i = surfel_ids[k]
+            i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
             rn = records[i, 2]
@@ -394,7 +430,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
                 continue
             share = sum1(share)
             if me == 0:
-                wp.atomic_add(sums, rows[k], share)
+                wp.atomic_add(sums, surfel_at(k, rows, order, overflow), share)
 
     return splat_error
 

@@ -1,4 +1,7 @@
-"""Composition (paper Eq. 5): image = plain + sum_k weight_k T_k + (1 - alpha) background. One thread a pixel; Warp's own adjoint."""
+"""Composition (paper Eq. 5): image = plain + sum_k weight_k T_k + (1 - alpha) background.
+
+One thread a pixel; Warp's own adjoint.
+"""
 
 import functools
 

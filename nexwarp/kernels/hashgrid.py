@@ -1,12 +1,12 @@
 """Hash-grid lookup (paper Eq. 1 and 2): unbounded, every level hashed, features down-weighted by a pixel's footprint.
 
-One thread a (level, point). Features are stored level-major, (levels * features, n): neighbouring threads write neighbouring
-values, and the MLP's matrix product takes the array as it is. A point with depth 0 (an empty hit slot) gets zeros and gives
-no gradient.
+One thread a (level, point). Features are stored level-major, (levels * features, n): neighbouring threads write
+neighbouring values, and the MLP's matrix product takes the array as it is. A point with depth 0 (an empty hit slot)
+gets zeros and gives no gradient.
 
-The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may be
-half precision while their gradients are summed in float32. On a CPU a launch is split by level: a level's table belongs
-to one thread, and position gradients go to a slot a level (on CUDA all levels share one, by a stride of 0).
+The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may
+be half precision while their gradients are summed in float32. On a CPU a launch is split by level: a level's table
+belongs to one thread, and position gradients go to a slot a level (on CUDA all levels share one, by a stride of 0).
 """
 
 import functools

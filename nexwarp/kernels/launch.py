@@ -1,4 +1,4 @@
-"""Launches that use every CPU core: a CPU launch is a serial loop that frees the GIL, so the range is split over threads.
+"""Launches that use every CPU core: a CPU launch is a serial loop that frees the GIL, so threads share the range.
 
 The number of chunks is fixed, whatever the number of threads, so that nothing depends on how many there are.
 """
@@ -62,8 +62,8 @@ def launch(
         device: Warp device.
         stream: CUDA stream, by default the device's current one.
         block_dim: threads a block on CUDA.
-        adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs no
-            gradient. Gradients are added to.
+        adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs
+            no gradient. Gradients are added to.
     """
     shape = (dim,) if isinstance(dim, int) else tuple(dim)
     if min(shape) == 0:

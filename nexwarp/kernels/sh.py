@@ -1,7 +1,7 @@
 """Spherical harmonics colours of degree 0 to 3: plain (a thread a surfel) and textured (a thread a point).
 
-Plain colours use Warp's own adjoint; textured ones are linear in the coefficients, and `wp.grad` differentiates the basis.
-Constants and signs are the field's.
+Plain colours use Warp's own adjoint; textured ones are linear in the coefficients, and `wp.grad` differentiates the
+basis. Constants and signs are the field's.
 """
 
 import functools

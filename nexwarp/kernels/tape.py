@@ -1,10 +1,13 @@
-"""The passes for Warp-only programs: every one records itself on a `wp.Tape`, so `tape.backward()` differentiates a render.
+"""The passes for Warp-only programs: each records itself on a `wp.Tape`; `tape.backward()` differentiates a render.
 
 Arrays are Warp arrays of one scalar type (float32 or float64) on one device; what is to receive gradients is made with
 `requires_grad=True`. Outputs own gradients. The generated adjoints record themselves, since the calls launch under the
 tape; the hand-structured pairs go through `tape.record_func`. The same kernels serve torch in `nexwarp.ops`.
 
-    with-less use:  tape = wp.Tape(); records, centers = project(tape, ...); ...; tape.backward(loss)
+    tape = wp.Tape()
+    records, centers = project(tape, ...)
+    ...
+    tape.backward(loss)
 """
 
 from typing import Any, NamedTuple
@@ -34,6 +37,8 @@ class Lists(NamedTuple):
 
     surfel_ids: wp.array
     tile_offsets: wp.array
+    order: wp.array
+    ends: wp.array
     tile_size: int
     columns: int
 
@@ -133,7 +138,7 @@ def intersect_tiles(
         _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
     offsets = integers(columns * rows + 1)
     _silent(tile_offsets_kernel, len(offsets), [tiles.view(wp.int32), total], [offsets])
-    return Lists(ids, offsets, tile_size, columns)
+    return Lists(ids, offsets, order[:count], ends, tile_size, columns)
 
 
 def collect(
@@ -159,17 +164,17 @@ def collect(
     )
     threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
     view = [wp.vec2i(*image.size), lists.columns, t.vec4(*image.intrinsics), image.near]
-    inputs = [records, centers, lists.surfel_ids, lists.tile_offsets, *view]
+    inputs = [records, centers, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends, *view]
     kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
     _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
 
     def backward() -> None:
         found = [hits.plain, hits.ids, hits.weights, hits.alphas, hits.stops]
         grads = [hits.plain.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
-        rows = [records, centers, lists.surfel_ids, lists.surfel_ids, lists.tile_offsets]
+        ids = [lists.surfel_ids, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
         kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
         outputs = [records.grad, centers.grad, None]
-        _silent(kernel, threads, [*rows, *view, *found, *grads, None], outputs, BLOCK_DIM)
+        _silent(kernel, threads, [records, centers, *ids, *view, *found, *grads, None], outputs, BLOCK_DIM)
 
     tape.record_func(backward, [records, centers, hits.plain, hits.depths, hits.weights, hits.alphas])
     return hits

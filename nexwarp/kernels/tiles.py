@@ -1,8 +1,8 @@
 """Tile lists: which surfels may be seen in which tile, near to far. Integers only, nothing here is differentiable.
 
-A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and projected: a convex
-polygon of at most five corners. A tile row's slab cuts out one span of it, so the tiles that the polygon touches are listed exactly,
-without its bounding box. The support only culls; alpha >= 1/255 decides.
+A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
+projected: a convex polygon of at most five corners. A tile row's slab cuts out one span of it, so the tiles that the polygon
+touches are listed exactly, not those of its bounding box. The support only culls; alpha >= 1/255 decides.
 """
 
 import functools
@@ -261,9 +261,11 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         for row in range(shape.rows[0], shape.rows[1] + 1):
             s = f.span(shape, row, grid[0])
             for column in range(s[0], s[1] + 1):
-                tiles[e] = row * grid[0] + column
-                entries[e] = e
-                surfels[e] = i
+                # Lists may be too short (see `nexwarp.ops.tiles`): never write past them.
+                if e < entries.shape[0]:
+                    tiles[e] = row * grid[0] + column
+                    entries[e] = e
+                    surfels[e] = i
                 e += 1
 
     return SimpleNamespace(count=count, emit=emit)

@@ -40,7 +40,7 @@ class Hits:
     """What the collection pass found.
 
     Attributes:
-        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer, N of paper Eq. 4; differentiable.
+        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 4); differentiable.
         ids: (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots.
         depths: (H, W, K) z-depths in world units, 0 in empty slots; differentiable.
         weights: (H, W, K), 0 in empty slots; differentiable.
@@ -89,9 +89,12 @@ def splat_error(
     """Give each surfel the sum over pixels of its blending weight times the pixel's error.
 
     Args:
-        projection, tiles, camera, low_pass: as given to `collect`.
+        projection: as given to `collect`.
+        tiles: as given to `collect`.
         hits: as returned by `collect`.
+        camera: as given to `collect`.
         errors: (H, W) error of each pixel, >= 0.
+        low_pass: as given to `collect`.
 
     Returns:
         (N,) blended errors. Not differentiable.
@@ -121,7 +124,7 @@ def _inputs(
     rows: torch.Tensor | None = None,
 ) -> list[Any]:
     t = types(real_of(records))
-    lists = [tiles.surfel_ids] + ([] if rows is None else [rows]) + [tiles.tile_offsets]
+    lists = [tiles.surfel_ids, *([] if rows is None else [rows]), tiles.tile_offsets, tiles.order, tiles.ends]
     return [
         array(records, t.vec4),
         array(centers, t.vec3),
@@ -135,14 +138,14 @@ def _inputs(
 
 def _rows(tiles: Tiles, records: torch.Tensor) -> tuple[torch.Tensor, int]:
     """Row that each entry's gradient goes to, and how many rows: by entry on a CPU, by surfel on CUDA."""
-    if records.is_cuda:
-        return tiles.surfel_ids, len(records)
-    return tiles.entries, len(tiles.entries)
+    if tiles.exact:
+        return tiles.entries, len(tiles.entries)
+    return tiles.surfel_ids, len(records)
 
 
 def _reduce(slots: torch.Tensor, tiles: Tiles, count: int, dtype: type) -> torch.Tensor:
     """Add up each surfel's rows; on CUDA they already are. A row is (columns,) elements of `dtype`."""
-    if slots.is_cuda:
+    if not tiles.exact:
         return slots
     sums = slots.new_zeros(count, *slots.shape[1:])
     inputs = [array(tiles.order, wp.int32), array(tiles.ends, wp.int32), array(slots, dtype), slots.shape[1]]

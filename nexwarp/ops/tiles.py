@@ -27,6 +27,8 @@ class Tiles:
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
         tile_size: pixels along a tile's side.
         columns: tiles in a row.
+        exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
+            or, when `ends` says that there are more than M, the lists are incomplete and the walk goes over `order`.
     """
 
     order: torch.Tensor
@@ -36,6 +38,7 @@ class Tiles:
     tile_offsets: torch.Tensor
     tile_size: int
     columns: int
+    exact: bool
 
 
 def intersect_tiles(
@@ -50,16 +53,23 @@ def intersect_tiles(
     *,
     low_pass: bool = False,
     tile_size: int = TILE_SIZE,
+    room: int | None = None,
 ) -> Tiles:
-    """List, for each tile, the surfels whose support touches it (arguments as for `project`).
+    """List, for each tile, the surfels whose support touches it.
 
     Args:
-        means, quats, scales, opacities, gammas: activated surfels.
+        means: (N, 3) world.
+        quats: (N, 4) unit, wxyz, surfel to world.
+        scales: (N, 2) world units.
+        opacities: (N,).
+        gammas: (N, 2).
         projection: of the same surfels.
         viewmat: (4, 4) world to camera.
         camera: the image plane.
         low_pass: whether supports include the screen-space low-pass.
         tile_size: pixels along a tile's side, a multiple of 8.
+        room: entries to make room for; by default as many as there are (CPU) or as there will hardly be more than
+            (CUDA, where the exact number would cost a wait). Too few is slow but right.
     """
     if tile_size % 8 or tile_size < 8:
         raise ValueError(f"tile_size: expected a multiple of 8, got {tile_size}")
@@ -80,31 +90,31 @@ def intersect_tiles(
     ]
     ends = torch.zeros(count, dtype=torch.int32, device=means.device)
     launch(means, kernels.count, count, arguments, [array(ends, wp.int32)])
-    total = _scan(ends)
-    entries, tile_ids, surfels = _pairs(total, means.device)
-    emitted = [array(x, wp.int32) for x in (tile_ids, entries, surfels)]
+    _scan(ends)
+    exact = means.device.type == "cpu" and room is None
+    if room is None:
+        room = _total(ends) if exact else _room(ends, (columns, rows, low_pass))
+    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
+    fill = {"dtype": torch.int32, "device": means.device}
+    entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
+    surfels, surfel_ids = torch.zeros(room, **fill), torch.empty(room, **fill)
+    emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
     launch(means, kernels.emit, count, [*arguments, array(ends, wp.int32)], emitted)
-    _sort(tile_ids, entries, total, (columns * rows).bit_length())
-    surfel_ids = torch.empty(total, dtype=torch.int32, device=means.device)
-    launch(means, surfel_ids_kernel, total, emitted[1:], [array(surfel_ids, wp.int32)])
-    offsets = torch.empty(columns * rows + 1, dtype=torch.int32, device=means.device)
-    launch(means, tile_offsets_kernel, len(offsets), [emitted[0], total], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries[:total], offsets, tile_size, columns)
+    _sort(tile_ids, entries, room, (columns * rows).bit_length())
+    launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    offsets = torch.empty(columns * rows + 1, **fill)
+    launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
+    return Tiles(order, ends, surfel_ids, entries[:room], offsets, tile_size, columns, exact)
 
 
 def _depth_order(centers: torch.Tensor, t: Any) -> torch.Tensor:
     """Indices of surfels by signed depth, ties by index (the sort is stable)."""
     count = len(centers)
-    # The sort takes the second half of its arrays as scratch.
     keys, order = (torch.empty(2 * count, dtype=torch.int32, device=centers.device) for _ in range(2))
     outputs = [array(keys, wp.uint32), array(order, wp.int32)]
     launch(centers, depth_keys_kernel(t.real), count, [array(centers.contiguous(), t.vec3)], outputs)
     _sort(keys, order, count, 32)
     return order[:count]
-
-
-def _pairs(total: int, device: torch.device) -> list[torch.Tensor]:
-    return [torch.empty(2 * total, dtype=torch.int32, device=device) for _ in range(3)]
 
 
 def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> None:
@@ -116,11 +126,53 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
 
 
-def _scan(counts: torch.Tensor) -> int:
-    """Turn counts into ends in place and return the total, which sizes the lists: the one wait of a frame on CUDA."""
+def _scan(counts: torch.Tensor) -> None:
+    """Turn counts into ends in place."""
     if len(counts) == 0:
-        return 0
+        return
     ends = wp.from_torch(counts, dtype=wp.int32)
     with wp.ScopedStream(stream_of(counts)):
         wp.utils.array_scan(ends, ends, inclusive=True)
-    return int(counts[-1])
+
+
+def _total(ends: torch.Tensor) -> int:
+    return int(ends[-1]) if len(ends) else 0
+
+
+@dataclass
+class _Need:
+    """What renderings of one kind needed, learnt without waiting: the count arrives in pinned memory some time later."""
+
+    room: int
+    total: torch.Tensor
+    copied: torch.cuda.Event
+
+
+_needs: dict[tuple, _Need] = {}
+
+
+def _room(ends: torch.Tensor, kind: tuple) -> int:
+    """Entries to make room for on CUDA: what such renderings needed so far, and half as much again.
+
+    Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
+    of two). A later one that needs more than there is room for is still right, since the walk then goes over all surfels,
+    but slow; the next one finds more room.
+    """
+    if len(ends) == 0:
+        return 0
+    key = (ends.device.index, len(ends).bit_length(), *kind)
+    need = _needs.get(key)
+    if need is None:
+        total = torch.empty(1, dtype=torch.int32, pin_memory=True)
+        need = _needs[key] = _Need(_with_margin(_total(ends)), total, torch.cuda.Event())
+    elif need.copied.query():
+        need.room = max(need.room, _with_margin(int(need.total)))
+    else:
+        return need.room
+    need.total.copy_(ends[-1:], non_blocking=True)
+    need.copied.record(torch.cuda.current_stream(ends.device))
+    return need.room
+
+
+def _with_margin(total: int) -> int:
+    return total + total // 2 + 4096

@@ -1,0 +1,93 @@
+"""One default training step, in the middle of a run: degree 3, blended errors watched, all losses, Adam."""
+
+import sys
+import time
+
+import torch
+
+import nexwarp as nw
+from benchmarks import suite
+from benchmarks.scenes import GARDEN, Scene, cloud, garden, saharov
+from benchmarks.suite import Options
+from benchmarks.timing import Measurement, figure, synchronize
+from nexwarp.data import Scene as Photos
+from nexwarp.data import View
+from nexwarp.metrics import to_uint8
+from nexwarp.trainer import Config, TextureConfig, Trainer
+
+MIDDLE = 10_000  # iteration
+POINTS = 1000
+
+
+def run(options: Options) -> list[Measurement]:
+    small = cloud(500, 64, 48) if options.quick else cloud(5_000, 240, 160)
+    if not options.cuda:
+        return step(small, options)
+    if options.quick:
+        scenes = [garden(20_000, 400, 259, options.data), small]
+    else:
+        scenes = [garden(GARDEN, 1558, 1039, options.data), saharov(data=options.data), small]
+    return [m for scene in scenes for m in step(scene, options)]
+
+
+def step(scene: Scene, options: Options) -> list[Measurement]:
+    trainer = make_trainer(scene, options)
+    one = options.time("training step", trainer.step, **scene.facts)
+    count = 3 if options.quick else 200 if options.cuda else 5
+    synchronize(options.device)
+    start = time.perf_counter()
+    for _ in range(count):
+        trainer.step()
+    synchronize(options.device)
+    rate = count / (time.perf_counter() - start)
+    note = f"{count} steps in a row, density control included as it falls due. {scene.note}".strip()
+    facts = scene.facts | {"note": note}
+    return [one, figure("training rate", rate, options.device, unit="it/s", **facts)]
+
+
+def make_trainer(scene: Scene, options: Options) -> Trainer:
+    """Trainer with default settings (small tables on scenes for a CPU) that goes on from the scene's surfels."""
+    count = len(scene.surfels)
+    large = count >= 20_000
+    shape = TextureConfig() if large else TextureConfig(levels=8, table_size=2**15, width=32)
+    config = Config(max_surfels=count, texture=shape)
+    surfels = scene.surfels.to(options.device)
+    trainer = Trainer(photos(scene, options), config, options.device)
+    # Trainer starts from few surfels; before the first step its optimizer has no state that the new ones must fit.
+    for name, parameter in trainer.surfels.named_parameters():
+        parameter.data = getattr(surfels, name).detach().clone()
+    trainer.densifier.errors = torch.zeros_like(trainer.surfels.logit_opacities.detach())
+    trainer.iteration = MIDDLE
+    return trainer
+
+
+@torch.no_grad()
+def photos(scene: Scene, options: Options) -> Photos:
+    """What the trainer wants: the scene's photos, or else its surfels rendered without a texture."""
+    images = scene.photos
+    cameras = scene.cameras
+    if not images:
+        moved = scene.to(options.device)
+        images = [to_uint8(nw.render(moved.surfels, None, camera).image).cpu() for camera in moved.cameras]
+    views = [
+        View(camera.to("cpu"), image, None, f"{i:03d}")
+        for i, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    generator = torch.Generator().manual_seed(3)
+    chosen = torch.randperm(len(scene.surfels), generator=generator)[:POINTS]
+    points = scene.surfels.means.detach().cpu()[chosen]
+    centers = torch.stack([camera.position for camera in cameras]).cpu()
+    return Photos(
+        train=views,
+        test=[],
+        points=points,
+        colors=torch.full((len(points), 3), 128, dtype=torch.uint8),
+        track_lengths=torch.full((len(points),), 3, dtype=torch.int32),
+        reprojection_errors=torch.zeros(len(points)),
+        scale=1.1 * float((centers - centers.mean(0)).norm(dim=1).max()),
+        path=options.data,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(suite.main({"train_step": run}))

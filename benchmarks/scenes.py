@@ -1,0 +1,223 @@
+"""Seeded scenes that all benchmarks share. Made on the CPU, so that they are the same on every device."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import nexwarp as nw
+from benchmarks.suite import Options
+from nexwarp import ops
+from nexwarp.paths import look_at
+
+SH_DC = 0.28209479177387814
+GARDEN_WIDTH = 648  # of the images that garden_points.npz's intrinsics are for
+GARDEN, SAHAROV = 400_000, 40_000
+# The synthetic cloud is as large as the garden: (share of the surfels, area in square world units).
+GROUND_RADIUS, BALL_RADIUS, DOME_RADIUS = 3.0, 0.5, 4.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Surfels and where they are seen from.
+
+    Attributes:
+        name: tells the sizes too.
+        surfels: gamma = 1 (but for 1e-6), SH of degree 3.
+        cameras: the first one is timed, training takes turns.
+        photos: (H, W, 3) uint8 of these cameras, where there are any.
+        note: where the scene is not what was asked for.
+    """
+
+    name: str
+    surfels: nw.Surfels
+    cameras: tuple[nw.Camera, ...]
+    photos: tuple[torch.Tensor, ...] = ()
+    note: str = ""
+
+    @property
+    def camera(self) -> nw.Camera:
+        """The camera that is timed."""
+        return self.cameras[0]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What every measurement on this scene says of it."""
+        sizes = {"surfels": len(self.surfels), "width": self.camera.width, "height": self.camera.height}
+        return {"scene": self.name, "sizes": sizes, "note": self.note}
+
+    def to(self, device: torch.device | str) -> "Scene":
+        """Return this scene on a device; the photos stay. Moves the surfels in place, as modules do."""
+        return replace(self, surfels=self.surfels.to(device), cameras=tuple(c.to(device) for c in self.cameras))
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Activated surfels as leaf tensors, for timing passes alone.
+
+    Attributes:
+        shape: means, quats, scales, opacities, gammas.
+        colors: (N, 3) plain colours.
+        viewmat: (4, 4), needs no gradient.
+        pinhole: the image plane.
+    """
+
+    shape: tuple[torch.Tensor, ...]
+    colors: torch.Tensor
+    viewmat: torch.Tensor
+    pinhole: ops.Pinhole
+
+    @property
+    def leaves(self) -> tuple[torch.Tensor, ...]:
+        """All that takes a gradient."""
+        return (*self.shape, self.colors)
+
+    def project(self) -> ops.Projection:
+        """Take the surfels to the camera frame."""
+        return ops.project(*self.shape, self.colors, self.viewmat)
+
+    def tiles(self, projection: ops.Projection) -> ops.Tiles:
+        """List the surfels of each tile."""
+        return ops.intersect_tiles(*self.shape, projection, self.viewmat, self.pinhole)
+
+    def hits(self, max_hits: int = 2) -> ops.Hits:
+        """The whole collection stage: project, tiles, collect."""
+        projection = self.project()
+        return ops.collect(projection, self.tiles(projection), self.pinhole, max_hits=max_hits)
+
+
+@torch.no_grad()
+def geometry(scene: Scene) -> Geometry:
+    """Activate a scene's surfels, and their colours as its camera sees them."""
+    s, c = scene.surfels, scene.camera
+    shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
+    colors = ops.plain_colors(s.sh, s.means, c.position, 3).requires_grad_()
+    pinhole = ops.Pinhole(c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.near)
+    return Geometry(shape, colors, c.viewmat, pinhole)
+
+
+def outputs(hits: ops.Hits) -> tuple[torch.Tensor, ...]:
+    """The differentiable buffers."""
+    return hits.plain, hits.depths, hits.weights, hits.alpha
+
+
+def random_like(tensors: tuple[torch.Tensor, ...], seed: int = 1) -> list[torch.Tensor]:
+    """Seeded normal values, to stand for gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.randn(x.shape, generator=generator, dtype=x.dtype).to(x.device) for x in tensors]
+
+
+def texture(scene: Scene, **shape: Any) -> nw.NeuralTexture:
+    """Random field on the scene's device; a table of 2^20 on large scenes, of 2^15 on those that a CPU takes."""
+    large = len(scene.surfels) >= SAHAROV
+    defaults = {"table_size": 2**20 if large else 2**15, "min_resolution": 16.0, "max_resolution": 1024.0}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(2)
+        field = nw.NeuralTexture(**(defaults | shape))
+        with torch.no_grad():
+            field.grid.uniform_(-0.5, 0.5)
+    return field.to(scene.surfels.device)
+
+
+def workload(options: Options) -> list[Scene]:
+    """Scenes for a pass: the garden on CUDA, and on every device one that a CPU can take, to compare them by."""
+    small = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
+    scenes = [small]
+    if options.cuda:
+        large = garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
+        scenes.insert(0, large)
+    return [scene.to(options.device) for scene in scenes]
+
+
+def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = Options.data) -> Scene:
+    """Surfels of random orientations over Mip-NeRF 360 "garden"; a synthetic cloud where its points are absent."""
+    file = data / "garden_points.npz"
+    if not file.is_file():
+        stand_in = cloud(n, width, height)
+        return replace(stand_in, name=f"garden stand-in, {stand_in.name}", note=f"synthetic: no {file}")
+    arrays = np.load(file)
+    points = torch.from_numpy(arrays["means3d"]).float()
+    colors = torch.from_numpy(arrays["colors"]).float() / 255
+    cameras = []
+    for viewmat, K in zip(arrays["viewmats"], arrays["Ks"], strict=True):
+        K = torch.from_numpy(K).float()
+        K[:2] *= width / GARDEN_WIDTH
+        cameras.append(nw.Camera(torch.from_numpy(viewmat).float(), K, width, height))
+    return Scene(f"garden {_sizes(n, width, height)}", _cover(points, colors, n), tuple(cameras))
+
+
+def saharov(n: int = SAHAROV, data: Path = Options.data) -> Scene:
+    """Surfels over the sparse points of "saharov", with its photos; a synthetic cloud where it is absent."""
+    folder = data / "saharov"
+    if not folder.is_dir():
+        stand_in = cloud(n, 670, 1013)
+        return replace(stand_in, name=f"saharov stand-in, {stand_in.name}", note=f"synthetic: no {folder}")
+    loaded = nw.load_scene(folder)
+    surfels = _cover(loaded.points, loaded.colors.float() / 255, n)
+    cameras = tuple(view.camera for view in loaded.train)
+    name = f"saharov {_sizes(n, cameras[0].width, cameras[0].height)}"
+    return Scene(name, surfels, cameras, tuple(view.image for view in loaded.train))
+
+
+def cloud(n: int, width: int, height: int) -> Scene:
+    """Make a synthetic scene as large as the garden: a ball on a disc under a dome.
+
+    The surfels' sizes follow n, so that they cover as much for any n.
+    """
+    generator = torch.Generator().manual_seed(0)
+    counts = [n // 2, n // 4, n - n // 2 - n // 4]
+    areas = torch.tensor([np.pi * GROUND_RADIUS**2, 4 * np.pi * BALL_RADIUS**2, 2 * np.pi * DOME_RADIUS**2])
+    radius = GROUND_RADIUS * torch.rand(counts[0], generator=generator).sqrt()
+    angle = 2 * np.pi * torch.rand(counts[0], generator=generator)
+    ground = torch.stack([radius * angle.cos(), radius * angle.sin(), torch.zeros_like(angle)], dim=1)
+    ball = BALL_RADIUS * _directions(counts[1], generator) + torch.tensor([0.0, 0.0, BALL_RADIUS])
+    dome = DOME_RADIUS * _directions(counts[2], generator)
+    dome[:, 2].abs_()
+    points = torch.cat([ground, ball, dome])
+    spacing = (areas / torch.tensor(counts).clamp_min(1)).sqrt().repeat_interleave(torch.tensor(counts))
+    surfels = _surfels(points, spacing, torch.rand(n, 3, generator=generator), generator)
+    focal = 0.74 * width
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    target, up = torch.tensor([0.0, 0.0, 0.3]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+    centers = [torch.tensor([1.5 * np.cos(a), 1.5 * np.sin(a), 0.8]) for a in np.linspace(0, 2 * np.pi, 8, False)]
+    cameras = tuple(nw.Camera(look_at(c, target, up).float(), K, width, height) for c in centers)
+    return Scene(f"cloud {_sizes(n, width, height)}", surfels, cameras)
+
+
+def _sizes(n: int, width: int, height: int) -> str:
+    return f"{n:,} at {width}x{height}"
+
+
+def _directions(count: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+
+
+def _cover(points: torch.Tensor, colors: torch.Tensor, n: int) -> nw.Surfels:
+    """Spread n surfels over points, as large as those lie apart."""
+    spacing = _spacing(points)
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.randperm(len(points) * -(-n // len(points)), generator=generator)[:n] % len(points)
+    size = spacing[chosen] * max((len(points) / n) ** 0.5, 0.6)
+    means = points[chosen] + torch.randn(n, 3, generator=generator) * size[:, None] * 0.5
+    return _surfels(means, size, colors[chosen], generator)
+
+
+def _spacing(points: torch.Tensor) -> torch.Tensor:
+    from scipy.spatial import cKDTree
+
+    array = points.numpy()
+    distances, _ = cKDTree(array).query(array, k=4, workers=-1)
+    return torch.from_numpy(distances[:, 1:].mean(axis=1)).float()
+
+
+def _surfels(means: torch.Tensor, size: torch.Tensor, colors: torch.Tensor, generator: torch.Generator) -> nw.Surfels:
+    """Random orientations, sizes around the given ones, mostly high opacities, and a little view dependence."""
+    n = len(means)
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1)
+    scales = size[:, None] * torch.exp(torch.randn(n, 2, generator=generator) * 0.3)
+    opacities = torch.sigmoid(torch.randn(n, generator=generator) * 1.5 + 1.0)
+    sh = torch.randn(n, 16, 3, generator=generator) * 0.02
+    sh[:, 0] = (colors - 0.5) / SH_DC
+    return nw.Surfels.from_activated(means, quats, scales.clamp_min(1e-9), opacities, torch.ones(n, 2), sh)

@@ -1,0 +1,211 @@
+"""One timer: warm-up, CUDA events or the wall clock, median and spread, peak memory; one JSON line a measurement."""
+
+import dataclasses
+import datetime
+import functools
+import json
+import platform
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+ROOT = Path(__file__).resolve().parents[1]
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One figure, and all that is needed to make it again.
+
+    Attributes:
+        name: what was measured.
+        scene: what it was measured on.
+        device: "cuda" or "cpu".
+        unit: of `median`, `p10` and `p90`.
+        median, p10, p90: over `repeats` runs.
+        repeats: how many runs.
+        peak_mib: peak memory during the runs, MiB: on CUDA, of torch's allocator plus the high-water mark of Warp's
+            pool; on a CPU, of the whole process (Linux only).
+        sizes: surfels, width, height and the like.
+        note: anything a reader must know.
+        device_name, commit, date, versions: where, of what and when.
+    """
+
+    name: str
+    scene: str
+    device: str
+    median: float
+    p10: float
+    p90: float
+    unit: str = "ms"
+    repeats: int = 1
+    peak_mib: float | None = None
+    sizes: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    device_name: str = ""
+    commit: str = field(default_factory=lambda: commit())
+    date: str = field(default_factory=lambda: datetime.datetime.now(datetime.timezone.utc).isoformat("T", "seconds"))
+    versions: str = field(default_factory=lambda: f"torch {torch.__version__}, warp {wp.__version__}")
+
+    def json(self) -> str:
+        """One line."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+def measure(
+    name: str,
+    run: Callable[[], Any],
+    device: torch.device,
+    *,
+    scene: str = "",
+    sizes: dict[str, Any] | None = None,
+    note: str = "",
+    seconds: float = 2.0,
+    warmup: int = 3,
+    least: int = 5,
+    most: int = 100,
+) -> Measurement:
+    """Time a function after warming it up.
+
+    On CUDA each run lies between two events and is waited for, so that a launch that the CPU cannot keep up with shows.
+
+    Args:
+        name: of the measurement.
+        run: what to time; called without arguments.
+        device: where it runs.
+        scene: of the measurement.
+        sizes: of the measurement.
+        note: of the measurement.
+        seconds: stop repeating after this long.
+        warmup: untimed runs; the first one compiles.
+        least: timed runs at least, however long they take.
+        most: timed runs at most.
+    """
+    for _ in range(warmup):
+        run()
+    clock = _cuda_clock if device.type == "cuda" else _wall_clock
+    synchronize(device)
+    reset_peak(device)
+    start = time.perf_counter()
+    times: list[float] = []
+    while len(times) < least or (len(times) < most and time.perf_counter() - start < seconds):
+        times.append(clock(run))
+    return figure(name, times, device, scene=scene, sizes=sizes, note=note, peak_mib=peak(device))
+
+
+def figure(
+    name: str,
+    values: float | list[float],
+    device: torch.device,
+    *,
+    unit: str = "ms",
+    scene: str = "",
+    sizes: dict[str, Any] | None = None,
+    note: str = "",
+    peak_mib: float | None = None,
+) -> Measurement:
+    """Make a measurement of values that something else measured."""
+    values = values if isinstance(values, list) else [values]
+    p10, median, p90 = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
+    return Measurement(
+        name=name,
+        scene=scene,
+        device=device.type,
+        median=median,
+        p10=p10,
+        p90=p90,
+        unit=unit,
+        repeats=len(values),
+        peak_mib=peak_mib,
+        sizes=dict(sizes or {}),
+        note=note,
+        device_name=device_name(device.type),
+    )
+
+
+def ratio(name: str, top: Measurement, bottom: Measurement, note: str = "") -> Measurement:
+    """Ratio of two medians of one run; its spread is that of `top` alone, over the median of `bottom`."""
+    over = {key: getattr(top, key) / bottom.median for key in ("median", "p10", "p90")}
+    kept = {"scene": top.scene, "sizes": top.sizes, "repeats": top.repeats, "device_name": top.device_name}
+    return Measurement(name=name, device=top.device, unit="x", note=note, **over, **kept)
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for a GPU; nothing on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def reset_peak(device: torch.device) -> None:
+    """Start a new peak."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        pass
+
+
+def peak(device: torch.device) -> float | None:
+    """Peak memory since `reset_peak`, MiB; None where the system does not tell."""
+    if device.type == "cuda":
+        pool = wp.get_mempool_used_mem_high(f"cuda:{device.index or 0}")
+        return (torch.cuda.max_memory_allocated(device) + pool) / MIB
+    return process_memory("VmHWM")
+
+
+def process_memory(key: str = "VmRSS") -> float | None:
+    """A line of /proc/self/status in MiB, None where there is none."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:")), None)
+
+
+@functools.cache
+def device_name(kind: str) -> str:
+    """Name of the GPU, or of the processor and its number of threads here."""
+    if kind == "cuda":
+        return torch.cuda.get_device_name()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        model = platform.processor() or platform.machine()
+    return f"{model}, {torch.get_num_threads()} threads"
+
+
+@functools.cache
+def commit() -> str:
+    """Commit of the working tree, with a + when it was changed; "unknown" without git."""
+    try:
+        git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10)
+        head = git(["git", "rev-parse", "--short", "HEAD"]).stdout.strip()
+        changed = git(["git", "status", "--porcelain"]).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return head + ("+" if changed else "")
+
+
+def _cuda_clock(run: Callable[[], Any]) -> float:
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    run()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+def _wall_clock(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return 1e3 * (time.perf_counter() - start)
