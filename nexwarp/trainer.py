@@ -367,7 +367,7 @@ class Trainer:
 
 
 class _Views:
-    """Training views on the device they are used on: photos stay 8-bit, and wait in pinned memory when they are many."""
+    """Training views on the device they are used on; photos stay 8-bit, in pinned memory when they are many."""
 
     def __init__(self, views: list[View], device: torch.device) -> None:
         self.device = device
@@ -386,7 +386,7 @@ class _Views:
         return len(self.photos)
 
     def get(self, index: int, factor: int) -> tuple[Camera, torch.Tensor]:
-        """Camera and photo (H, W, 3) float in [0, 1], both reduced by a factor; what does not fill a pixel is cut off."""
+        """Camera and photo (H, W, 3) float in [0, 1], reduced by a factor; what does not fill a pixel is cut off."""
         photo = self.photos[index].to(self.device, non_blocking=True).float() / 255.0
         camera = self.cameras[index]
         if factor == 1 or min(camera.width, camera.height) < factor:

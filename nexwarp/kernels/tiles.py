@@ -1,8 +1,8 @@
 """Tile lists: which surfels may be seen in which tile, near to far. Integers only, nothing here is differentiable.
 
 A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
-projected: a convex polygon of at most five corners. A tile row's slab cuts out one span of it, so the tiles that the polygon
-touches are listed exactly, not those of its bounding box. The support only culls; alpha >= 1/255 decides.
+projected: a convex polygon of at most five corners. A tile row's slab cuts out one span of it, so the tiles that the
+polygon touches are listed exactly, not those of its bounding box. The support only culls; alpha >= 1/255 decides.
 """
 
 import functools

@@ -141,7 +141,7 @@ def _total(ends: torch.Tensor) -> int:
 
 @dataclass
 class _Need:
-    """What renderings of one kind needed, learnt without waiting: the count arrives in pinned memory some time later."""
+    """What renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later."""
 
     room: int
     total: torch.Tensor
@@ -155,8 +155,8 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     """Entries to make room for on CUDA: what such renderings needed so far, and half as much again.
 
     Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
-    of two). A later one that needs more than there is room for is still right, since the walk then goes over all surfels,
-    but slow; the next one finds more room.
+    of two). A later one that needs more than there is room for is still right, since the walk then goes over all
+    surfels, but slow; the next one finds more room.
     """
     if len(ends) == 0:
         return 0
