@@ -5,7 +5,7 @@ import sys
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, geometry, outputs, random_like, workload
+from benchmarks.scenes import Scene, entries, geometry, outputs, random_like, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
@@ -25,7 +25,7 @@ def walk(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]
     hits = ops.collect(projection, tiles, g.pinhole, max_hits=max_hits)
     signals = random_like(outputs(hits))
     facts = scene.facts
-    facts["sizes"] |= {"entries": len(tiles.entries), "max_hits": max_hits}
+    facts["sizes"] |= {"entries": entries(tiles), "max_hits": max_hits}
     return [
         options.time("collect, forward", lambda: ops.collect(projection, tiles, g.pinhole, max_hits=max_hits), **facts),
         options.time(

@@ -41,14 +41,15 @@ def collection(scene: Scene, options: Options) -> list[Measurement]:
     def theirs() -> tuple[torch.Tensor, ...]:
         return torch.autograd.grad(torch_collect(records, tiles, g.pinhole), records, signals)
 
-    name = "collect, forward + backward, {}: {} thread"
+    name = "collect, forward + backward, {}, {}"
     facts = scene.facts | {"warmup": 1, "least": 3}
     mine, others, bits = [], [], []
     for count in (1, 2):
         with threads(count):
             bits.append(ours())
-            mine.append(options.time(name.format("ours", count), ours, **facts))
-            others.append(options.time(name.format("torch by tile", count), theirs, **facts))
+            label = f"{count} thread{'s' * (count > 1)}"
+            mine.append(options.time(name.format("ours", label), ours, **facts))
+            others.append(options.time(name.format("torch by tile", label), theirs, **facts))
     different = sum(int((a != b).sum()) for a, b in zip(*bits, strict=True))
     same = figure("values that differ between 1 and 2 threads", different, options.device, unit="", **scene.facts)
     ratios = [

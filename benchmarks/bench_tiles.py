@@ -3,7 +3,7 @@
 import sys
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, geometry, workload
+from benchmarks.scenes import Scene, entries, geometry, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 
@@ -16,7 +16,7 @@ def tiles(scene: Scene, options: Options) -> list[Measurement]:
     g = geometry(scene)
     projection = g.project()
     facts = scene.facts
-    facts["sizes"]["entries"] = len(g.tiles(projection).entries)
+    facts["sizes"]["entries"] = entries(g.tiles(projection))
     return [options.time("tiles", lambda: g.tiles(projection), **facts)]
 
 

@@ -15,6 +15,7 @@ from nexwarp.paths import look_at
 SH_DC = 0.28209479177387814
 GARDEN_WIDTH = 648  # of the images that garden_points.npz's intrinsics are for
 GARDEN, SAHAROV = 400_000, 40_000
+GARDEN_SPREAD = 1.5  # SCALE of the first measurements (2.80 million entries by bounding boxes), which targets refer to
 # The synthetic cloud is as large as the garden: (share of the surfels, area in square world units).
 GROUND_RADIUS, BALL_RADIUS, DOME_RADIUS = 3.0, 0.5, 4.0
 
@@ -98,6 +99,11 @@ def geometry(scene: Scene) -> Geometry:
     return Geometry(shape, colors, c.viewmat, pinhole)
 
 
+def entries(tiles: ops.Tiles) -> int:
+    """How many (tile, surfel) entries there are; waits for a GPU."""
+    return int(tiles.ends[-1]) if len(tiles.ends) else 0
+
+
 def outputs(hits: ops.Hits) -> tuple[torch.Tensor, ...]:
     """The differentiable buffers."""
     return hits.plain, hits.depths, hits.weights, hits.alpha
@@ -145,7 +151,7 @@ def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = 
         K = torch.from_numpy(K).float()
         K[:2] *= width / GARDEN_WIDTH
         cameras.append(nw.Camera(torch.from_numpy(viewmat).float(), K, width, height))
-    return Scene(f"garden {_sizes(n, width, height)}", _cover(points, colors, n), tuple(cameras))
+    return Scene(f"garden {_sizes(n, width, height)}", _cover(points, colors, n, GARDEN_SPREAD), tuple(cameras))
 
 
 def saharov(n: int = SAHAROV, data: Path = Options.data) -> Scene:
@@ -194,12 +200,12 @@ def _directions(count: int, generator: torch.Generator) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
 
 
-def _cover(points: torch.Tensor, colors: torch.Tensor, n: int) -> nw.Surfels:
-    """Spread n surfels over points, as large as those lie apart."""
+def _cover(points: torch.Tensor, colors: torch.Tensor, n: int, spread: float = 1.0) -> nw.Surfels:
+    """Spread n surfels over points, as large as those lie apart, times `spread`."""
     spacing = _spacing(points)
     generator = torch.Generator().manual_seed(0)
     chosen = torch.randperm(len(points) * -(-n // len(points)), generator=generator)[:n] % len(points)
-    size = spacing[chosen] * max((len(points) / n) ** 0.5, 0.6)
+    size = spacing[chosen] * max((len(points) / n) ** 0.5, 0.6) * spread
     means = points[chosen] + torch.randn(n, 3, generator=generator) * size[:, None] * 0.5
     return _surfels(means, size, colors[chosen], generator)
 

@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import functools
 import json
+import os
 import platform
 import subprocess
 import time
@@ -173,7 +174,7 @@ def process_memory(key: str = "VmRSS") -> float | None:
 
 @functools.cache
 def device_name(kind: str) -> str:
-    """Name of the GPU, or of the processor and its number of threads here."""
+    """Name of the GPU, or of the processor and how many cores this process may use."""
     if kind == "cuda":
         return torch.cuda.get_device_name()
     try:
@@ -181,7 +182,8 @@ def device_name(kind: str) -> str:
         model = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {torch.get_num_threads()} threads"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{model}, {cores} cores"
 
 
 @functools.cache

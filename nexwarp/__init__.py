@@ -1,5 +1,10 @@
 """nexwarp: Nexels, neurally-textured surfels for real-time novel view synthesis, in NVIDIA Warp and PyTorch."""
 
+import os
+
+# Before torch is imported: its idle OpenMP threads would otherwise spin on the cores that the CPU kernels need.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load
 from nexwarp.data import Scene, View, load_scene

@@ -12,6 +12,8 @@ from tests.tolerances import assert_close
 
 BUFFERS = ("plain", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
+# 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
+WIDE = {"width": 300, "height": 200}
 
 
 @pytest.fixture(autouse=True)
@@ -74,9 +76,9 @@ def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
 # Threads
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_collect_does_not_depend_on_threads(low_pass):
-    scene = random_scene(600, **BIG)
+@pytest.mark.parametrize(("low_pass", "size"), [(False, BIG), (True, BIG), (False, WIDE)])
+def test_collect_does_not_depend_on_threads(low_pass, size):
+    scene = random_scene(600, **size)
     errors = errors_of(scene)
     results = []
     for count in (1, 2, 3):
@@ -125,9 +127,11 @@ def test_thread_count_must_be_positive(count):
     assert launch.get_num_threads() == before
 
 
-@pytest.mark.parametrize("dim", [0, 1, 255, 256, 257, 4096, 4097, 1_000_003])
-def test_chunks_cover_the_range_once_whatever_the_threads(dim):
-    parts = launch.chunks(dim)
+@pytest.mark.parametrize("align", [1, 256, 1024])
+@pytest.mark.parametrize("dim", [0, 1, 255, 256, 257, 4096, 4097, 63_232, 1_000_003])
+def test_chunks_cover_the_range_once_whatever_the_threads(dim, align):
+    parts = launch.chunks(dim, align)
+    assert all(first % align == 0 for first, _ in parts)
     assert len(parts) <= launch.CHUNKS
     covered = 0
     for first, last in parts:
@@ -135,7 +139,7 @@ def test_chunks_cover_the_range_once_whatever_the_threads(dim):
         covered = last
     assert covered == dim
     launch.set_num_threads(3)
-    assert launch.chunks(dim) == parts
+    assert launch.chunks(dim, align) == parts
 
 
 # Tiles

@@ -35,9 +35,10 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="nexwarp")
 
 
-def chunks(dim: int) -> list[tuple[int, int]]:
-    """Split [0, dim) into at most CHUNKS ranges of at least SMALLEST_CHUNK."""
+def chunks(dim: int, align: int = 1) -> list[tuple[int, int]]:
+    """Split [0, dim) into at most CHUNKS ranges of at least SMALLEST_CHUNK, at multiples of `align`."""
     size = max(SMALLEST_CHUNK, -(-dim // CHUNKS))
+    size = -(-size // align) * align
     return [(first, min(first + size, dim)) for first in range(0, dim, size)]
 
 
@@ -50,6 +51,7 @@ def launch(
     device: wp.Device,
     stream: wp.Stream | None = None,
     block_dim: int = 256,
+    align: int = 1,
     adjoint: tuple[Sequence[Any], Sequence[Any]] | None = None,
 ) -> None:
     """Launch a kernel whose first argument is `first` over the leading dimension of `dim`.
@@ -62,6 +64,7 @@ def launch(
         device: Warp device.
         stream: CUDA stream, by default the device's current one.
         block_dim: threads a block on CUDA.
+        align: on a CPU, runs of this many neighbours stay in one thread, since they write to the same place.
         adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs
             no gradient. Gradients are added to.
     """
@@ -86,7 +89,7 @@ def launch(
     if not device.is_cpu:
         part((0, shape[0]))
         return
-    ranges = chunks(shape[0]) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
+    ranges = chunks(shape[0], align) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
     if _threads == 1 or len(ranges) == 1:
         for bounds in ranges:
             part(bounds)

@@ -108,12 +108,17 @@ def splat_error(
     errors = errors.detach().to(records.dtype).contiguous()
     inputs += [array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
-    launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], block_dim=BLOCK_DIM)
+    launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], **_options(tiles))
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
 
 
 def _threads(tiles: Tiles) -> int:
     return (len(tiles.tile_offsets) - 1) * tiles.tile_size**2
+
+
+def _options(tiles: Tiles) -> dict[str, int]:
+    """Launch options: all pixels of a tile write to its entries, so one CPU thread must walk them all."""
+    return {"block_dim": BLOCK_DIM, "align": tiles.tile_size**2}
 
 
 def _inputs(
@@ -182,7 +187,7 @@ class _Collect(torch.autograd.Function):
         ]
         kernel = collect_kernel(real, max_hits, low_pass, tiles.tile_size)
         inputs = _inputs(records, centers, tiles, camera)
-        launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
+        launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
         ctx.save_for_backward(records, centers, plain, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, watch)
@@ -228,7 +233,7 @@ class _Collect(torch.autograd.Function):
         error_rows = None if watch.errors is None else records.new_zeros(count)
         outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
         kernel = collect_backward_kernel(real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
-        launch(records, kernel, _threads(tiles), inputs, outputs, block_dim=BLOCK_DIM)
+        launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
         if error_rows is not None:
             watch.sums = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
         grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)
