@@ -105,9 +105,9 @@ def warp_program(
     tape = wp.Tape()
     colors = passes.plain_colors(tape, x["sh"], x["means"], position, 3)
     shape = [x[key] for key in ("means", "quats", "scales", "opacities", "gammas")]
-    records, centers = passes.project(tape, *shape, colors, view)
+    records, centers, limits = passes.project(tape, *shape, colors, view)
     lists = passes.intersect_tiles(*shape, centers, view, image)
-    hits = passes.collect(tape, records, centers, lists, image, HITS)
+    hits = passes.collect(tape, records, centers, limits, lists, image, HITS)
     positions, directions = passes.unproject(tape, hits.depths, view, image)
     resolutions = to_warp(texture.resolutions.double(), REAL)
     features = passes.hashgrid(tape, table, positions.flatten(), hits.depths.flatten(), resolutions, focal)

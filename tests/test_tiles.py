@@ -1,5 +1,7 @@
 """Tile lists: what is listed, in which order, and what happens when there is no room for all of it."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -52,7 +54,7 @@ def test_lists_are_near_to_far_and_cover_every_hit(device: torch.device) -> None
     viewmat = scene["viewmat"]
     depths = scene["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]
     offsets = tiles.tile_offsets.tolist()
-    for tile, (start, end) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
+    for tile, (start, end) in enumerate(itertools.pairwise(offsets)):
         listed = tiles.surfel_ids[start:end].long()
         assert (depths[listed, 2].diff() >= -1e-5).all()
         assert len(listed.unique()) == len(listed)

@@ -106,6 +106,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
         surfel_ids: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
         order: wp.array(dtype=wp.int32),
@@ -150,7 +151,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
             rn = records[i, 2]
             rc = records[i, 3]
             uvt = h.plane(ra, rb, rn, rc[3], d)
-            if h.far_outside(uvt):
+            if h.far_outside(uvt, limits[i]):
                 continue
             center = vec3()
             if wp.static(low_pass):
@@ -218,6 +219,7 @@ def collect_backward_kernel(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
         surfel_ids: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
@@ -290,7 +292,7 @@ def collect_backward_kernel(
                 center = centers[i]
             uvt = h.plane(ra, rb, rn, rc[3], d)
             alpha = ZERO
-            if live == 1 and not h.far_outside(uvt):
+            if live == 1 and not h.far_outside(uvt, limits[i]):
                 hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
                 if hit[0] >= ALPHA_MIN and hit[1] > near:
                     alpha = hit[0]
@@ -369,6 +371,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
         surfel_ids: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
@@ -417,7 +420,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
                 center = centers[i]
             uvt = h.plane(ra, rb, rn, rc[3], d)
             alpha = ZERO
-            if live == 1 and not h.far_outside(uvt):
+            if live == 1 and not h.far_outside(uvt, limits[i]):
                 hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
                 if hit[0] >= ALPHA_MIN and hit[1] > near:
                     alpha = hit[0]

@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.surfel import frame_functions
-from nexwarp.kernels.types import types
+from nexwarp.kernels.types import LIMIT_MARGIN, types
 
 
 @functools.cache
@@ -17,6 +17,7 @@ def project_kernel(real: type) -> wp.Kernel:
     t = types(real)
     vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
     f = frame_functions(real)
+    TWO, TINY, MARGIN = t.TWO, t.TINY, wp.constant(real(LIMIT_MARGIN))
 
     @wp.kernel(module="unique")
     def project(
@@ -32,6 +33,7 @@ def project_kernel(real: type) -> wp.Kernel:
         # outputs
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
     ):
         i = first + wp.tid()
         viewmat = viewmats[i * viewmat_step]
@@ -48,5 +50,6 @@ def project_kernel(real: type) -> wp.Kernel:
         color = colors[i]
         records[i, 3] = vec4(color[0], color[1], color[2], wp.dot(center, n))
         centers[i] = center
+        limits[i] = TWO * wp.log(real(255.0) * wp.max(opacities[i], TINY)) + MARGIN
 
     return project

@@ -75,7 +75,7 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
     """The hit of a ray on a surfel (paper Eq. 3), and its contraction for `wp.grad`."""
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
-    ALPHA_MAX, EXPONENT_MAX, TINY, HALF, ONE, TWO = t.ALPHA_MAX, t.EXPONENT_MAX, t.TINY, t.HALF, t.ONE, t.TWO
+    ALPHA_MAX, TINY, ZERO, HALF, ONE, TWO = t.ALPHA_MAX, t.TINY, t.ZERO, t.HALF, t.ONE, t.TWO
 
     @wp.func
     def plane(a: vec4, b: vec4, n: vec4, m: real, d: vec3):
@@ -86,11 +86,17 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
         return vec3(u, v, m * inverse)
 
     @wp.func
-    def far_outside(uvt: vec3):
-        """True only where alpha is certainly below 1/255: spares the exponentials."""
+    def far_outside(uvt: vec3, limit: real):
+        """True only where alpha is certainly below 1/255: spares the exponentials.
+
+        Beyond 1, |u|^(2g) is at least u^2; `limit` is what the exponent of a hit cannot exceed.
+        """
         if wp.static(low_pass):
             return False
-        return uvt[0] * uvt[0] > EXPONENT_MAX or uvt[1] * uvt[1] > EXPONENT_MAX
+        u2 = uvt[0] * uvt[0]
+        v2 = uvt[1] * uvt[1]
+        low = wp.where(u2 > ONE, u2, ZERO) + wp.where(v2 > ONE, v2, ZERO)
+        return low > limit
 
     @wp.func
     def kernel(uvt: vec3, a: vec4, b: vec4, n: vec4, center: vec3, d: vec3, focal: vec2, near: real):

@@ -5,7 +5,7 @@ Arrays are Warp arrays of one scalar type (float32 or float64) on one device; wh
 tape; the hand-structured pairs go through `tape.record_func`. The same kernels serve torch in `nexwarp.ops`.
 
     tape = wp.Tape()
-    records, centers = project(tape, ...)
+    records, centers, limits = project(tape, ...)
     ...
     tape.backward(loss)
 """
@@ -89,14 +89,15 @@ def project(
     gammas: wp.array,
     colors: wp.array,
     viewmat: wp.array,
-) -> tuple[wp.array, wp.array]:
-    """Records (N, 4) vec4 and centers (N) vec3 of activated surfels; viewmat is (1) mat44."""
+) -> tuple[wp.array, wp.array, wp.array]:
+    """Records (N, 4) vec4, centers (N) vec3 and limits (N) of activated surfels; viewmat is (1) mat44."""
     real = _real(means)
     records = _new(means, (len(means), 4), types(real).vec4)
     centers = _new(means, len(means), means.dtype)
+    limits = _new(means, len(means), real, requires_grad=False)
     inputs = [means, quats, scales, opacities, gammas, colors, viewmat, 0]
-    _launch(tape, project_kernel(real), len(means), inputs, [records, centers])
-    return records, centers
+    _launch(tape, project_kernel(real), len(means), inputs, [records, centers, limits])
+    return records, centers, limits
 
 
 def intersect_tiles(
@@ -145,6 +146,7 @@ def collect(
     tape: wp.Tape,
     records: wp.array,
     centers: wp.array,
+    limits: wp.array,
     lists: Lists,
     image: Image,
     max_hits: int,
@@ -164,7 +166,7 @@ def collect(
     )
     threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
     view = [wp.vec2i(*image.size), lists.columns, t.vec4(*image.intrinsics), image.near]
-    inputs = [records, centers, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends, *view]
+    inputs = [records, centers, limits, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends, *view]
     kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
     _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
 
@@ -174,7 +176,7 @@ def collect(
         ids = [lists.surfel_ids, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
         kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
         outputs = [records.grad, centers.grad, None]
-        _silent(kernel, threads, [records, centers, *ids, *view, *found, *grads, None], outputs, BLOCK_DIM)
+        _silent(kernel, threads, [records, centers, limits, *ids, *view, *found, *grads, None], outputs, BLOCK_DIM)
 
     tape.record_func(backward, [records, centers, hits.plain, hits.depths, hits.weights, hits.alphas])
     return hits

@@ -8,8 +8,8 @@ import warp as wp
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
-# The exponent of a hit with alpha >= 1/255 is at most 2 ln 255 = 11.08; |u| > 1 implies |u|^(2g) >= u^2.
-EXPONENT_MAX = 11.1
+# The exponent of a hit is at most 2 ln(255 opacity); rounding must not cull one.
+LIMIT_MARGIN = 1e-3
 # Floor of u^2, so that log stays finite at a surfel's centre.
 TINY = 1e-20
 MAX_HITS = 8
@@ -28,7 +28,6 @@ def types(real: type) -> SimpleNamespace:
         ALPHA_MIN=wp.constant(real(ALPHA_MIN)),
         ALPHA_MAX=wp.constant(real(ALPHA_MAX)),
         TRANSMITTANCE_MIN=wp.constant(real(TRANSMITTANCE_MIN)),
-        EXPONENT_MAX=wp.constant(real(EXPONENT_MAX)),
         TINY=wp.constant(real(TINY)),
         ZERO=wp.constant(real(0.0)),
         HALF=wp.constant(real(0.5)),

@@ -73,7 +73,9 @@ def collect(
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
     watch = ErrorWatch()
-    buffers = _Collect.apply(projection.records, projection.centers, tiles, camera, max_hits, low_pass, watch)
+    buffers = _Collect.apply(
+        projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, watch
+    )
     return Hits(*buffers, watch)
 
 
@@ -104,7 +106,7 @@ def splat_error(
     real = real_of(records)
     rows, slots = _rows(tiles, records)
     sums = records.new_zeros(slots)
-    inputs = _inputs(records, projection.centers.detach(), tiles, camera, rows)
+    inputs = _inputs(records, projection.centers.detach(), projection.limits, tiles, camera, rows)
     errors = errors.detach().to(records.dtype).contiguous()
     inputs += [array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
@@ -124,6 +126,7 @@ def _options(tiles: Tiles) -> dict[str, int]:
 def _inputs(
     records: torch.Tensor,
     centers: torch.Tensor,
+    limits: torch.Tensor,
     tiles: Tiles,
     camera: Pinhole,
     rows: torch.Tensor | None = None,
@@ -133,6 +136,7 @@ def _inputs(
     return [
         array(records, t.vec4),
         array(centers, t.vec3),
+        array(limits, t.real),
         *(array(x, wp.int32) for x in lists),
         wp.vec2i(camera.width, camera.height),
         tiles.columns,
@@ -164,6 +168,7 @@ class _Collect(torch.autograd.Function):
         ctx: Any,
         records: torch.Tensor,
         centers: torch.Tensor,
+        limits: torch.Tensor,
         tiles: Tiles,
         camera: Pinhole,
         max_hits: int,
@@ -186,9 +191,9 @@ class _Collect(torch.autograd.Function):
             array(stops.view(-1), wp.int32),
         ]
         kernel = collect_kernel(real, max_hits, low_pass, tiles.tile_size)
-        inputs = _inputs(records, centers, tiles, camera)
+        inputs = _inputs(records, centers, limits, tiles, camera)
         launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
-        ctx.save_for_backward(records, centers, plain, ids, weights, alphas, stops)
+        ctx.save_for_backward(records, centers, limits, plain, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, watch)
         return plain, ids, depths, weights, alphas, stops
@@ -204,7 +209,7 @@ class _Collect(torch.autograd.Function):
         grad_alphas: torch.Tensor,
         _stops: None,
     ) -> tuple[torch.Tensor | None, ...]:
-        records, centers, plain, ids, weights, alphas, stops = ctx.saved_tensors
+        records, centers, limits, plain, ids, weights, alphas, stops = ctx.saved_tensors
         tiles, camera, max_hits, low_pass, watch = ctx.rest
         real = real_of(records)
         t = types(real)
@@ -218,7 +223,7 @@ class _Collect(torch.autograd.Function):
         # Centres carry a gradient only through the low-pass.
         grad_center_rows = centers.new_zeros(count if low_pass else 1, 3)
         inputs = [
-            *_inputs(records, centers, tiles, camera, rows),
+            *_inputs(records, centers, limits, tiles, camera, rows),
             array(plain.view(-1, 3), t.vec3),
             buffer(ids, wp.int32),
             buffer(weights, real),
@@ -240,4 +245,4 @@ class _Collect(torch.autograd.Function):
         grad_centers = None
         if low_pass:
             grad_centers = _reduce(grad_center_rows[:, None], tiles, len(records), t.vec3)[:, 0]
-        return grad_records, grad_centers, *(None,) * 5
+        return grad_records, grad_centers, *(None,) * 6

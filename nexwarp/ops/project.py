@@ -19,10 +19,12 @@ class Projection:
     Attributes:
         records: (N, 4, 4), see `nexwarp.kernels.surfel`; differentiable.
         centers: (N, 3) centres in the camera frame, world units; differentiable.
+        limits: (N,) what a hit's exponent |u|^(2 g1) + |v|^(2 g2) cannot exceed; only culls.
     """
 
     records: torch.Tensor
     centers: torch.Tensor
+    limits: torch.Tensor
 
 
 def project(
@@ -71,13 +73,14 @@ def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Any]:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         means = inputs[0]
         real = real_of(means)
         t = types(real)
         records = means.new_empty(len(means), 4, 4)
         centers = torch.empty_like(means)
-        outputs = [array(records, t.vec4), array(centers, t.vec3)]
+        limits = means.new_empty(len(means))
+        outputs = [array(records, t.vec4), array(centers, t.vec3), array(limits, real)]
         launch(
             means,
             project_kernel(real),
@@ -86,11 +89,14 @@ class _Project(torch.autograd.Function):
             outputs,
         )
         ctx.save_for_backward(*inputs)
-        return records, centers
+        ctx.mark_non_differentiable(limits)
+        return records, centers, limits
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(
+        ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor, _limits: None
+    ) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         means, viewmat = inputs[0], inputs[6]
         real, count = real_of(means), len(means)
@@ -100,8 +106,8 @@ class _Project(torch.autograd.Function):
         step = int(ctx.needs_input_grad[6])
         grad_viewmats = viewmat.new_zeros(count, 4, 4) if step else None
         viewmats = viewmat.expand(count, 4, 4) if step else viewmat[None]
-        outputs = [None, None]
-        adjoint_outputs = [array(grad_records.contiguous(), t.vec4), array(grad_centers.contiguous(), t.vec3)]
+        outputs = [None, None, None]
+        adjoint_outputs = [array(grad_records.contiguous(), t.vec4), array(grad_centers.contiguous(), t.vec3), None]
         launch(
             means,
             project_kernel(real),
