@@ -37,7 +37,7 @@ from nexwarp.trainer import Config, LearningRates, TextureConfig, Trainer, prese
 
 # The demo is small enough for two CPU cores: a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, Any] = {
-    "iterations": 1500,
+    "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
     "texture": TextureConfig(levels=12, table_size=2**15, width=32),
@@ -70,7 +70,7 @@ class Train:
     max_surfels: int | None = None
     """Budget P of surfels, never exceeded (400,000; demo 3,000)."""
     iterations: int | None = None
-    """Training steps; schedules stretch with them (30,000; demo 1,500)."""
+    """Training steps; schedules stretch with them (30,000; demo 1,200)."""
     downscale: int = 1
     """Reduce photos by this factor, by area."""
     images: str = "images"
