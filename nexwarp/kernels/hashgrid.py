@@ -36,6 +36,43 @@ def add_pair(table: wp.array2d(dtype=wp.vec2), level: wp.int32, slot: wp.int32, 
     ...
 
 
+# Neighbouring pixels fall into the same cell of a coarse level: the lanes of a cell add up theirs in a tree, and only
+# the first of them goes on to the atomics. Absent lanes (a part-filled warp, empty hits) are left out by the mask.
+_MERGE = """
+#if defined(__CUDA_ARCH__)
+    const unsigned active = __activemask();
+    const unsigned long long xy = ((unsigned long long)(unsigned)y << 32) | (unsigned)x;
+    const unsigned peers = __match_any_sync(active, xy) & __match_any_sync(active, z);
+    const int lane = threadIdx.x & 31;
+    int rank = __popc(peers & ((1u << lane) - 1u));
+    const bool first = rank == 0;
+    unsigned rest = peers & (0xfffffffeu << lane);
+    while (__any_sync(active, rest != 0u)) {
+        const int next = __ffs(rest) - 1;
+        for (int j = 0; j < 8; ++j) {
+            for (int k = 0; k < 2; ++k) {
+                const float other = __shfl_sync(active, value.data[j][k], next < 0 ? lane : next);
+                if (next >= 0) value.data[j][k] += other;
+            }
+        }
+        rest &= __ballot_sync(active, (rank & 1) == 0);
+        rank >>= 1;
+    }
+    if (!first) {
+        for (int j = 0; j < 8; ++j) for (int k = 0; k < 2; ++k) value.data[j][k] = 0.0f;
+    }
+#endif
+    return value;
+"""
+Corners = wp.types.matrix(shape=(8, 2), dtype=wp.float32)
+
+
+@wp.func_native(_MERGE)
+def merge_cells(x: wp.int32, y: wp.int32, z: wp.int32, value: Corners) -> Corners:
+    """Return the sum of the values of all lanes with the cell (x, y, z) in the first of them, zeros in the others."""
+    ...
+
+
 @wp.func
 def map_positive(i: wp.int32):
     """Fold the integers onto the non-negative ones: 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..."""
@@ -162,15 +199,17 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         gf, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
             x - base, gather(table, level, corner, mask), scale, depth, focal[0], grad
         )
+        if wp.static(pairs):
+            gc = merge_cells(corner[0], corner[1], corner[2], gc)
         for j in range(8):
-            slot = hash_slot(corner, j, mask)
             part = vec()
             for k in range(wp.static(features)):
                 part[k] = gc[j, k]
             if wp.static(pairs):
-                add_pair(grad_table, level, slot, part)
+                if part[0] != real(0.0) or part[1] != real(0.0):
+                    add_pair(grad_table, level, hash_slot(corner, j, mask), part)
             else:
-                wp.atomic_add(grad_table, level, slot, part)
+                wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
         if grad_positions.shape[0] > 0:
             wp.atomic_add(grad_positions, level, p, gf * scale)
             wp.atomic_add(grad_depths, level, p, gd)
