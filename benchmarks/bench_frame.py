@@ -68,7 +68,7 @@ def waits(render: Callable[[], torch.Tensor], scene: Scene, options: Options) ->
             render()
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    count = sum("synchroniz" in str(w.message) for w in caught)
+    count = sum("called a synchronizing" in str(w.message) for w in caught)
     return [figure("frame, waits of the host", count, options.device, unit="a frame", **scene.facts)]
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from nexwarp import console as display
 from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
+from nexwarp.config import Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene
 from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
@@ -33,7 +34,7 @@ from nexwarp.runs import (
     read_metrics,
     read_run,
 )
-from nexwarp.trainer import Config, LearningRates, TextureConfig, Trainer, preset
+from nexwarp.trainer import Trainer
 
 # The demo is small enough for two CPU cores: a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, Any] = {
@@ -92,7 +93,7 @@ class Train:
         """Train."""
         source = SceneSource(self.scene, self.images, self.downscale)
         run = self.run or Path("runs") / source.name
-        prepare_run(run, resume=self.resume, overwrite=self.overwrite)
+        prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
@@ -349,7 +350,8 @@ def main(arguments: list[str] | None = None) -> int:
         Console(stderr=True, soft_wrap=True, highlight=False).print(message, markup=False)
         return 2
     except KeyboardInterrupt:
-        Console(stderr=True).print("nexwarp: interrupted; continue with --resume")
+        hint = "; continue with --resume" if isinstance(command, Train) else ""
+        Console(stderr=True).print(f"nexwarp: interrupted{hint}")
         return 130
     return 0
 

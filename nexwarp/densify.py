@@ -83,7 +83,9 @@ class Densifier:
             self.errors = torch.zeros_like(surfels.logit_opacities.detach())
         pruned = 0
         if split or self.config.prune_at_cap:
-            keep = surfels.opacities.detach() >= self.config.prune_opacity
+            opacities = surfels.opacities.detach()
+            # The most opaque one always stays: a scene without surfels has no gradient to recover by.
+            keep = (opacities >= self.config.prune_opacity) | (opacities == opacities.max())
             pruned = int((~keep).sum())
             if pruned:
                 kept = keep.nonzero()[:, 0]

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from nexwarp.checkpoint import write_json
+from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
-from nexwarp.trainer import Config
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
@@ -44,15 +44,17 @@ class SceneSource:
         return load_scene(folder, images=self.images, downscale=self.downscale)
 
 
-def prepare_run(run: Path, *, resume: bool, overwrite: bool) -> None:
+def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> None:
     """Refuse a run folder that must not be touched; change nothing.
 
     Raises:
-        ValueError: the folder exists and neither flag is given, or both are, or it is no run.
+        ValueError: the folder exists and neither flag is given, or both are, or it is no run, or it holds the scene.
         FileNotFoundError: there is nothing to resume.
     """
     if resume and overwrite:
         raise ValueError("--resume, --overwrite: expected at most one of them, got both")
+    if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
+        raise ValueError(f"--run: expected a folder that does not hold the scene, got {run}")
     exists = run.exists() and (not run.is_dir() or any(run.iterdir()))
     if resume:
         if not (run / CONFIG_FILE).is_file():

@@ -5,7 +5,7 @@ import math
 import random
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,164 +14,17 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
-from nexwarp.data import Scene, View, initial_points
+from nexwarp.config import Config
+from nexwarp.data import Scene, View
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
-from nexwarp.kernels.types import MAX_HITS
-from nexwarp.losses import LossWeights, training_losses
-from nexwarp.ops.checks import check_range
+from nexwarp.initial import initial_surfels, texture_shape
+from nexwarp.losses import training_losses
 from nexwarp.render import Rendering, render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
-# Schedules are given for runs of this length and stretch with `iterations`.
-REFERENCE_ITERATIONS = 30_000
-MIN_SURFELS = 16
-SH_DC = 0.28209479177387814
-INITIAL_OPACITY = 0.1
-INITIAL_RAW_GAMMA = -5.0
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rates; pairs decay log-linearly over the run."""
-
-    means: tuple[float, float] = (1.6e-4, 1.6e-6)
-    """Times the scene scale."""
-    quats: float = 1e-3
-    """Of the raw quaternions."""
-    scales: float = 5e-3
-    """Of the logarithms of the scales."""
-    opacities: float = 0.025
-    """Of the logits of the opacities."""
-    gammas: float = 1e-3
-    """Of the logarithms of gamma - 1."""
-    sh0: float = 2.5e-3
-    """Of the plain colours' constant coefficients."""
-    shN: float = 1.25e-4
-    """Of the other ones."""
-    grid: tuple[float, float] = (1e-3, 1e-5)
-    """Of the hash grid."""
-    mlp: tuple[float, float] = (1e-3, 1e-4)
-    """Of the MLP."""
-
-
-@dataclass(frozen=True)
-class TextureConfig:
-    """Shape of the neural texture (paper Sec. 4)."""
-
-    levels: int = 16
-    """L, resolution levels."""
-    table_size: int = 2**20
-    """T, entries a level, a power of two."""
-    features: int = 2
-    """F, features an entry."""
-    min_resolution: float | None = None
-    """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
-    max_resolution: float | None = None
-    """Of the finest level; None derives it from the footprint of the training pixels."""
-    width: int = 64
-    """Of the hidden layers."""
-    hidden_layers: int = 2
-    """Number of hidden layers."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """Everything that a run depends on, beside the scene."""
-
-    preset: str = "default"
-    """Name of the preset that this is, or started from."""
-    iterations: int = REFERENCE_ITERATIONS
-    """Training steps, one view each; schedules stretch with them."""
-    max_surfels: int = 400_000
-    """P, the budget: never exceeded. Half of it at most comes from the point cloud."""
-    max_hits: int = 2
-    """K, hits a pixel textures, 0 to 8; 0 trains without a texture."""
-    sh_degree: int = 3
-    """Highest degree of both appearances; one more is unlocked every 1,000 iterations."""
-    sh_every: int = 1000
-    """Iterations, of a run of 30,000, between those."""
-    coarse: float = 0.0
-    """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind everything."""
-    low_pass: bool = False
-    """Screen-space low-pass for surfels smaller than a pixel."""
-    clamp_texture: bool = False
-    """Limit textured colours to >= 0."""
-    clamp_image: bool = False
-    """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
-    filter_points: bool = True
-    """Drop uncertain points of the cloud before sampling."""
-    orient_points: bool = True
-    """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
-    seed: int = 0
-    """Of every random choice."""
-    losses: LossWeights = field(default_factory=LossWeights)
-    """Factors of the loss terms."""
-    rates: LearningRates = field(default_factory=LearningRates)
-    """Learning rates."""
-    texture: TextureConfig = field(default_factory=TextureConfig)
-    """Shape of the texture."""
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
-    """Density control."""
-
-    def __post_init__(self) -> None:
-        check_range("iterations", self.iterations, 1)
-        check_range("max_surfels", self.max_surfels, MIN_SURFELS)
-        check_range("max_hits", self.max_hits, 0, MAX_HITS)
-        check_range("sh_degree", self.sh_degree, 0, 3)
-        check_range("coarse", self.coarse, 0.0, 1.0)
-
-    def scaled(self, iteration: float) -> int:
-        """Iteration of this run that stands for one of a run of 30,000."""
-        return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the settings as plain JSON values."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Config":
-        """Rebuild a config from `as_dict`; ValueError names an unknown key."""
-        parts = {
-            "losses": LossWeights,
-            "rates": LearningRates,
-            "texture": TextureConfig,
-            "densify": DensifyConfig,
-        }
-        try:
-            data = {k: parts[k](**_tuples(v)) if k in parts else v for k, v in data.items()}
-            return cls(**_tuples(data))
-        except (TypeError, AttributeError) as error:
-            raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
-
-
-def _tuples(data: dict[str, Any]) -> dict[str, Any]:
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-
-
-PRESETS: dict[str, Config] = {
-    "default": Config(),
-    "paper": Config(
-        preset="paper",
-        clamp_image=True,
-        filter_points=False,
-        orient_points=False,
-        rates=LearningRates(mlp=(1e-3, 1e-3)),
-        texture=TextureConfig(min_resolution=16.0, max_resolution=256.0),
-        densify=DensifyConfig(prune_at_cap=False),
-    ),
-}
-
-
-def preset(name: str) -> Config:
-    """Return a preset; ValueError lists the known ones."""
-    if name not in PRESETS:
-        raise ValueError(f"preset: expected one of {', '.join(sorted(PRESETS))}, got {name!r}")
-    return PRESETS[name]
 
 
 @dataclass(frozen=True)
@@ -398,89 +251,6 @@ class _Views:
             self.reduced[index, factor] = Camera(camera.viewmat, K, *size, near=camera.near)
         small = torch.nn.functional.avg_pool2d(photo.permute(2, 0, 1), factor)
         return self.reduced[index, factor], small.permute(1, 2, 0).contiguous()
-
-
-def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
-    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 3.3)."""
-    points = initial_points(
-        scene.points,
-        scene.colors,
-        max(config.max_surfels // 2, 1),
-        track_lengths=scene.track_lengths,
-        errors=scene.reprojection_errors,
-        filter_outliers=config.filter_points,
-    )
-    count = len(points.means)
-    quats = torch.randn(count, 4, generator=generator)
-    raw = {
-        "means": points.means,
-        "raw_quats": quats_towards(points.normals, quats) if config.orient_points else quats,
-        "log_scales": points.scales.log()[:, None].repeat(1, 2),
-        "logit_opacities": torch.logit(torch.full((count,), INITIAL_OPACITY)),
-        "raw_gammas": torch.full((count, 2), INITIAL_RAW_GAMMA),
-        "sh0": ((points.colors - 0.5) / SH_DC)[:, None],
-        "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
-    }
-    return Surfels(raw)
-
-
-def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
-    """Turn rotations by the least angle so that their z axes lie along normals.
-
-    Args:
-        normals: (N, 3) unit.
-        quats: (N, 4) wxyz, any length but zero.
-
-    Returns:
-        (N, 4) unit, wxyz.
-    """
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
-    normals = torch.where((axis * normals).sum(-1, keepdim=True) < 0, -normals, normals)
-    # Half-way quaternion from axis to normal; their angle is at most 90 degrees, so it is never 0.
-    turn = torch.cat([1 + (axis * normals).sum(-1, keepdim=True), torch.linalg.cross(axis, normals)], dim=-1)
-    a, b, c, d = torch.nn.functional.normalize(turn, dim=-1).unbind(-1)
-    return torch.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        dim=-1,
-    )
-
-
-def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
-    """Arguments of `NeuralTexture`, with resolutions that follow the scene when the config leaves them open.
-
-    The finest level's cells are as small as the pixels of nearly all training views at the points they see (95th
-    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing.
-    """
-    shape = dataclasses.asdict(config.texture)
-    if shape["max_resolution"] is None:
-        shape["max_resolution"] = _pixel_resolution(scene)
-    if shape["min_resolution"] is None:
-        shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
-    return shape
-
-
-def _pixel_resolution(scene: Scene) -> float:
-    """95th percentile, over training views and the points in them, of pixels per world unit."""
-    densities = []
-    for view in scene.train:
-        camera = view.camera
-        x = scene.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = x[:, 2]
-        pixel = x[:, :2] / depth[:, None] * torch.tensor([camera.fx, camera.fy])
-        pixel = pixel + torch.tensor([camera.cx, camera.cy])
-        size = torch.tensor([camera.width, camera.height])
-        seen = (depth > camera.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
-        densities.append(camera.focal / depth[seen])
-    density = torch.cat(densities)
-    if density.numel() == 0:
-        raise ValueError(f"{scene.path}: expected points in front of the training cameras, found none")
-    return float(np.quantile(density.numpy(), 0.95))
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

@@ -16,14 +16,14 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp import cli, trainer
+from nexwarp import cli, config
 from nexwarp.checkpoint import load_cameras
+from nexwarp.config import Config, TextureConfig
 from nexwarp.console import TrainingDisplay
 from nexwarp.data import write_demo
 from nexwarp.densify import Densifier, DensifyConfig
 from nexwarp.metrics import CONVENTION, psnr, to_uint8
 from nexwarp.pictures import CAPTION_HEIGHT
-from nexwarp.trainer import Config, TextureConfig
 from tests.test_scene import make_scene
 
 SMALL = Config(
@@ -40,7 +40,7 @@ def small_preset() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(trainer.PRESETS, "default", SMALL)
+        patch.setitem(config.PRESETS, "default", SMALL)
         yield
     torch.set_num_threads(threads)
 
@@ -506,3 +506,12 @@ def test_python_dash_m(tmp_path):
     assert done.returncode == 2
     assert done.stderr == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a COLMAP scene\n"
     assert os.listdir(tmp_path) == []
+
+
+def test_a_run_may_not_replace_its_own_scene(scene, tmp_path, capsys):
+    folder = tmp_path / "holds"
+    shutil.copytree(scene, folder / "scene")
+    (folder / "config.json").write_text("{}")
+    assert cli.main(["train", str(folder / "scene"), "--run", str(folder), "--overwrite"]) == 2
+    assert "--run: expected a folder that does not hold the scene" in capsys.readouterr().err
+    assert (folder / "scene" / "images").is_dir()

@@ -301,3 +301,16 @@ def test_settings_out_of_range_are_refused(name, value):
 def test_budget_must_be_positive():
     with pytest.raises(ValueError, match=r"^max_surfels: expected at least 1, got 0$"):
         densifier_of(make(4)[0], budget=0)
+
+
+def test_the_last_surfel_is_never_pruned() -> None:
+    """With none left, the opacity loss is the mean of nothing and no gradient can bring one back."""
+    surfels = make_surfels(random_scene(5))
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.tensor([-9.0, -8.0, -7.0, -8.5, -9.5]))
+    means = surfels.means.detach().clone()
+    optimizer = torch.optim.Adam([{"params": [p]} for p in surfels.parameters()])
+    densifier = Densifier(DensifyConfig(), surfels, 100)
+    _, pruned = densifier.step(surfels, optimizer, torch.Generator().manual_seed(0))
+    assert pruned == 4 and len(surfels) == 1
+    assert torch.equal(surfels.means.detach(), means[2:3])

@@ -14,6 +14,8 @@ LAYERS = [
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures"},
     {"densify", "checkpoint", "evaluate"},
+    {"config"},
+    {"initial"},
     {"trainer"},
     {"runs", "console"},
     {"cli"},

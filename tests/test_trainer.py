@@ -13,21 +13,13 @@ import torch
 
 import nexwarp as nw
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene, View, initial_points, write_demo
 from nexwarp.densify import DensifyConfig
 from nexwarp.evaluate import evaluate
+from nexwarp.initial import initial_surfels, quats_towards, texture_shape
 from nexwarp.losses import LossWeights
-from nexwarp.trainer import (
-    MIN_SURFELS,
-    Config,
-    LearningRates,
-    TextureConfig,
-    Trainer,
-    initial_surfels,
-    preset,
-    quats_towards,
-    texture_shape,
-)
+from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
 
 FOX = Path(__file__).parents[2] / "shared" / "data" / "fox"

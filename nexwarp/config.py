@@ -1,0 +1,155 @@
+"""Settings of a training run: dataclasses whose field docstrings say what they are, and the presets."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+from nexwarp.densify import DensifyConfig
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.losses import LossWeights
+from nexwarp.ops.checks import check_range
+
+# Schedules are given for runs of this length and stretch with `iterations`.
+REFERENCE_ITERATIONS = 30_000
+MIN_SURFELS = 16
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates; pairs decay log-linearly over the run."""
+
+    means: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """Times the scene scale."""
+    quats: float = 1e-3
+    """Of the raw quaternions."""
+    scales: float = 5e-3
+    """Of the logarithms of the scales."""
+    opacities: float = 0.025
+    """Of the logits of the opacities."""
+    gammas: float = 1e-3
+    """Of the logarithms of gamma - 1."""
+    sh0: float = 2.5e-3
+    """Of the plain colours' constant coefficients."""
+    shN: float = 1.25e-4
+    """Of the other ones."""
+    grid: tuple[float, float] = (1e-3, 1e-5)
+    """Of the hash grid."""
+    mlp: tuple[float, float] = (1e-3, 1e-4)
+    """Of the MLP."""
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Shape of the neural texture (paper Sec. 4)."""
+
+    levels: int = 16
+    """L, resolution levels."""
+    table_size: int = 2**20
+    """T, entries a level, a power of two."""
+    features: int = 2
+    """F, features an entry."""
+    min_resolution: float | None = None
+    """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
+    max_resolution: float | None = None
+    """Of the finest level; None derives it from the footprint of the training pixels."""
+    width: int = 64
+    """Of the hidden layers."""
+    hidden_layers: int = 2
+    """Number of hidden layers."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that a run depends on, beside the scene."""
+
+    preset: str = "default"
+    """Name of the preset that this is, or started from."""
+    iterations: int = REFERENCE_ITERATIONS
+    """Training steps, one view each; schedules stretch with them."""
+    max_surfels: int = 400_000
+    """P, the budget: never exceeded. Half of it at most comes from the point cloud."""
+    max_hits: int = 2
+    """K, hits a pixel textures, 0 to 8; 0 trains without a texture."""
+    sh_degree: int = 3
+    """Highest degree of both appearances; one more is unlocked every 1,000 iterations."""
+    sh_every: int = 1000
+    """Iterations, of a run of 30,000, between those."""
+    coarse: float = 0.0
+    """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour behind everything."""
+    low_pass: bool = False
+    """Screen-space low-pass for surfels smaller than a pixel."""
+    clamp_texture: bool = False
+    """Limit textured colours to >= 0."""
+    clamp_image: bool = False
+    """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
+    filter_points: bool = True
+    """Drop uncertain points of the cloud before sampling."""
+    orient_points: bool = True
+    """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
+    seed: int = 0
+    """Of every random choice."""
+    losses: LossWeights = field(default_factory=LossWeights)
+    """Factors of the loss terms."""
+    rates: LearningRates = field(default_factory=LearningRates)
+    """Learning rates."""
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    """Shape of the texture."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    """Density control."""
+
+    def __post_init__(self) -> None:
+        check_range("iterations", self.iterations, 1)
+        check_range("max_surfels", self.max_surfels, MIN_SURFELS)
+        check_range("max_hits", self.max_hits, 0, MAX_HITS)
+        check_range("sh_degree", self.sh_degree, 0, 3)
+        check_range("coarse", self.coarse, 0.0, 1.0)
+
+    def scaled(self, iteration: float) -> int:
+        """Iteration of this run that stands for one of a run of 30,000."""
+        return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain JSON values."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Config":
+        """Rebuild a config from `as_dict`; ValueError names an unknown key."""
+        parts = {
+            "losses": LossWeights,
+            "rates": LearningRates,
+            "texture": TextureConfig,
+            "densify": DensifyConfig,
+        }
+        try:
+            data = {k: parts[k](**_tuples(v)) if k in parts else v for k, v in data.items()}
+            return cls(**_tuples(data))
+        except (TypeError, AttributeError) as error:
+            raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
+
+
+def _tuples(data: dict[str, Any]) -> dict[str, Any]:
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+
+
+PRESETS: dict[str, Config] = {
+    "default": Config(),
+    "paper": Config(
+        preset="paper",
+        clamp_image=True,
+        filter_points=False,
+        orient_points=False,
+        rates=LearningRates(mlp=(1e-3, 1e-3)),
+        texture=TextureConfig(min_resolution=16.0, max_resolution=256.0),
+        densify=DensifyConfig(prune_at_cap=False),
+    ),
+}
+
+
+def preset(name: str) -> Config:
+    """Return a preset; ValueError lists the known ones."""
+    if name not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(sorted(PRESETS))}, got {name!r}")
+    return PRESETS[name]
