@@ -160,11 +160,16 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     """
     if len(ends) == 0:
         return 0
-    key = (ends.device.index, len(ends).bit_length(), *kind)
+    bits = len(ends).bit_length()
+    key = (ends.device.index, bits, *kind)
     need = _needs.get(key)
     if need is None:
+        room = _with_margin(_total(ends))
+        # A scene that grew by splitting has at least the needs it had: one view may show little of it.
+        if fewer := _needs.get((ends.device.index, bits - 1, *kind)):
+            room = max(room, fewer.room)
         total = torch.empty(1, dtype=torch.int32, pin_memory=True)
-        need = _needs[key] = _Need(_with_margin(_total(ends)), total, torch.cuda.Event())
+        need = _needs[key] = _Need(room, total, torch.cuda.Event())
     elif need.copied.query():
         need.room = max(need.room, _with_margin(int(need.total)))
     else:
