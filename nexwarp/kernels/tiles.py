@@ -261,8 +261,9 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         for row in range(shape.rows[0], shape.rows[1] + 1):
             s = f.span(shape, row, grid[0])
             for column in range(s[0], s[1] + 1):
-                # Lists may be too short (see `nexwarp.ops.tiles`): never write past them.
-                if e < entries.shape[0]:
+                # Lists may be too short (see `nexwarp.ops.tiles`), and a compiler may round here otherwise than in
+                # `count`: never write past the list's or the surfel's own end.
+                if e < end and e < entries.shape[0]:
                     tiles[e] = row * grid[0] + column
                     entries[e] = e
                     surfels[e] = i
