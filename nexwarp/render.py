@@ -1,6 +1,7 @@
 """Rendering: project -> tiles -> collect -> texture -> compose (paper Sec. 3.2)."""
 
-from collections.abc import Sequence
+import numbers
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -73,7 +74,7 @@ def render(
     texture: NeuralTexture | None,
     camera: Camera,
     max_hits: int = 2,
-    background: Sequence[float] | torch.Tensor = (0.0, 0.0, 0.0),
+    background: float | Sequence[float] | torch.Tensor = (0.0, 0.0, 0.0),
     sh_degree: int = 3,
     low_pass: bool = False,
     clamp_texture: bool = False,
@@ -87,7 +88,7 @@ def render(
         texture: the neural texture, on the same device; None gives the textured hits their plain colour instead.
         camera: the camera, on the same device.
         max_hits: K, how many hits a pixel textures, 0 to 8.
-        background: three numbers or a (3,) tensor, seen through what is left of the transmittance.
+        background: a number, three numbers or a (3,) tensor, seen through what is left of the transmittance.
         sh_degree: 0 to 3, limits the degree of both appearances.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
         clamp_texture: limit textured colours to >= 0.
@@ -95,7 +96,7 @@ def render(
     Raises:
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
-    background = _check(surfels, texture, camera, max_hits, background, sh_degree)
+    background = _check(surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture)
     shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
     pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, sh_degree)
@@ -114,13 +115,31 @@ def render(
     return Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, passes)
 
 
+def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Return the background as a (3,) tensor; a tensor keeps its graph."""
+    if isinstance(background, torch.Tensor):
+        return background.expand(3) if background.ndim == 0 else background
+    if isinstance(background, numbers.Real):
+        background = [background] * 3
+    if not isinstance(background, Iterable) or isinstance(background, str):
+        raise TypeError(f"background: expected numbers or a tensor, got {type(background).__name__}")
+    values = list(background)
+    if len(values) != 3:
+        raise ValueError(f"background: expected 3 values, got {len(values)}")
+    if not all(isinstance(x, numbers.Real) for x in values):
+        raise TypeError(f"background: expected three numbers or a tensor, got {values}")
+    return torch.stack([like.new_full((), float(x)) for x in values])
+
+
 def _check(
     surfels: Surfels,
     texture: NeuralTexture | None,
     camera: Camera,
     max_hits: int,
-    background: Sequence[float] | torch.Tensor,
+    background: float | Sequence[float] | torch.Tensor,
     sh_degree: int,
+    low_pass: bool,
+    clamp_texture: bool,
 ) -> torch.Tensor:
     """Check types, shapes and devices only, so as never to wait for a GPU; return the background as a tensor."""
     for name, value, kind in (("surfels", surfels, Surfels), ("camera", camera, Camera)):
@@ -132,15 +151,13 @@ def _check(
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
         check_range(name, value, 0, high)
+    for name, value in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
+        if not isinstance(value, bool):
+            raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
     means = surfels.means
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
-    if not isinstance(background, torch.Tensor):
-        if not isinstance(background, Sequence) or isinstance(background, str):
-            raise TypeError(f"background: expected three numbers or a tensor, got {type(background).__name__}")
-        if len(background) != 3:
-            raise ValueError(f"background: expected 3 values, got {len(background)}")
-        background = torch.stack([means.new_full((), float(x)) for x in background])
+    background = _background(background, means)
     others = {"camera.viewmat": (camera.viewmat, (4, 4)), "background": (background, (3,))}
     if texture is not None:
         others["texture.grid"] = (texture.grid, tuple(texture.grid.shape))

@@ -73,13 +73,14 @@ class Surfels(nn.Module):
         check_coefficients("sh", sh.shape[1])
         for name, (tensor, _) in arguments.items():
             check_finite(name, tensor)
-        _check_each("quats", quats.norm(dim=-1) > 0, quats, "a length > 0")
+        largest = quats.abs().amax(dim=-1, keepdim=True)
+        _check_each("quats", largest[..., 0] > 0, quats, "a length > 0")
         _check_each("scales", scales > 0, scales, "values > 0")
         _check_each("opacities", (opacities >= 0) & (opacities <= 1), opacities, "values in [0, 1]")
         _check_each("gammas", gammas >= 1, gammas, "values >= 1")
         raw = {
             "means": means,
-            "raw_quats": quats,
+            "raw_quats": nn.functional.normalize(quats / largest, dim=-1),
             "log_scales": scales.log(),
             "logit_opacities": torch.logit(opacities, eps=END),
             "raw_gammas": (gammas - 1).clamp_min(END).log(),

@@ -64,8 +64,13 @@ class NeuralTexture(nn.Module):
             check_range(name, value, low, high)
         if table_size & (table_size - 1):
             raise ValueError(f"table_size: expected a power of two, got {table_size}")
+        if isinstance(features, bool) or not isinstance(features, int):
+            raise TypeError(f"features: expected an int, got {type(features).__name__}")
         if features not in (1, 2, 4, 8):
             raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
+        for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
         check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
         check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
         self.config = {
@@ -108,10 +113,12 @@ class NeuralTexture(nn.Module):
         Returns:
             (..., (sh_degree + 1)^2, 3) coefficients, differentiable in positions, depths and the parameters.
         """
+        if not isinstance(depths, torch.Tensor):
+            raise TypeError(f"depths: expected a torch.Tensor, got {type(depths).__name__}")
         expected = {"depths": (depths, tuple(depths.shape)), "positions": (positions, (*depths.shape, 3))}
         check_tensors(expected, dtype=self.grid.dtype, device=self.grid.device)
         out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)
-        return out.T.reshape(*depths.shape, -1, 3)
+        return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
 
     def colors(
         self,
@@ -152,7 +159,11 @@ class NeuralTexture(nn.Module):
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if isinstance(focal, torch.Tensor):
+            if focal.numel() != 1:
+                raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
             focal = focal.detach().to(self.grid).reshape(1)
+        elif isinstance(focal, bool) or not isinstance(focal, (int, float)):
+            raise TypeError(f"focal: expected a number or a tensor, got {type(focal).__name__}")
         else:
             focal = self.grid.new_full((1,), float(focal))
         return ops.texture(

@@ -402,3 +402,47 @@ def test_surfels_of_lower_degree(coefficients: int, device: torch.device) -> Non
     short, full = draw(scene | {"sh": scene["sh"][:, :coefficients]}), draw(scene | {"sh": padded})
     for buffer in BUFFERS:
         assert_close(getattr(short, buffer), getattr(full, buffer), kind="value", name=buffer)
+
+
+def in_a_row(device: torch.device, opacities: list[float], scale: float = 100.0, depth: float = 1.0) -> Scene:
+    """Surfels facing the camera one behind the other, one unit apart."""
+    count = len(opacities)
+    scene = random_scene(count, device=device)
+    means = torch.zeros(count, 3, device=device)
+    means[:, 2] = depth + torch.arange(count, device=device)
+    quats = torch.zeros(count, 4, device=device)
+    quats[:, 0] = 1
+    return scene | {
+        "means": means,
+        "quats": quats,
+        "scales": torch.full((count, 2), scale, device=device),
+        "opacities": torch.tensor(opacities, device=device),
+        "gammas": torch.ones(count, 2, device=device),
+        "viewmat": torch.eye(4, device=device),
+        "K": torch.tensor([[10.0, 0.0, 0.5], [0.0, 10.0, 0.5], [0.0, 0.0, 1.0]], device=device),
+        "width": 1,
+        "height": 1,
+    }
+
+
+def test_of_equal_weights_the_nearer_stays_when_a_heavier_one_comes(device: torch.device) -> None:
+    """A hit that is displaced moves before its equals: it came first. Once the nearer one fell out instead."""
+    found = 0
+    for step in range(400):
+        first = 0.05 + step * 1e-4
+        scene = in_a_row(device, [first, first / (1 - first), 0.97], scale=1e6)
+        out = draw(scene, max_hits=8)
+        weight = dict(zip(out.ids[0, 0].tolist(), out.weights[0, 0].tolist(), strict=True))
+        if weight[0] != weight[1]:
+            continue
+        found += 1
+        assert out.ids[0, 0, :3].tolist() == [2, 0, 1]
+        assert draw(scene, max_hits=2).ids[0, 0].tolist() == [2, 0]
+    assert found > 10
+
+
+@pytest.mark.parametrize("scale", [1e2, 1e5, 1e6, 1e8, 1e10])
+def test_however_large_a_surfel_is_it_is_seen(scale: float, device: torch.device) -> None:
+    """Once a support over a million times as wide as it is far away was clipped as if behind the camera."""
+    out = draw(in_a_row(device, [0.9], scale=scale, depth=5.0))
+    assert_close(out.alpha, torch.full((1, 1), 0.9), kind="value", name="alpha")

@@ -161,12 +161,15 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                 weight = hit[0] * transmittance
                 transmittance = transmittance * (ONE - hit[0])
                 stop = k + 1
-                # Insert into the buffer, bubbling down what it displaces; what falls out is blended as plain.
+                # Insert into the buffer before the first lighter hit, and move that and all behind it down by one, so
+                # that of equal ones the nearer stays; what falls out is blended as plain.
+                displaced = int(0)
                 out_id = int(i)
                 out_weight = real(weight)
                 out_depth = real(hit[1])
                 for j in range(wp.static(max_hits)):
-                    if out_weight > buffer_weights[j]:
+                    if displaced == 1 or out_weight > buffer_weights[j]:
+                        displaced = 1
                         w_ = buffer_weights[j]
                         i_ = buffer_ids[j]
                         d_ = buffer_depths[j]

@@ -15,7 +15,7 @@ from nexwarp.kernels.types import types
 
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01
-RELATIVE_MARGIN = 4e-6
+RELATIVE_MARGIN = 1e-6
 # A typed constant: a bare literal of this size would be an int32.
 SIGN = wp.constant(wp.uint32(2147483648))
 
@@ -31,6 +31,7 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
     ZERO, HALF, ONE, TWO = t.ZERO, t.HALF, t.ONE, t.TWO
     HUGE = wp.constant(real(1e30))
     SIZE = wp.constant(real(tile_size))
+    RELATIVE = wp.constant(real(RELATIVE_MARGIN))
 
     @wp.struct
     class Footprint:
@@ -74,7 +75,8 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
         v1 = v1 * (scale[0] * wp.pow(limit, HALF / gamma[0]))
         v2 = v2 * (scale[1] * wp.pow(limit, HALF / gamma[1]))
         reach = wp.length(center) + wp.length(v1) + wp.length(v2)
-        plane = wp.max(near * real(0.999), reach * real(1.0e-6))
+        # With near = 0, hits closer than a millionth of the surfel's distance are given up: they have no projection.
+        plane = wp.max(near * real(0.999), wp.length(center) * real(1.0e-6))
         quad = mat43()
         for k in range(4):
             s1 = wp.where(k == 0 or k == 3, ONE, -ONE)
@@ -85,6 +87,7 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
             quad[k, 2] = c[2]
         low = vec2(HUGE, HUGE)
         high = vec2(-HUGE, -HUGE)
+        nearest = real(HUGE)
         count = int(0)
         for k in range(4):
             j = (k + 1) % 4
@@ -97,11 +100,13 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
                 count += 1
                 low = wp.min(low, x)
                 high = wp.max(high, x)
+                nearest = wp.min(nearest, p[2])
             if (p[2] >= plane) != (q[2] >= plane):
                 cut = p + (q - p) * ((plane - p[2]) / (q[2] - p[2]))
                 cut[2] = plane
                 x = pixel(cut, intrinsics)
                 # Five corners at most; rounding cannot make a sixth of a convex quad.
+                nearest = plane
                 if count < 5:
                     out.corners[count, 0] = x[0]
                     out.corners[count, 1] = x[1]
@@ -121,7 +126,9 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
         if not (size < HUGE):
             return out
         out.count = count
-        out.margin = real(MARGIN) + real(RELATIVE_MARGIN) * size
+        # A corner is known to a rounding of the reach: pixels by the focal length over the depth.
+        blur = RELATIVE * reach * wp.max(intrinsics[0], intrinsics[1]) / nearest
+        out.margin = real(MARGIN) + RELATIVE * size + wp.where(count > 0, blur, ZERO)
         # A tile's samples are its pixel centres, half a pixel inside its border.
         y0 = index((low[1] - out.margin + HALF) / SIZE - ONE, tile_rows)
         y1 = index((high[1] + out.margin - HALF) / SIZE, tile_rows)
