@@ -107,7 +107,7 @@ def _check_intrinsics(intrinsics: torch.Tensor) -> None:
     (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
     if fx <= 0 or fy <= 0:
         raise ValueError(f"K: expected focal lengths > 0, got fx={fx:g}, fy={fy:g}")
-    if abs(skew) > 1e-6 * fx or abs(shear) > 1e-6 * fy:
+    if skew != 0 or shear != 0:
         raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
     if last != [0.0, 0.0, 1.0]:
         raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.checks import check_finite, check_range
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
@@ -73,6 +75,8 @@ def load(path: str | os.PathLike[str]) -> Model:
     """
     from safetensors import SafetensorError, safe_open
 
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
     path = Path(path)
     if path.is_dir():
         path = path / MODEL_FILE
@@ -96,15 +100,32 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
-        missing = [name for name in RENDER_OPTIONS if name not in meta]
-        if missing:
-            raise ValueError(f"no {missing[0]} in the metadata")
+        _check_options(meta)
+        for name, x in tensors.items():
+            check_finite(name, x)
         texture = NeuralTexture(**meta.pop("texture"))
         texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())  # torch's go over several lines
         raise ValueError(f"{path}: the tensors do not make a model ({reason})") from None
     return Model(surfels, texture, meta)
+
+
+def _check_options(meta: dict[str, Any]) -> None:
+    """Raise ValueError unless the metadata holds what `nexwarp.render` takes."""
+    missing = [name for name in RENDER_OPTIONS if name not in meta]
+    if missing:
+        raise ValueError(f"no {missing[0]} in the metadata")
+    for name, high in (("max_hits", MAX_HITS), ("sh_degree", 3)):
+        if type(meta[name]) is not int:
+            raise ValueError(f"{name}: expected an int, got {meta[name]!r}")
+        check_range(name, meta[name], 0, high)
+    for name in ("low_pass", "clamp_texture"):
+        if not isinstance(meta[name], bool):
+            raise ValueError(f"{name}: expected true or false, got {meta[name]!r}")
+    colour = meta["background"]
+    if not (isinstance(colour, list) and len(colour) == 3 and all(type(x) in (int, float) for x in colour)):
+        raise ValueError(f"background: expected three numbers, got {colour!r}")
 
 
 def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:

@@ -198,7 +198,10 @@ class Render:
             renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras.get("test", {}).items()
         }
         if self.frames:
-            path = ellipse(list(cameras.get("train", {}).values()), self.frames)
+            try:
+                path = ellipse(list(cameras.get("train", {}).values()), self.frames)
+            except ValueError as error:
+                raise ValueError(f"{error}; --frames 0 renders the test views alone") from None
             jobs |= {renders / "ellipse" / f"{i:04d}.png": camera for i, camera in enumerate(path)}
         with display.counting(console, "rendering", len(jobs)) as done:
             for file, camera in jobs.items():

@@ -104,6 +104,7 @@ class Config:
         check_range("max_surfels", self.max_surfels, MIN_SURFELS)
         check_range("max_hits", self.max_hits, 0, MAX_HITS)
         check_range("sh_degree", self.sh_degree, 0, 3)
+        check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
 
     def scaled(self, iteration: float) -> int:

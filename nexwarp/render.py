@@ -37,7 +37,6 @@ class Rendering:
         depths: (H, W, K) their z-depths, world units; 0 in empty slots.
         weights: (H, W, K) their blending weights; 0 in empty slots.
         alpha: (H, W) 1 - final transmittance.
-        passes: intermediate results.
     """
 
     image: torch.Tensor
@@ -47,7 +46,6 @@ class Rendering:
     depths: torch.Tensor
     weights: torch.Tensor
     alpha: torch.Tensor
-    passes: Passes
 
     def watch_error(self, errors: torch.Tensor) -> ops.ErrorWatch:
         """Ask the coming backward pass for `splat_error(errors)`, at hardly any cost.
@@ -58,14 +56,14 @@ class Rendering:
         Returns:
             An object whose `sums` (N,) are there once `backward` has run.
         """
-        watch = self.passes.hits.watch
+        watch = self._passes.hits.watch
         check_tensors({"errors": (errors, self.alpha.shape)}, dtype=self.alpha.dtype, device=self.alpha.device)
         watch.errors = errors.detach().contiguous()
         return watch
 
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
         """Return (N,): each surfel's sum over pixels of blending weight * errors (H, W). Not differentiable."""
-        p = self.passes
+        p = self._passes
         return ops.splat_error(p.projection, p.tiles, p.hits, p.pinhole, errors, low_pass=p.low_pass)
 
 
@@ -112,7 +110,10 @@ def render(
         )
     image, textured = ops.compose(hits.plain, texels, hits.weights, hits.alpha, background)
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
-    return Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, passes)
+    rendering = Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
+    # No buffer, so no field: only `watch_error` and `splat_error` look at it.
+    object.__setattr__(rendering, "_passes", passes)
+    return rendering
 
 
 def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:

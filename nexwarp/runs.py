@@ -88,6 +88,9 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
         raise FileNotFoundError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
         data = json.loads(path.read_text())
+        scene = data["scene"]
+        if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
+            raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None

@@ -70,6 +70,8 @@ class Surfels(nn.Module):
             "sh": (sh, ("N", "C", 3)),
         }
         check_tensors(arguments)
+        if means.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"means: expected float32 or float64, got {means.dtype}")
         check_coefficients("sh", sh.shape[1])
         for name, (tensor, _) in arguments.items():
             check_finite(name, tensor)

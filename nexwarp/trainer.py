@@ -1,6 +1,7 @@
 """Training: the loop of paper Sec. 3.3, as a class that the command line drives."""
 
 import dataclasses
+import hashlib
 import math
 import random
 import time
@@ -145,7 +146,7 @@ class Trainer:
             "iteration": self.iteration,
             "seconds": self.seconds,
             "order": self.order,
-            "views": len(self.views),
+            "views": self.views.fingerprint(),
             "numpy": [kind, *rest],
             "python": random.getstate(),
             "config": self.config.as_dict(),
@@ -158,8 +159,8 @@ class Trainer:
         try:
             if Config.from_dict(state["config"]) != self.config:
                 raise ValueError("its settings are others")
-            if state["views"] != len(self.views):
-                raise ValueError(f"it has seen {state['views']} training views, the scene has {len(self.views)}")
+            if state["views"] != self.views.fingerprint():
+                raise ValueError("it has seen other training views than the scene has")
             self._restore(tensors, state)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())  # torch's go over several lines
@@ -224,6 +225,7 @@ class _Views:
 
     def __init__(self, views: list[View], device: torch.device) -> None:
         self.device = device
+        self.names = [view.name for view in views]
         self.cameras = [view.camera.to(device) for view in views]
         photos = [view.image for view in views]
         if device.type == "cuda":
@@ -237,6 +239,14 @@ class _Views:
 
     def __len__(self) -> int:
         return len(self.photos)
+
+    def fingerprint(self) -> str:
+        """Digest of the names and cameras, to know the same views again."""
+        digest = hashlib.sha256()
+        for name, camera in zip(self.names, self.cameras, strict=True):
+            values = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), camera.width, camera.height]
+            digest.update(f"{name} {values}\n".encode())
+        return digest.hexdigest()
 
     def get(self, index: int, factor: int) -> tuple[Camera, torch.Tensor]:
         """Camera and photo (H, W, 3) float in [0, 1], reduced by a factor; what does not fill a pixel is cut off."""

@@ -374,3 +374,29 @@ def test_malformed_cameras(tmp_path, content):
 def test_missing_cameras(tmp_path):
     file = tmp_path / "cameras.json"
     refused(FileNotFoundError, load_cameras, file, names=file, match="expected the run's cameras")
+
+
+def test_models_that_cannot_render_are_refused(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    texture = nw.NeuralTexture(levels=2, table_size=2**4, width=8)
+    meta = {"max_hits": 2, "background": [0.0, 0.0, 0.0], "sh_degree": 3, "low_pass": False, "clamp_texture": False}
+    model = nw.Model(make_surfels(random_scene(3)), texture, meta)
+    for key, value in (
+        ("max_hits", "two"),
+        ("max_hits", 9),
+        ("background", [0, 0]),
+        ("low_pass", 1),
+        ("sh_degree", None),
+    ):
+        save_model(tmp_path, nw.Model(model.surfels, texture, meta | {key: value}))
+        with pytest.raises(ValueError, match=key):
+            nw.load(tmp_path)
+    path = save_model(tmp_path, model)
+    with safe_open(path, "pt") as file:
+        header = file.metadata()
+    tensors = load_file(path)
+    tensors["surfels.means"][1, 2] = float("nan")
+    save_file(tensors, path, header)
+    with pytest.raises(ValueError, match=r"surfels.means: expected finite values, got nan at index \(1, 2\)"):
+        nw.load(tmp_path)

@@ -82,6 +82,10 @@ def load_scene(path: str | os.PathLike, images: str = "images", downscale: int =
             pinhole, a photo whose shape is not its camera's, fewer than 2 photos, no points, points that are
             not finite.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    if not isinstance(images, str):
+        raise TypeError(f"images: expected the name of a folder, got {type(images).__name__}")
     path = Path(path)
     _check_downscale(downscale)
     if not path.is_dir():

@@ -75,8 +75,10 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
         v1 = v1 * (scale[0] * wp.pow(limit, HALF / gamma[0]))
         v2 = v2 * (scale[1] * wp.pow(limit, HALF / gamma[1]))
         reach = wp.length(center) + wp.length(v1) + wp.length(v2)
-        # With near = 0, hits closer than a millionth of the surfel's distance are given up: they have no projection.
-        plane = wp.max(near * real(0.999), wp.length(center) * real(1.0e-6))
+        plane = near * real(0.999)
+        if not (plane > ZERO):
+            # With near = 0, hits closer than a millionth of the surfel's distance are given up: nothing bounds where.
+            plane = wp.length(center) * real(1.0e-6)
         quad = mat43()
         for k in range(4):
             s1 = wp.where(k == 0 or k == 3, ONE, -ONE)
@@ -124,6 +126,12 @@ def footprint_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNam
             return out
         size = wp.max(wp.max(wp.abs(low[0]), wp.abs(low[1])), wp.max(wp.abs(high[0]), wp.abs(high[1])))
         if not (size < HUGE):
+            # Too large for arithmetic, or not a number: list it everywhere, the walk decides.
+            for k in range(4):
+                out.corners[k, 0] = wp.where(k == 0 or k == 3, -HUGE, HUGE)
+                out.corners[k, 1] = wp.where(k < 2, -HUGE, HUGE)
+            out.count = 4
+            out.rows = wp.vec2i(0, tile_rows - 1)
             return out
         out.count = count
         # A corner is known to a rounding of the reach: pixels by the focal length over the depth.
