@@ -1,6 +1,6 @@
 """How close is close enough: the one table of tolerances, and a comparison whose failures explain themselves.
 
-Precisions: float64 and float32 are whole passes in that type; float16 stands for the default on CUDA, float32
+Rows: float64 and float32 are whole passes in that type; float16 stands for the default on CUDA, float32
 passes with a half-precision texture. Bounds are on the relative L2 error |a - e| / |e|; float64 also bounds
 the largest error by the largest value. They come from the arithmetic (rounding times the length of the sums),
 not from what the kernels happened to reach.
@@ -22,12 +22,6 @@ ACTIVATION = 2e-6
 
 FLOOR = 1e-12
 """Norm below which an expected tensor counts as zero."""
-
-
-def precision(dtype: torch.dtype, device: torch.device | str, textured: bool) -> torch.dtype:
-    """Row of the table for passes in `dtype` on `device`, with or without a neural texture."""
-    half = textured and dtype == torch.float32 and torch.device(device).type == "cuda"
-    return torch.float16 if half else dtype
 
 
 def assert_close(
