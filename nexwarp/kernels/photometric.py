@@ -1,0 +1,99 @@
+"""The loss terms that compare pixel by pixel: the L1 of the image, of the texture, and the weight that has no texture.
+
+With S = sum_k W, a pixel's share is |image - target|, |textured / (S + eps) - target| (both summed over the channels)
+and 1 - S, each times a scale, which holds the term's factor and the number of values. One thread a pixel; a term whose
+output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from nexwarp.kernels.types import types
+
+WEIGHT_EPSILON = 1e-6  # keeps the un-premultiplied texture finite where nothing is textured
+
+
+@functools.cache
+def photometric_kernels(real: type) -> SimpleNamespace:
+    """Make the forward and backward kernels; `scales` are those of the terms in order."""
+    t = types(real)
+    vec3 = t.vec3
+    ONE, ZERO, EPS = t.ONE, t.ZERO, wp.constant(real(WEIGHT_EPSILON))
+
+    @wp.func
+    def sign(x: real):
+        return wp.where(x > ZERO, ONE, wp.where(x < ZERO, -ONE, ZERO))
+
+    @wp.func
+    def signs(x: vec3):
+        return vec3(sign(x[0]), sign(x[1]), sign(x[2]))
+
+    @wp.func
+    def distance(x: vec3):
+        return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+
+    @wp.func
+    def total(weights: wp.array2d(dtype=real), p: wp.int32):
+        result = real(0.0)
+        for h in range(weights.shape[1]):
+            result += weights[p, h]
+        return result
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def photometric(
+        first: wp.int32,
+        image: wp.array(dtype=vec3),
+        textured: wp.array(dtype=vec3),
+        weights: wp.array2d(dtype=real),
+        target: wp.array(dtype=vec3),
+        scales: vec3,
+        # outputs
+        l1: wp.array(dtype=real),
+        texture: wp.array(dtype=real),
+        alpha: wp.array(dtype=real),
+    ):
+        p = first + wp.tid()
+        weight = total(weights, p)
+        if l1:
+            l1[p] = distance(image[p] - target[p]) * scales[0]
+        if texture:
+            texture[p] = distance(textured[p] / (weight + EPS) - target[p]) * scales[1]
+        if alpha:
+            alpha[p] = (ONE - weight) * scales[2]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def photometric_backward(
+        first: wp.int32,
+        image: wp.array(dtype=vec3),
+        textured: wp.array(dtype=vec3),
+        weights: wp.array2d(dtype=real),
+        target: wp.array(dtype=vec3),
+        scales: vec3,
+        grad_l1: wp.array(dtype=real),
+        grad_texture: wp.array(dtype=real),
+        grad_alpha: wp.array(dtype=real),
+        # outputs
+        grad_image: wp.array(dtype=vec3),
+        grad_textured: wp.array(dtype=vec3),
+        grad_weights: wp.array2d(dtype=real),
+    ):
+        p = first + wp.tid()
+        if grad_image:
+            grad_image[p] = signs(image[p] - target[p]) * (grad_l1[0] * scales[0])
+        change = real(0.0)
+        if grad_texture:
+            divisor = total(weights, p) + EPS
+            color = textured[p] / divisor
+            grad = signs(color - target[p]) * (grad_texture[0] * scales[1]) / divisor
+            change -= wp.dot(grad, color)
+            if grad_textured:
+                grad_textured[p] = grad
+        if grad_alpha:
+            change -= grad_alpha[0] * scales[2]
+        if grad_weights:
+            for h in range(grad_weights.shape[1]):
+                grad_weights[p, h] = change
+
+    return SimpleNamespace(forward=photometric, backward=photometric_backward)

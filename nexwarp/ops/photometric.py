@@ -1,0 +1,96 @@
+"""The losses that compare pixel by pixel, several in one go."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from nexwarp.kernels.photometric import photometric_kernels
+from nexwarp.kernels.types import types
+from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops.checks import check_tensors
+
+Factors = tuple[float, float, float]
+
+
+def photometric_terms(
+    image: torch.Tensor | None,
+    textured: torch.Tensor | None,
+    weights: torch.Tensor | None,
+    target: torch.Tensor | None,
+    *,
+    l1: float = 0.0,
+    texture: float = 0.0,
+    alpha: float = 0.0,
+) -> tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor | None]:
+    """Return the L1, texture and alpha terms of `nexwarp.losses`, each times its factor.
+
+    Differentiable once, with respect to image, textured and weights. What no wanted term reads may be None.
+
+    Args:
+        image: (H, W, 3) float32 or float64.
+        textured: (H, W, 3), sum_k W T.
+        weights: (H, W, K), W.
+        target: (H, W, 3).
+        l1: factor of the mean of |image - target|.
+        texture: factor of the mean of |textured / (sum_k W + 1e-6) - target|.
+        alpha: factor of the mean of 1 - sum_k W.
+
+    Returns:
+        Three scalars; None, at no cost, for a factor of 0.
+
+    Raises:
+        ValueError: a shape or device does not fit, or `target` requires a gradient, which it would not get.
+    """
+    wanted = {
+        "image": (image, ("H", "W", 3), l1),
+        "textured": (textured, ("H", "W", 3), texture),
+        "weights": (weights, ("H", "W", "K"), texture or alpha),
+        "target": (target, ("H", "W", 3), l1 or texture),
+    }
+    read = {name: (tensor, shape) for name, (tensor, shape, factor) in wanted.items() if factor}
+    if not read:
+        return None, None, None
+    check_tensors(read)
+    if "target" in read and target.requires_grad:
+        raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
+    tensors = [tensor.contiguous() if name in read else None for name, (tensor, _, _) in wanted.items()]
+    return _Photometric.apply((l1, texture, alpha), *tensors)
+
+
+def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Any]:
+    """View image, textured, weights and any more images, (H, W, ...) each, as arrays of pixels."""
+    flat = [None if x is None else x.view(x.shape[0] * x.shape[1], x.shape[2]) for x in tensors]
+    return [array(x, real if i == 2 else types(real).vec3) for i, x in enumerate(flat)]
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, factors: Factors, *tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        like = next(x for x in tensors if x is not None)
+        real, pixels = real_of(like), like.shape[0] * like.shape[1]
+        ctx.scales = (factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
+        maps = like.new_empty(sum(factor != 0.0 for factor in factors), pixels)
+        rows = iter(maps)
+        outputs = [array(next(rows), real) if factor else None for factor in factors]
+        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales)]
+        launch(like, photometric_kernels(real).forward, pixels, inputs, outputs)
+        ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
+        sums = iter(maps.sum(1).unbind())
+        return tuple(next(sums) if factor else None for factor in factors)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        like = next(x for x in tensors if x is not None)
+        real, pixels = real_of(like), like.shape[0] * like.shape[1]
+        l1, texture, alpha = (grad is not None for grad in grads)
+        reached = zip(tensors, ctx.needs_input_grad[1:], (l1, texture, texture or alpha, False), strict=True)
+        results = [torch.empty_like(x) if needed and term else None for x, needed, term in reached]
+        incoming = [None if grad is None else array(grad.reshape(1), real) for grad in grads]
+        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), *incoming]
+        launch(like, photometric_kernels(real).backward, pixels, inputs, _arrays(real, results[:3]))
+        return None, *results

@@ -1,0 +1,85 @@
+"""Structural dissimilarity of two images."""
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from nexwarp.kernels.ssim import LANES, PAD, rows_a_thread, ssim_kernels
+from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops.checks import check_tensors
+
+
+def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
+    """Return factor * (1 - SSIM), see `nexwarp.losses.dssim`; differentiable once, with respect to `image` only.
+
+    Args:
+        image: (H, W, 3) float32 or float64.
+        target: (H, W, 3).
+        factor: of the result and of the gradient.
+
+    Raises:
+        ValueError: `target` requires a gradient, which it would not get.
+    """
+    check_tensors({"image": (image, ("H", "W", 3)), "target": (target, ("H", "W", 3))})
+    if target.requires_grad:
+        raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
+    return _DSSIM.apply(image.contiguous(), target.contiguous(), factor)
+
+
+class _Blocks:
+    """How an image's values are shared out among threads, and its arrays of blocks."""
+
+    def __init__(self, image: torch.Tensor) -> None:
+        real = real_of(image)
+        self.height, self.width = image.shape[0], 3 * image.shape[1]
+        self.lanes = LANES if image.device.type == "cpu" and self.width >= LANES else 1
+        self.kernels = ssim_kernels(real, self.lanes)
+        self.dtype = wp.types.vector(length=self.lanes, dtype=real)
+        self.padded_size = self.height * (self.width + 2 * PAD)
+
+    def array(self, values: torch.Tensor | None) -> Any:
+        """View (n,) or (M, n) contiguous values as blocks, one at every address: (n - lanes + 1,) or (M, ...)."""
+        return None if values is None else array(values.unfold(-1, self.lanes, 1), self.dtype)
+
+    def blur_columns(self, kernel: wp.Kernel, *sources: torch.Tensor) -> torch.Tensor:
+        """Launch `moments` on two images or `blur` on three maps, (n,) each: (4 or 3, padded_size)."""
+        blurred = sources[0].new_empty(4 if len(sources) == 2 else 3, self.padded_size)
+        blocks = -(-self.width // self.lanes) + 2 * PAD // self.lanes
+        groups = -(-self.height // rows_a_thread(self.lanes))
+        inputs = [self.array(sources[i] if i < len(sources) else None) for i in range(3)]
+        inputs += [self.height, self.width]
+        launch(blurred, kernel, groups * blocks, inputs, [self.array(blurred)], align=blocks)
+        return blurred
+
+    def blur_rows(self, kernel: wp.Kernel, blurred: torch.Tensor, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch `score` or `gradient` on what `blur_columns` returned."""
+        blocks = -(-self.width // self.lanes)
+        launch(blurred, kernel, self.height * blocks, [self.array(blurred), *inputs], outputs, align=blocks)
+
+
+class _DSSIM(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
+        b = _Blocks(image)
+        moments = b.blur_columns(b.kernels.moments, image.view(-1), target.view(-1))
+        losses = image.new_empty(image.numel())
+        derivatives = image.new_empty(3, image.numel()) if ctx.needs_input_grad[0] else None
+        ctx.scale = factor / image.numel()
+        b.blur_rows(b.kernels.score, moments, [b.width, ctx.scale], [b.array(losses), b.array(derivatives)])
+        if derivatives is not None:
+            ctx.save_for_backward(image, target, derivatives)
+        return losses.sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        image, target, derivatives = ctx.saved_tensors
+        b = _Blocks(image)
+        blurred = b.blur_columns(b.kernels.blur, *derivatives)
+        gradient = torch.empty_like(image)
+        pictures = [b.array(x.view(-1)) for x in (image, target)]
+        inputs = [*pictures, b.width, ctx.scale, array(grad_loss.reshape(1), real_of(image))]
+        b.blur_rows(b.kernels.gradient, blurred, inputs, [b.array(gradient.view(-1))])
+        return gradient, None, None

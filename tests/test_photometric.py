@@ -1,0 +1,221 @@
+"""The terms that compare pixel by pixel: alone and together against the reference, kinks, what is left out."""
+
+import itertools
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from nexwarp import losses
+from nexwarp.kernels import launch
+from nexwarp.ops import photometric
+from nexwarp.ops.photometric import photometric_terms
+from tests.reference import losses as reference
+from tests.tolerances import assert_close
+
+DTYPES = [torch.float32, torch.float64]
+NAMES = ("image", "textured", "weights")
+FACTORS = {"l1": 0.8, "texture": 0.5, "alpha": 0.3}
+SUBSETS = [names for count in (1, 2, 3) for names in itertools.combinations(FACTORS, count)]
+
+
+@pytest.fixture(autouse=True)
+def restore_threads():
+    before = launch.get_num_threads()
+    yield
+    launch.set_num_threads(before)
+
+
+def inputs(height: int = 7, width: int = 9, slots: int = 2) -> dict[str, torch.Tensor]:
+    """Image, textured, weights, which want gradients, and a target further away from them than a finite difference."""
+
+    def noise(*shape: int) -> torch.Tensor:
+        return (torch.randint(2, shape) * 2 - 1) * (0.05 + 0.2 * torch.rand(shape, dtype=torch.float64))
+
+    target = torch.rand(height, width, 3, dtype=torch.float64)
+    weights = 0.1 + 0.3 * torch.rand(height, width, slots, dtype=torch.float64)
+    total = weights.sum(-1, keepdim=True)
+    given = {
+        "image": target + noise(height, width, 3),
+        "textured": (target + noise(height, width, 3)) * total,
+        "weights": weights,
+    }
+    return {name: x.requires_grad_() for name, x in given.items()} | {"target": target}
+
+
+def expected_terms(given: dict[str, torch.Tensor], factors: dict[str, float]) -> dict[str, torch.Tensor]:
+    image, textured, weights, target = given.values()
+    terms = {
+        "l1": lambda: reference.l1(image, target),
+        "texture": lambda: reference.texture(textured, weights, target),
+        "alpha": lambda: reference.alpha(weights),
+    }
+    return {name: factor * terms[name]() for name, factor in factors.items()}
+
+
+def moved(given: dict[str, torch.Tensor], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    return {name: x.detach().to(device, dtype).requires_grad_(x.requires_grad) for name, x in given.items()}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("names", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("slots", [1, 2, 5])
+def test_terms_are_the_references(device: torch.device, slots: int, names: tuple[str, ...], dtype: torch.dtype) -> None:
+    factors = {name: FACTORS[name] for name in names}
+    given = inputs(slots=slots)
+    expected = expected_terms(given, factors)
+    leaves = moved(given, device, dtype)
+    actual = dict(zip(FACTORS, photometric_terms(*leaves.values(), **factors), strict=True))
+    assert {name for name, term in actual.items() if term is not None} == set(names)
+    for name in names:
+        assert_close(actual[name], expected[name], kind="value", name=name)
+    # Each term has a cotangent of its own.
+    scales = {name: 2.0 + index for index, name in enumerate(names)}
+    totals = [sum(scales[name] * terms[name] for name in names) for terms in (actual, expected)]
+    gradients = [
+        torch.autograd.grad(total, [source[name] for name in NAMES], allow_unused=True)
+        for total, source in zip(totals, (leaves, given), strict=True)
+    ]
+    for name, gradient, wanted in zip(NAMES, *gradients, strict=True):
+        assert (gradient is None) == (wanted is None), name
+        if gradient is not None:
+            assert gradient.dtype == dtype
+            assert_close(gradient, wanted, kind="gradient", name=f"gradient to {name}")
+
+
+def test_gradients_against_finite_differences() -> None:
+    given = inputs(3, 4)
+    target = given.pop("target")
+    assert gradcheck(lambda *x: photometric_terms(*x, target, **FACTORS), tuple(given.values()))
+
+
+@pytest.mark.parametrize("wanted", SUBSETS, ids="+".join)
+def test_gradients_go_only_where_they_are_wanted(wanted: tuple[str, ...]) -> None:
+    """Whatever subset of the terms is used, and whatever subset of the inputs asks."""
+    for needed in itertools.product((False, True), repeat=3):
+        given = inputs(2, 3)
+        for name, need in zip(NAMES, needed, strict=True):
+            given[name].requires_grad_(need)
+        actual = dict(zip(FACTORS, photometric_terms(*given.values(), **FACTORS), strict=True))
+        expected = expected_terms(given, FACTORS)
+        leaves = [given[name] for name in NAMES if given[name].requires_grad]
+        totals = [sum(terms[name] for name in wanted) for terms in (actual, expected)]
+        if not totals[1].requires_grad:
+            continue
+        gradients = [torch.autograd.grad(total, leaves, allow_unused=True) for total in totals]
+        for gradient, want in zip(*gradients, strict=True):
+            assert (gradient is None) == (want is None)
+            if gradient is not None:
+                assert_close(gradient, want, kind="gradient", name="gradient")
+
+
+def test_nothing_wanted_launches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = inputs()
+    monkeypatch.setattr(photometric, "launch", None)
+    assert photometric_terms(*given.values()) == (None, None, None)
+    assert photometric_terms(None, None, None, None) == (None, None, None)
+
+
+def test_inputs_need_not_be_contiguous(device: torch.device) -> None:
+    given = moved(inputs(), device, torch.float64)
+    turned = {
+        name: x.detach().transpose(0, 1).contiguous().transpose(0, 1).requires_grad_(x.requires_grad)
+        for name, x in given.items()
+    }
+    assert not any(x.is_contiguous() for x in turned.values())
+    results = []
+    for source in (given, turned):
+        terms = photometric_terms(*source.values(), **FACTORS)
+        results.append([*terms, *torch.autograd.grad(sum(terms), [source[name] for name in NAMES])])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_inputs_may_be_expanded() -> None:
+    target = torch.rand(1, 1, 3, dtype=torch.float64).expand(4, 5, 3)
+    weights = torch.full((), 0.25, dtype=torch.float64).expand(4, 5, 2)
+    expected = reference.texture(0.4 * target, weights, target)
+    assert_close(losses.texture_loss(0.4 * target, weights, target), expected, kind="value", name="texture")
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1)])
+def test_tiny_images(device: torch.device, size: tuple[int, int]) -> None:
+    given = inputs(*size)
+    terms = photometric_terms(*moved(given, device, torch.float64).values(), **FACTORS)
+    for term, (name, expected) in zip(terms, expected_terms(given, FACTORS).items(), strict=True):
+        assert_close(term, expected, kind="value", name=name)
+
+
+def test_equal_colours_have_no_gradient(device: torch.device) -> None:
+    """The kink of |x| has the gradient 0 at 0, as in torch."""
+    target = torch.rand(4, 5, 3, device=device)
+    target[0] = 0.0
+    image = target.clone().requires_grad_()
+    textured = torch.zeros_like(target).requires_grad_()
+    weights = torch.full((4, 5, 2), 0.5, device=device).requires_grad_()
+    loss = sum(photometric_terms(image, textured, weights, target, l1=1.0, texture=1.0)[:2])
+    to_image, to_textured, to_weights = torch.autograd.grad(loss, [image, textured, weights])
+    assert not to_image.any()
+    assert not to_textured[0].any() and (to_textured[1:] < 0.0).all()
+    assert not to_weights.any()  # the texture is black: no weight changes that
+
+
+def test_a_nan_shows_in_its_terms_and_stays_in_its_pixel(device: torch.device) -> None:
+    given = moved(inputs(), device, torch.float64)
+    with torch.no_grad():
+        given["weights"][3, 4, 1] = float("nan")
+    terms = photometric_terms(*given.values(), **FACTORS)
+    assert [bool(term.isnan()) for term in terms] == [False, True, True]
+    gradients = torch.autograd.grad(sum(terms), [given[name] for name in NAMES])
+    assert [int(gradient.isnan().sum()) for gradient in gradients] == [0, 3, 2]
+
+
+def test_no_slots(device: torch.device) -> None:
+    """With K = 0 alone: nothing is textured, and the whole weight is left."""
+    weights = torch.zeros(3, 4, 0, device=device, requires_grad=True)
+    picture = torch.rand(3, 4, 3, device=device)
+    assert_close(losses.alpha_loss(weights), torch.ones(()), kind="value", name="alpha")
+    loss = losses.texture_loss(1e-6 * picture, weights, torch.zeros_like(picture))
+    assert_close(loss, picture.mean(), kind="value", name="texture")
+    assert torch.autograd.grad(loss, weights)[0].shape == (3, 4, 0)
+
+
+def test_result_does_not_depend_on_threads() -> None:
+    given = moved(inputs(60, 50), torch.device("cpu"), torch.float32)
+    results = []
+    for count in (1, 2, 3, 3):
+        launch.set_num_threads(count)
+        terms = photometric_terms(*given.values(), **FACTORS)
+        results.append([*terms, *torch.autograd.grad(sum(terms), [given[name] for name in NAMES])])
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+@pytest.mark.cuda
+def test_result_repeats_on_cuda() -> None:
+    given = moved(inputs(190, 270), torch.device("cuda"), torch.float32)
+    results = []
+    for _ in range(3):
+        terms = photometric_terms(*given.values(), **FACTORS)
+        results.append([*terms, *torch.autograd.grad(sum(terms), [given[name] for name in NAMES])])
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+def test_a_target_that_wants_a_gradient_is_refused() -> None:
+    given = inputs()
+    target = given["target"].clone().requires_grad_()
+    for term in (
+        lambda: losses.l1(given["image"], target),
+        lambda: losses.texture_loss(given["textured"], given["weights"], target),
+    ):
+        with pytest.raises(ValueError, match="target: expected a tensor that needs no gradient"):
+            term()
+
+
+def test_wrong_inputs_name_the_argument() -> None:
+    given = inputs()
+    given["weights"] = given["weights"][:-1]
+    with pytest.raises(ValueError, match=r"^weights: expected shape \(H=7, W=9, K=2\), got \(6, 9, 2\)"):
+        photometric_terms(*given.values(), **FACTORS)
+    terms = photometric_terms(*given.values(), l1=1.0)  # which does not read the weights
+    assert terms[0] is not None and terms[1:] == (None, None)

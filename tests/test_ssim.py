@@ -1,0 +1,145 @@
+"""D-SSIM by kernels against the dense reference: values, gradients, borders, both ways to share out an image."""
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from nexwarp.kernels import launch
+from nexwarp.kernels.ssim import LANES, PAD, WINDOW_SIZE
+from nexwarp.losses import LossWeights, training_losses
+from nexwarp.ops import ssim
+from nexwarp.ops.ssim import weighted_dssim
+from tests.reference import losses as reference
+from tests.tolerances import assert_close
+
+DTYPES = [torch.float32, torch.float64]
+# Smaller than the window, than a block of LANES values, and not a whole number of blocks or of 4 rows.
+SIZES = [(1, 1), (1, 40), (40, 1), (3, 5), (4, 6), (12, 16), (13, 17), (30, 43)]
+
+
+@pytest.fixture(autouse=True)
+def restore_threads():
+    before = launch.get_num_threads()
+    yield
+    launch.set_num_threads(before)
+
+
+@pytest.fixture(params=[LANES, 1], ids=["blocks", "single values"])
+def lanes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Values a thread on a CPU; with 1 the CPU runs what CUDA runs."""
+    monkeypatch.setattr(ssim, "LANES", request.param)
+    return request.param
+
+
+def images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    target = torch.rand(height, width, 3, dtype=torch.float64)
+    return (target + 0.2 * torch.randn_like(target)).requires_grad_(), target
+
+
+def with_gradient(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    leaf = image.detach().clone().requires_grad_()
+    loss = weighted_dssim(leaf, target, factor)
+    return loss.detach(), torch.autograd.grad(loss, leaf)[0]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("size", SIZES)
+def test_dssim_is_the_references(device: torch.device, lanes: int, size: tuple[int, int], dtype: torch.dtype) -> None:
+    image, target = images(*size)
+    expected = 0.3 * reference.dssim(image, target)
+    (expected_gradient,) = torch.autograd.grad(expected, image)
+    loss, gradient = with_gradient(image.to(device, dtype), target.to(device, dtype), 0.3)
+    assert loss.dtype == gradient.dtype == dtype
+    assert_close(loss, expected, kind="value", name="dssim")
+    assert_close(gradient, expected_gradient, kind="gradient", name="gradient")
+
+
+@pytest.mark.parametrize("size", [(2, 3), (5, 4), (3, 8)])
+def test_gradient_against_finite_differences(lanes: int, size: tuple[int, int]) -> None:
+    image, target = images(*size)
+    assert gradcheck(lambda x: weighted_dssim(x, target, 2.0), image)
+
+
+def test_inputs_need_not_be_contiguous(device: torch.device, lanes: int) -> None:
+    image, target = (x.to(device) for x in images(14, 9))
+    loss, gradient = with_gradient(image, target)
+    turned = image.detach().permute(2, 1, 0).contiguous().permute(2, 1, 0).requires_grad_()
+    wide = torch.stack([target, target], dim=-1)[..., 0]
+    assert not turned.is_contiguous() and not wide.is_contiguous()
+    again = weighted_dssim(turned, wide)
+    assert torch.equal(again, loss)
+    assert torch.equal(torch.autograd.grad(again, turned)[0], gradient)
+
+
+def test_pads_are_as_wide_as_the_window_reaches() -> None:
+    assert PAD % LANES == 0 and PAD >= 3 * (WINDOW_SIZE // 2)
+
+
+def test_result_does_not_depend_on_threads(lanes: int) -> None:
+    image, target = (x.float() for x in images(90, 70))
+    results = []
+    for count in (1, 2, 3, 3):
+        launch.set_num_threads(count)
+        results.append(with_gradient(image, target))
+    for loss, gradient in results[1:]:
+        assert torch.equal(loss, results[0][0])
+        assert torch.equal(gradient, results[0][1])
+
+
+@pytest.mark.cuda
+def test_result_repeats_on_cuda() -> None:
+    image, target = (x.float().cuda() for x in images(190, 270))
+    results = [with_gradient(image, target) for _ in range(3)]
+    for loss, gradient in results[1:]:
+        assert torch.equal(loss, results[0][0])
+        assert torch.equal(gradient, results[0][1])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_what_is_not_finite_shows_and_stays_near(device: torch.device, lanes: int, bad: float) -> None:
+    """A pixel is in the windows of its 11 x 11 neighbours, and these are in those of 21 x 21."""
+    image, target = (x.to(device) for x in images(50, 40))
+    with torch.no_grad():
+        image[22, 15, 1] = bad
+    loss, gradient = with_gradient(image, target)
+    assert loss.isnan()
+    wrong = ~gradient.isfinite()
+    assert wrong[12:33, 5:26, 1].all()
+    assert int(wrong.sum()) == 21 * 21
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
+def test_nan_in_a_corner_does_not_wrap_around(device: torch.device, lanes: int, corner: tuple[int, int]) -> None:
+    image, target = (x.to(device) for x in images(50, 40))
+    with torch.no_grad():
+        image[corner] = float("nan")
+    _, gradient = with_gradient(image, target)
+    wrong = gradient.isnan()
+    rows = slice(0, 11) if corner[0] == 0 else slice(-11, None)
+    columns = slice(0, 11) if corner[1] == 0 else slice(-11, None)
+    assert wrong[rows, columns].all()
+    assert int(wrong.sum()) == 11 * 11 * 3
+
+
+def test_training_losses_fold_the_factor_in() -> None:
+    image, target = images(9, 9)
+    terms = training_losses(
+        image=image,
+        textured=torch.zeros_like(target),
+        weights=target.new_zeros(9, 9, 0),
+        target=target,
+        opacities=target.new_zeros(2),
+        grid=None,
+        resolutions=None,
+        loss_weights=LossWeights(dssim=0.3),
+    )
+    expected = 0.3 * reference.dssim(image, target)
+    assert_close(terms["dssim"], expected, kind="value", name="dssim")
+    actual, wanted = (torch.autograd.grad(x, image)[0] for x in (terms["dssim"], expected))
+    assert_close(actual, wanted, kind="gradient", name="gradient")
+
+
+def test_half_precision_is_refused() -> None:
+    image = torch.zeros(4, 5, 3, dtype=torch.float16)
+    with pytest.raises(TypeError, match=r"expected float32 or float64 tensors, got torch\.float16"):
+        weighted_dssim(image, image)
