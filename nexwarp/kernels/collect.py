@@ -18,15 +18,20 @@ and the sum over all i, which the walk then uses up hit by hit, is known from th
     rest = gN . N + sum_k gW_k W_k + gA A.
 
 Each hit is differentiated by `wp.grad` of the one function that the forward pass calls.
-Gradients of entry k go to row rows[k]: the surfel (CUDA: atomics after a sum over the warp) or the entry's own slot
-(CPU: owned by one thread, then added up in a fixed order by `reduce_rows_kernel`).
+
+A warp first culls the list for its 8 x 4 pixels, one entry a lane, then walks along what is left: of the entries of a
+tile about half. On a CPU a warp is one thread and one pixel, and there is nothing to share.
+Gradients of entry k go to the surfel (CUDA: atomics after a sum over the warp) or, where `rows` is given, to the slot
+rows[k] of its own (CPU: owned by one thread, then added up in a fixed order by `reduce_rows_kernel`).
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.lanes import any_lane, lane, lane_sum
+from nexwarp.kernels.lanes import any_lane, ballot, first_lane, from_lane, lane, lane_max, lane_sum, lanes, record_sum
+from nexwarp.kernels.loads import load_function
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 
@@ -52,20 +57,26 @@ def walk(tile: wp.int32, tile_offsets: wp.array(dtype=wp.int32), ends: wp.array(
 
 @wp.func
 def surfel_at(k: wp.int32, listed: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), overflow: wp.bool):
-    """Surfel (or row) at place k of the walk."""
+    """Surfel at place k of the walk."""
     if overflow:
         return order[k]
     return listed[k]
 
 
 @functools.cache
-def pixel_function(tile_size: int) -> wp.Function:
-    """(column, row) of a thread: the 32 lanes of a warp cover 8 x 4 pixels, warps cover a tile, tiles the image."""
+def view_functions(real: type, tile_size: int) -> SimpleNamespace:
+    """Which pixel a thread has, its ray, and the block of pixels that its warp has."""
+    t = types(real)
+    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    HALF, ONE = t.HALF, t.ONE
+    # Half of the distances between the outer pixel centres of a block, and a little.
+    HALF_WIDTH, HALF_HEIGHT = wp.constant(real(3.51)), wp.constant(real(1.51))
     pixels = tile_size * tile_size
     across = tile_size // 8
 
     @wp.func
     def pixel_of(thread: int, tile_columns: int):
+        """(column, row): the 32 lanes of a warp cover 8 x 4 pixels, warps cover a tile, tiles the image."""
         tile = thread // pixels
         local = thread % pixels
         warp = local // 32
@@ -75,14 +86,38 @@ def pixel_function(tile_size: int) -> wp.Function:
             (tile // tile_columns) * tile_size + (warp // across) * 4 + lane_ // 8,
         )
 
-    return pixel_of
+    @wp.func
+    def ray(x: real, y: real, intrinsics: vec4):
+        """Direction, of z 1, through pixel coordinates."""
+        return vec3((x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], ONE)
+
+    @wp.func
+    def ray_of(xy: wp.vec2i, intrinsics: vec4):
+        return ray(real(float(xy[0])) + HALF, real(float(xy[1])) + HALF, intrinsics)
+
+    @wp.func
+    def block_of(xy: wp.vec2i, intrinsics: vec4):
+        """Ray through the middle of the 8 x 4 pixels that have pixel xy among them."""
+        x = xy[0] - xy[0] % 8 + 4
+        y = xy[1] - xy[1] % 4 + 2
+        return ray(real(float(x)), real(float(y)), intrinsics)
+
+    @wp.func
+    def half_block(intrinsics: vec4):
+        return vec2(HALF_WIDTH / intrinsics[0], HALF_HEIGHT / intrinsics[1])
+
+    return SimpleNamespace(pixel_of=pixel_of, ray_of=ray_of, block_of=block_of, half_block=half_block, pixels=pixels)
 
 
 @functools.cache
-def buffer_types(real: type, max_hits: int) -> tuple[type, type]:
-    """Vector types of the K-buffer: registers, of static length (one unused slot for K = 0)."""
+def buffer_types(real: type, max_hits: int) -> tuple[type, type, type]:
+    """Types of the K-buffer's values, ids and colours: registers, of static length (one unused slot for K = 0)."""
     slots = max(max_hits, 1)
-    return wp.types.vector(length=slots, dtype=real), wp.types.vector(length=slots, dtype=wp.int32)
+    return (
+        wp.types.vector(length=slots, dtype=real),
+        wp.types.vector(length=slots, dtype=wp.int32),
+        wp.types.matrix(shape=(slots, 3), dtype=real),
+    )
 
 
 @functools.cache
@@ -91,9 +126,10 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
-    vec, ivec = buffer_types(real, max_hits)
-    pixel_of = pixel_function(tile_size)
-    pixels = tile_size * tile_size
+    load = load_function(4, real)
+    vec, ivec, colors = buffer_types(real, max_hits)
+    v = view_functions(real, tile_size)
+    pixels = v.pixels
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     @wp.kernel(
@@ -115,6 +151,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         tile_columns: wp.int32,
         intrinsics: vec4,
         near: real,
+        reaches: wp.array(dtype=vec2),
         # outputs
         plain: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
@@ -125,66 +162,104 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = pixel_of(thread, tile_columns)
+        xy = v.pixel_of(thread, tile_columns)
+        # Lanes outside the image cull along: all lanes of a warp must reach the votes together.
+        done = int(0)
         if xy[0] >= size[0] or xy[1] >= size[1]:
-            return
+            done = 1
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = vec3(
-            (real(float(xy[0])) + real(0.5) - intrinsics[2]) / focal[0],
-            (real(float(xy[1])) + real(0.5) - intrinsics[3]) / focal[1],
-            ONE,
-        )
+        d = v.ray_of(xy, intrinsics)
+        middle = v.block_of(xy, intrinsics)
+        half = v.half_block(intrinsics)
         transmittance = real(1.0)
         color = vec3()
         buffer_ids = ivec()
         buffer_weights = vec()
         buffer_depths = vec()
+        buffer_colors = colors()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
         overflow = overflowed(ends, surfel_ids)
         bounds = walk(tile, tile_offsets, ends, overflow)
         stop = int(bounds[0])
-        for k in range(bounds[0], bounds[1]):
-            i = surfel_at(k, surfel_ids, order, overflow)
-            ra = records[i, 0]
-            rb = records[i, 1]
-            rn = records[i, 2]
-            rc = records[i, 3]
-            uvt = h.plane(ra, rb, rn, rc[3], d)
-            if h.far_outside(uvt, limits[i]):
-                continue
-            center = vec3()
-            if wp.static(low_pass):
-                center = centers[i]
-            hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
-            if hit[0] >= ALPHA_MIN and hit[1] > near:
-                weight = hit[0] * transmittance
-                transmittance = transmittance * (ONE - hit[0])
-                stop = k + 1
-                # Insert into the buffer before the first lighter hit, and move that and all behind it down by one, so
-                # that of equal ones the nearer stays; what falls out is blended as plain.
-                displaced = int(0)
-                out_id = int(i)
-                out_weight = real(weight)
-                out_depth = real(hit[1])
-                for j in range(wp.static(max_hits)):
-                    if displaced == 1 or out_weight > buffer_weights[j]:
-                        displaced = 1
-                        w_ = buffer_weights[j]
-                        i_ = buffer_ids[j]
-                        d_ = buffer_depths[j]
-                        buffer_weights[j] = out_weight
-                        buffer_ids[j] = out_id
-                        buffer_depths[j] = out_depth
-                        out_weight = w_
-                        out_id = i_
-                        out_depth = d_
-                if out_id >= 0:
-                    if out_id != i:
-                        rc = records[out_id, 3]
-                    color += vec3(rc[0], rc[1], rc[2]) * out_weight
-                if transmittance < TRANSMITTANCE_MIN:
-                    break
+        width = lanes()
+        me = lane()
+        for base in range(bounds[0], bounds[1], width):
+            if any_lane(1 - done) == 0:
+                break
+            mine = int(-1)
+            if base + me < bounds[1]:
+                mine = surfel_at(base + me, surfel_ids, order, overflow)
+                if width > 1:
+                    center = vec3()
+                    if wp.static(low_pass):
+                        center = centers[mine]
+                    m = load(records, mine, 3)[3]
+                    if h.misses_block(
+                        load(records, mine, 0),
+                        load(records, mine, 1),
+                        load(records, mine, 2),
+                        m,
+                        reaches[mine],
+                        limits[mine],
+                        center,
+                        middle,
+                        half,
+                        focal,
+                    ):
+                        mine = int(-1)
+            left = ballot(wp.where(mine >= 0, 1, 0))
+            while left != 0:
+                next_lane = first_lane(left)
+                left = left & (left - 1)
+                i = from_lane(mine, next_lane)
+                if done == 0:
+                    ra = load(records, i, 0)
+                    rb = load(records, i, 1)
+                    rn = load(records, i, 2)
+                    rc = load(records, i, 3)
+                    uvt = h.plane(ra, rb, rn, rc[3], d)
+                    hit = vec2()
+                    # On a GPU some lane nearly always needs the exponentials.
+                    if width > 1 or not h.far_outside(uvt, limits[i]):
+                        center = vec3()
+                        if wp.static(low_pass):
+                            center = centers[i]
+                        hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
+                    if hit[0] >= ALPHA_MIN and hit[1] > near:
+                        weight = hit[0] * transmittance
+                        transmittance = transmittance * (ONE - hit[0])
+                        stop = base + next_lane + 1
+                        # Insert into the buffer before the first lighter hit, and move that and all behind it down by
+                        # one, so that of equal ones the nearer stays; what falls out is blended as plain.
+                        displaced = int(0)
+                        out_id = int(i)
+                        out_weight = real(weight)
+                        out_depth = real(hit[1])
+                        out_color = vec3(rc[0], rc[1], rc[2])
+                        for j in range(wp.static(max_hits)):
+                            if displaced == 1 or out_weight > buffer_weights[j]:
+                                displaced = 1
+                                w_ = buffer_weights[j]
+                                i_ = buffer_ids[j]
+                                d_ = buffer_depths[j]
+                                c_ = vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2])
+                                buffer_weights[j] = out_weight
+                                buffer_ids[j] = out_id
+                                buffer_depths[j] = out_depth
+                                buffer_colors[j, 0] = out_color[0]
+                                buffer_colors[j, 1] = out_color[1]
+                                buffer_colors[j, 2] = out_color[2]
+                                out_weight = w_
+                                out_id = i_
+                                out_depth = d_
+                                out_color = c_
+                        # Out of an empty slot comes the weight 0.
+                        color += out_color * out_weight
+                        if transmittance < TRANSMITTANCE_MIN:
+                            done = 1
+        if xy[0] >= size[0] or xy[1] >= size[1]:
+            return
         p = xy[1] * size[0] + xy[0]
         plain[p] = color
         for j in range(wp.static(max_hits)):
@@ -205,11 +280,12 @@ def collect_backward_kernel(
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
+    load = load_function(4, real)
     hit_dot = h.hit_dot
-    vec, ivec = buffer_types(real, max_hits)
-    pixel_of = pixel_function(tile_size)
-    pixels = tile_size * tile_size
-    sum1, sum3, sum4 = lane_sum(real), lane_sum(vec3), lane_sum(vec4)
+    vec, ivec, _ = buffer_types(real, max_hits)
+    v = view_functions(real, tile_size)
+    pixels = v.pixels
+    sum1, sum3, add_record = lane_sum(real), lane_sum(vec3), record_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -224,7 +300,6 @@ def collect_backward_kernel(
         centers: wp.array(dtype=vec3),
         limits: wp.array(dtype=real),
         surfel_ids: wp.array(dtype=wp.int32),
-        rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
         order: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
@@ -232,6 +307,8 @@ def collect_backward_kernel(
         tile_columns: wp.int32,
         intrinsics: vec4,
         near: real,
+        reaches: wp.array(dtype=vec2),
+        rows: wp.array(dtype=wp.int32),
         plain: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
         weights: wp.array2d(dtype=real),
@@ -249,18 +326,16 @@ def collect_backward_kernel(
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = pixel_of(thread, tile_columns)
+        xy = v.pixel_of(thread, tile_columns)
         # Lanes outside the image walk along with nothing to give: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = vec3(
-            (real(float(xy[0])) + real(0.5) - intrinsics[2]) / focal[0],
-            (real(float(xy[1])) + real(0.5) - intrinsics[3]) / focal[1],
-            ONE,
-        )
+        d = v.ray_of(xy, intrinsics)
+        middle = v.block_of(xy, intrinsics)
+        half = v.half_block(intrinsics)
         gn = grad_plain[p]
         ga = grad_alphas[p]
         rest = wp.dot(gn, plain[p]) + ga * alphas[p]
@@ -279,76 +354,92 @@ def collect_backward_kernel(
         me = lane()
         overflow = overflowed(ends, surfel_ids)
         bounds = walk(tile, tile_offsets, ends, overflow)
-        for k in range(bounds[0], bounds[1]):
-            live = int(0)
-            if k < stop:
-                live = 1
-            if any_lane(live) == 0:
-                break
-            i = surfel_at(k, surfel_ids, order, overflow)
-            ra = records[i, 0]
-            rb = records[i, 1]
-            rn = records[i, 2]
-            rc = records[i, 3]
-            center = vec3()
-            if wp.static(low_pass):
-                center = centers[i]
-            uvt = h.plane(ra, rb, rn, rc[3], d)
-            alpha = ZERO
-            if live == 1 and not h.far_outside(uvt, limits[i]):
-                hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
-                if hit[0] >= ALPHA_MIN and hit[1] > near:
-                    alpha = hit[0]
-            counts = int(0)
-            if alpha > ZERO:
-                counts = 1
-            if any_lane(counts) == 0:
-                continue
-            g0 = vec4()
-            g1 = vec4()
-            g2 = vec4()
-            g3 = vec4()
-            gc = vec3()
-            share = real(0.0)
-            if counts == 1:
-                weight = alpha * transmittance
-                share = weight * error
-                q = ga
-                gt = real(0.0)
-                buffered = int(0)
-                for j in range(wp.static(max_hits)):
-                    if i == slots[j]:
-                        q += gw[j]
-                        gt = gd[j]
-                        buffered = 1
-                if buffered == 0:
-                    q += gn[0] * rc[0] + gn[1] * rc[1] + gn[2] * rc[2]
-                    g3 = vec4(gn[0] * weight, gn[1] * weight, gn[2] * weight, ZERO)
-                rest -= q * weight
-                grad_alpha = transmittance * q - rest / (ONE - alpha)
-                transmittance = transmittance * (ONE - alpha)
-                g0, g1, g2, gm, gc, _d, _f, _n, _a, _t = wp.grad(hit_dot)(
-                    ra, rb, rn, rc[3], center, d, focal, near, grad_alpha, gt
-                )
-                g3[3] = gm
-            row = surfel_at(k, rows, order, overflow)
-            g0 = sum4(g0)
-            g1 = sum4(g1)
-            g2 = sum4(g2)
-            g3 = sum4(g3)
-            if wp.static(low_pass):
-                gc = sum3(gc)
-            if wp.static(watch):
-                share = sum1(share)
-            if me == 0:
-                if wp.static(watch):
-                    wp.atomic_add(error_sums, row, share)
-                wp.atomic_add(grad_records, row, 0, g0)
-                wp.atomic_add(grad_records, row, 1, g1)
-                wp.atomic_add(grad_records, row, 2, g2)
-                wp.atomic_add(grad_records, row, 3, g3)
+        width = lanes()
+        last = wp.min(lane_max(stop), bounds[1])
+        for base in range(bounds[0], last, width):
+            mine = int(-1)
+            if base + me < last:
+                mine = surfel_at(base + me, surfel_ids, order, overflow)
+                if width > 1:
+                    center = vec3()
+                    if wp.static(low_pass):
+                        center = centers[mine]
+                    m = load(records, mine, 3)[3]
+                    if h.misses_block(
+                        load(records, mine, 0),
+                        load(records, mine, 1),
+                        load(records, mine, 2),
+                        m,
+                        reaches[mine],
+                        limits[mine],
+                        center,
+                        middle,
+                        half,
+                        focal,
+                    ):
+                        mine = int(-1)
+            left = ballot(wp.where(mine >= 0, 1, 0))
+            while left != 0:
+                next_lane = first_lane(left)
+                left = left & (left - 1)
+                i = from_lane(mine, next_lane)
+                k = base + next_lane
+                ra = load(records, i, 0)
+                rb = load(records, i, 1)
+                rn = load(records, i, 2)
+                rc = load(records, i, 3)
+                center = vec3()
                 if wp.static(low_pass):
-                    wp.atomic_add(grad_centers, row, gc)
+                    center = centers[i]
+                uvt = h.plane(ra, rb, rn, rc[3], d)
+                hit = vec2()
+                # Straight on, so that the compiler can use the exponentials again for the derivative.
+                if width > 1 or not h.far_outside(uvt, limits[i]):
+                    hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
+                alpha = ZERO
+                if k < stop and hit[0] >= ALPHA_MIN and hit[1] > near:
+                    alpha = hit[0]
+                if any_lane(wp.where(alpha > ZERO, 1, 0)) != 0:
+                    g0 = vec4()
+                    g1 = vec4()
+                    g2 = vec4()
+                    g3 = vec4()
+                    gc = vec3()
+                    share = real(0.0)
+                    if alpha > ZERO:
+                        weight = alpha * transmittance
+                        share = weight * error
+                        q = ga
+                        gt = real(0.0)
+                        buffered = int(0)
+                        for j in range(wp.static(max_hits)):
+                            if i == slots[j]:
+                                q += gw[j]
+                                gt = gd[j]
+                                buffered = 1
+                        if buffered == 0:
+                            q += gn[0] * rc[0] + gn[1] * rc[1] + gn[2] * rc[2]
+                            g3 = vec4(gn[0] * weight, gn[1] * weight, gn[2] * weight, ZERO)
+                        rest -= q * weight
+                        grad_alpha = transmittance * q - rest / (ONE - alpha)
+                        transmittance = transmittance * (ONE - alpha)
+                        g0, g1, g2, gm, gc, _d, _f, _n, _a, _t = wp.grad(hit_dot)(
+                            ra, rb, rn, rc[3], center, d, focal, near, grad_alpha, gt
+                        )
+                        g3[3] = gm
+                    row = int(i)
+                    if k < rows.shape[0]:
+                        row = rows[k]
+                    add_record(grad_records, row, g0, g1, g2, g3)
+                    if wp.static(low_pass):
+                        gc = sum3(gc)
+                    if wp.static(watch):
+                        share = sum1(share)
+                    if me == 0:
+                        if wp.static(watch):
+                            wp.atomic_add(error_sums, row, share)
+                        if wp.static(low_pass):
+                            wp.atomic_add(grad_centers, row, gc)
 
     return collect_backward
 
@@ -359,8 +450,9 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
-    pixel_of = pixel_function(tile_size)
-    pixels = tile_size * tile_size
+    load = load_function(4, real)
+    v = view_functions(real, tile_size)
+    pixels = v.pixels
     sum1 = lane_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
@@ -376,7 +468,6 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         centers: wp.array(dtype=vec3),
         limits: wp.array(dtype=real),
         surfel_ids: wp.array(dtype=wp.int32),
-        rows: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int32),
         order: wp.array(dtype=wp.int32),
         ends: wp.array(dtype=wp.int32),
@@ -384,6 +475,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         tile_columns: wp.int32,
         intrinsics: vec4,
         near: real,
+        rows: wp.array(dtype=wp.int32),
         stops: wp.array(dtype=wp.int32),
         errors: wp.array(dtype=real),
         # outputs
@@ -391,17 +483,13 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = pixel_of(thread, tile_columns)
+        xy = v.pixel_of(thread, tile_columns)
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = vec3(
-            (real(float(xy[0])) + real(0.5) - intrinsics[2]) / focal[0],
-            (real(float(xy[1])) + real(0.5) - intrinsics[3]) / focal[1],
-            ONE,
-        )
+        d = v.ray_of(xy, intrinsics)
         error = errors[p]
         transmittance = real(1.0)
         me = lane()
@@ -414,10 +502,10 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
             if any_lane(live) == 0:
                 break
             i = surfel_at(k, surfel_ids, order, overflow)
-            ra = records[i, 0]
-            rb = records[i, 1]
-            rn = records[i, 2]
-            rc = records[i, 3]
+            ra = load(records, i, 0)
+            rb = load(records, i, 1)
+            rn = load(records, i, 2)
+            rc = load(records, i, 3)
             center = vec3()
             if wp.static(low_pass):
                 center = centers[i]
@@ -436,7 +524,10 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
                 continue
             share = sum1(share)
             if me == 0:
-                wp.atomic_add(sums, surfel_at(k, rows, order, overflow), share)
+                row = int(i)
+                if k < rows.shape[0]:
+                    row = rows[k]
+                wp.atomic_add(sums, row, share)
 
     return splat_error
 

@@ -1,12 +1,12 @@
 """Hash-grid lookup (paper Eq. 1 and 2): unbounded, every level hashed, features down-weighted by a pixel's footprint.
 
-One thread a (level, point). Features are stored level-major, (levels * features, n): neighbouring threads write
-neighbouring values, and the MLP's matrix product takes the array as it is. A point with depth 0 (an empty hit slot)
-gets zeros and gives no gradient.
+Forward one thread a (level, point), backward one thread a point and a run of levels. Features are stored level-major,
+(levels * features, n): neighbouring threads write neighbouring values, and the MLP's matrix product takes the array as
+it is. A point with depth 0 (an empty hit slot) gets zeros and gives no gradient.
 
 The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may
 be half precision while their gradients are summed in float32. On a CPU a launch is split by level: a level's table
-belongs to one thread, and position gradients go to a slot a level (on CUDA all levels share one, by a stride of 0).
+belongs to one thread, and gradients of points go to a slot a level; on CUDA a thread takes all levels of its point.
 """
 
 import functools
@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.loads import load_function
 from nexwarp.kernels.types import types
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
@@ -98,13 +99,14 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         features: features a level, 1, 2, 4 or 8.
     """
     t = types(real)
-    vec3 = t.vec3
+    vec3, vec4 = t.vec3, t.vec4
     row = wp.types.vector(length=features, dtype=storage)
     vec = wp.types.vector(length=features, dtype=real)
     mat = wp.types.matrix(shape=(8, features), dtype=real)
     vec8 = wp.types.vector(length=8, dtype=real)
     ONE, ZERO = t.ONE, t.ZERO
     INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
+    load = load_function(features, storage)
     pairs = features == 2 and real is wp.float32
 
     @wp.func
@@ -138,7 +140,7 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
     def gather(table: wp.array2d(dtype=row), level: int, corner: wp.vec3i, mask: wp.uint32):
         corners = mat()
         for j in range(8):
-            value = table[level, hash_slot(corner, j, mask)]
+            value = load(table, level, hash_slot(corner, j, mask))
             for k in range(wp.static(features)):
                 corners[j, k] = real(value[k])
         return corners
@@ -179,39 +181,43 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         mask: wp.uint32,
         grad_encoded: wp.array2d(dtype=storage),
         unscale: wp.array(dtype=real),
+        run: wp.int32,
         # outputs
         grad_table: wp.array2d(dtype=vec),
-        grad_positions: wp.array2d(dtype=vec3),
-        grad_depths: wp.array2d(dtype=real),
+        grad_points: wp.array2d(dtype=vec4),
     ):
-        l_, p = wp.tid()
-        level = first + l_
+        r_, p = wp.tid()
+        start = (first + r_) * run
         depth = depths[p]
         if not (depth > ZERO):
+            if grad_points.shape[0] > 0:
+                grad_points[first + r_, p] = vec4()
             return
-        grad = vec()
-        for k in range(wp.static(features)):
-            grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
-        scale = resolutions[level]
-        x = positions[p] * scale
-        base = cell(x)
-        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-        gf, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-            x - base, gather(table, level, corner, mask), scale, depth, focal[0], grad
-        )
-        if wp.static(pairs):
-            gc = merge_cells(corner[0], corner[1], corner[2], gc)
-        for j in range(8):
-            part = vec()
+        total = vec4()
+        for level in range(start, wp.min(start + run, resolutions.shape[0])):
+            grad = vec()
             for k in range(wp.static(features)):
-                part[k] = gc[j, k]
+                grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
+            scale = resolutions[level]
+            x = positions[p] * scale
+            base = cell(x)
+            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+            gf, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+                x - base, gather(table, level, corner, mask), scale, depth, focal[0], grad
+            )
             if wp.static(pairs):
-                if part[0] != real(0.0) or part[1] != real(0.0):
-                    add_pair(grad_table, level, hash_slot(corner, j, mask), part)
-            else:
-                wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
-        if grad_positions.shape[0] > 0:
-            wp.atomic_add(grad_positions, level, p, gf * scale)
-            wp.atomic_add(grad_depths, level, p, gd)
+                gc = merge_cells(corner[0], corner[1], corner[2], gc)
+            for j in range(8):
+                part = vec()
+                for k in range(wp.static(features)):
+                    part[k] = gc[j, k]
+                if wp.static(pairs):
+                    if part[0] != real(0.0) or part[1] != real(0.0):
+                        add_pair(grad_table, level, hash_slot(corner, j, mask), part)
+                else:
+                    wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
+            total += vec4(gf[0] * scale, gf[1] * scale, gf[2] * scale, gd)
+        if grad_points.shape[0] > 0:
+            grad_points[first + r_, p] = total
 
     return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)

@@ -18,6 +18,9 @@ import warp as wp
 
 from nexwarp.kernels.types import types
 
+# Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
+BLOCK_SLACK = 1e-6
+
 
 @functools.cache
 def frame_functions(real: type) -> SimpleNamespace:
@@ -76,6 +79,7 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     ALPHA_MAX, TINY, ZERO, HALF, ONE, TWO = t.ALPHA_MAX, t.TINY, t.ZERO, t.HALF, t.ONE, t.TWO
+    SLACK = wp.constant(real(BLOCK_SLACK))
 
     @wp.func
     def plane(a: vec4, b: vec4, n: vec4, m: real, d: vec3):
@@ -97,6 +101,42 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
         v2 = uvt[1] * uvt[1]
         low = wp.where(u2 > ONE, u2, ZERO) + wp.where(v2 > ONE, v2, ZERO)
         return low > limit
+
+    @wp.func
+    def beside(side: vec4, n: vec4, facing: real, reach: real, d: vec3, half: vec2):
+        """Whether all rays of a block, d +- half, meet the plane where |coordinate| > reach, `side` being a or b.
+
+        Where the hit lies before the camera, facing * n . d > 0, so that side . d <= reach * facing * n . d is linear
+        in d: the block's corners bound it. The slack is for rounding.
+        """
+        x = side[0] * d[0]
+        y = side[1] * d[1]
+        nx = facing * reach * n[0]
+        ny = facing * reach * n[1]
+        across = facing * reach * n[2] + nx * d[0] + ny * d[1]
+        along = x + y + side[2]
+        slack = SLACK * (
+            wp.abs(x) + wp.abs(y) + wp.abs(side[2]) + reach * (wp.abs(n[0] * d[0]) + wp.abs(n[1] * d[1]) + wp.abs(n[2]))
+        )
+        above = along - across - wp.abs(side[0] - nx) * half[0] - wp.abs(side[1] - ny) * half[1]
+        below = -along - across - wp.abs(side[0] + nx) * half[0] - wp.abs(side[1] + ny) * half[1]
+        return above > slack or below > slack
+
+    @wp.func
+    def misses_block(
+        a: vec4, b: vec4, n: vec4, m: real, reach: vec2, limit: real, center: vec3, d: vec3, half: vec2, focal: vec2
+    ):
+        """Whether no ray of a block of pixels, d +- half, can hit; d[2] = 1. Only culls: conservative."""
+        facing = wp.where(m < ZERO, -ONE, ONE)
+        out = beside(a, n, facing, reach[0], d, half) or beside(b, n, facing, reach[1], d, half)
+        if wp.static(low_pass):
+            if center[2] > ZERO:
+                # The disc's radius is sqrt(limit / 2) pixels, `limit` having a margin already.
+                radius = wp.sqrt(HALF * wp.max(limit, ZERO))
+                x = wp.abs(d[0] - center[0] / center[2]) - half[0]
+                y = wp.abs(d[1] - center[1] / center[2]) - half[1]
+                out = out and (x * focal[0] > radius or y * focal[1] > radius)
+        return out
 
     @wp.func
     def kernel(uvt: vec3, a: vec4, b: vec4, n: vec4, center: vec3, d: vec3, focal: vec2, near: real):
@@ -133,4 +173,6 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
         hit = kernel(plane(a, b, n, m, d), a, b, n, center, d, focal, near)
         return grad_alpha * hit[0] + grad_depth * hit[1]
 
-    return SimpleNamespace(plane=plane, far_outside=far_outside, kernel=kernel, hit_dot=hit_dot)
+    return SimpleNamespace(
+        plane=plane, far_outside=far_outside, misses_block=misses_block, kernel=kernel, hit_dot=hit_dot
+    )

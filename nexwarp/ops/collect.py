@@ -106,9 +106,9 @@ def splat_error(
     real = real_of(records)
     rows, slots = _rows(tiles, records)
     sums = records.new_zeros(slots)
-    inputs = _inputs(records, projection.centers.detach(), projection.limits, tiles, camera, rows)
+    inputs = _inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
     errors = errors.detach().to(records.dtype).contiguous()
-    inputs += [array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
+    inputs += [array(rows, wp.int32), array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
     launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], **_options(tiles))
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
@@ -129,15 +129,14 @@ def _inputs(
     limits: torch.Tensor,
     tiles: Tiles,
     camera: Pinhole,
-    rows: torch.Tensor | None = None,
 ) -> list[Any]:
+    """Arguments that the kernels share, from `records` to `near`."""
     t = types(real_of(records))
-    lists = [tiles.surfel_ids, *([] if rows is None else [rows]), tiles.tile_offsets, tiles.order, tiles.ends]
     return [
         array(records, t.vec4),
         array(centers, t.vec3),
         array(limits, t.real),
-        *(array(x, wp.int32) for x in lists),
+        *(array(x, wp.int32) for x in (tiles.surfel_ids, tiles.tile_offsets, tiles.order, tiles.ends)),
         wp.vec2i(camera.width, camera.height),
         tiles.columns,
         t.vec4(*camera.intrinsics),
@@ -145,11 +144,11 @@ def _inputs(
     ]
 
 
-def _rows(tiles: Tiles, records: torch.Tensor) -> tuple[torch.Tensor, int]:
-    """Row that each entry's gradient goes to, and how many rows: by entry on a CPU, by surfel on CUDA."""
+def _rows(tiles: Tiles, records: torch.Tensor) -> tuple[torch.Tensor | None, int]:
+    """Row that each entry's gradient goes to, and how many rows: by entry on a CPU; None is by surfel, on CUDA."""
     if tiles.exact:
         return tiles.entries, len(tiles.entries)
-    return tiles.surfel_ids, len(records)
+    return None, len(records)
 
 
 def _reduce(slots: torch.Tensor, tiles: Tiles, count: int, dtype: type) -> torch.Tensor:
@@ -191,7 +190,7 @@ class _Collect(torch.autograd.Function):
             array(stops.view(-1), wp.int32),
         ]
         kernel = collect_kernel(real, max_hits, low_pass, tiles.tile_size)
-        inputs = _inputs(records, centers, limits, tiles, camera)
+        inputs = [*_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
         launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
         ctx.save_for_backward(records, centers, limits, plain, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
@@ -223,7 +222,9 @@ class _Collect(torch.autograd.Function):
         # Centres carry a gradient only through the low-pass.
         grad_center_rows = centers.new_zeros(count if low_pass else 1, 3)
         inputs = [
-            *_inputs(records, centers, limits, tiles, camera, rows),
+            *_inputs(records, centers, limits, tiles, camera),
+            array(tiles.reaches, t.vec2),
+            array(rows, wp.int32),
             array(plain.view(-1, 3), t.vec3),
             buffer(ids, wp.int32),
             buffer(weights, real),

@@ -14,6 +14,8 @@ from nexwarp.ops._interop import STORAGES, array, launch, real_of
 
 # Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
 HALF_GRADIENT = 64.0
+# Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
+POINT_MULTIPLE = 64
 
 
 def texture(
@@ -70,7 +72,10 @@ class _Texture(torch.autograd.Function):
         dtype = torch.float16 if half else grid.dtype
         table = grid.contiguous().to(dtype)
         matrices = [w.to(dtype) for w in weights]
-        encoded = torch.empty(grid.shape[0] * grid.shape[2], len(positions), dtype=dtype, device=grid.device)
+        count = len(positions)
+        encoded = torch.empty(grid.shape[0] * grid.shape[2], _padded(count, dtype), dtype=dtype, device=grid.device)
+        # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
+        encoded[:, count:] = 0
         kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
         launch(
             positions,
@@ -89,7 +94,7 @@ class _Texture(torch.autograd.Function):
             positions, depths, directions, resolutions, focal, table, coefficients, *layers, *matrices
         )
         if directions is None:
-            return coefficients.to(grid.dtype)
+            return coefficients[:, :count].to(grid.dtype)
         colors = torch.empty_like(positions)
         kernels, arguments = _colors(coefficients, directions, len(positions), clamp)
         launch(
@@ -110,7 +115,8 @@ class _Texture(torch.autograd.Function):
         scale = _gradient_scale(grad, table.dtype)
         grad_directions = None
         if directions is None:
-            signal = (grad * scale).to(table.dtype)
+            signal = torch.zeros_like(coefficients)
+            signal[:, : grad.shape[1]] = grad * scale
         else:
             signal, grad_directions = _colors_backward(
                 coefficients, directions, grad.contiguous(), scale, ctx.clamp, need_directions
@@ -133,6 +139,11 @@ class _Texture(torch.autograd.Function):
             *(None,) * 4,
             *grad_matrices,
         )
+
+
+def _padded(count: int, dtype: torch.dtype) -> int:
+    """Columns that the MLP works on for `count` points."""
+    return -(-count // POINT_MULTIPLE) * POINT_MULTIPLE if dtype == torch.float16 else count
 
 
 def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
@@ -184,24 +195,20 @@ def _lookup_backward(
     levels, _, features = table.shape
     count = len(positions)
     grad_grid = torch.zeros_like(table, dtype=positions.dtype)
-    # On a CPU a slot a level, owned by one thread; on CUDA all levels add to one.
-    slots = (levels if positions.device.type == "cpu" else 1) if need_points else 0
-    point_slots = positions.new_zeros(slots, count, 3)
-    depth_slots = positions.new_zeros(slots, count)
-    shared = need_points and slots == 1
+    # A run of levels is one thread's: a level on a CPU, where it owns the level's table, and all of them on CUDA.
+    runs = levels if positions.device.type == "cpu" else 1
+    grad_points = positions.new_empty(runs if need_points else 0, count, 4)
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
-    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real)]
+    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real), levels // runs]
     outputs = [
         array(grad_grid, wp.types.vector(length=features, dtype=real)),
-        array(point_slots.expand(levels, -1, -1) if shared else point_slots, types(real).vec3),
-        array(depth_slots.expand(levels, -1) if shared else depth_slots, real),
+        array(grad_points, types(real).vec4),
     ]
-    launch(positions, kernels.backward, (levels, count), arguments, outputs)
+    launch(positions, kernels.backward, (runs, count), arguments, outputs)
     if not need_points:
         return grad_grid, None, None
-    if shared:
-        return grad_grid, point_slots[0], depth_slots[0]
-    return grad_grid, point_slots.sum(0), depth_slots.sum(0)
+    points = grad_points.sum(0) if runs > 1 else grad_points[0]
+    return grad_grid, points[:, :3], points[:, 3]
 
 
 def _colors(coefficients: torch.Tensor, directions: torch.Tensor, count: int, clamp: bool) -> tuple[Any, list[Any]]:
@@ -224,6 +231,7 @@ def _colors_backward(
     vec3 = types(real).vec3
     count = len(grad_colors)
     signal = torch.empty_like(coefficients)
+    signal[:, count:] = 0
     slots = directions.new_zeros(count if need_directions else 0, 3)
     kernels, arguments = _colors(coefficients, directions, count, clamp)
     arguments += [array(scale, real), array(grad_colors, vec3)]

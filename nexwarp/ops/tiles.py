@@ -6,13 +6,22 @@ from typing import Any
 import torch
 import warp as wp
 
-from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tiles import (
+    MAX_CORNERS,
+    depth_keys_kernel,
+    footprint_kernel,
+    list_kernels,
+    surfel_ids_kernel,
+    tile_offsets_kernel,
+)
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch, real_of, stream_of
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
+# Threads that share a surfel's tile rows on a GPU.
+LANES = 8
 
 
 @dataclass(frozen=True)
@@ -25,6 +34,7 @@ class Tiles:
         surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
         entries: (M,) int32, emission index of each of those.
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
+        reaches: (N, 2), half the sides of the support rectangle, |u| and |v| of a hit cannot exceed them.
         tile_size: pixels along a tile's side.
         columns: tiles in a row.
         exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
@@ -36,6 +46,7 @@ class Tiles:
     surfel_ids: torch.Tensor
     entries: torch.Tensor
     tile_offsets: torch.Tensor
+    reaches: torch.Tensor
     tile_size: int
     columns: int
     exact: bool
@@ -79,18 +90,13 @@ def intersect_tiles(
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
     order = _depth_order(projection.centers.detach(), t)
     kernels = list_kernels(real, low_pass, tile_size)
-    dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2)
-    arguments = [
-        array(order, wp.int32),
-        *(array(x, dtype) for x, dtype in zip(tensors, dtypes, strict=True)),
-        array(viewmat.contiguous()[None], t.mat44),
-        t.vec4(*camera.intrinsics),
-        camera.near,
-        wp.vec2i(columns, rows),
-    ]
-    ends = torch.zeros(count, dtype=torch.int32, device=means.device)
-    launch(means, kernels.count, count, arguments, [array(ends, wp.int32)])
-    _scan(ends)
+    footprints, reaches = _footprints(tensors, viewmat, camera, low_pass, tile_size)
+    lanes = 1 if means.device.type == "cpu" else LANES
+    arguments = [array(order, wp.int32), *footprints, wp.vec2i(columns, rows), lanes]
+    counts = torch.empty(count * lanes, dtype=torch.int32, device=means.device)
+    launch(means, kernels.count, count * lanes, arguments, [array(counts, wp.int32)])
+    _scan(counts)
+    ends = counts[lanes - 1 :: lanes]
     exact = means.device.type == "cpu" and room is None
     if room is None:
         room = _total(ends) if exact else _room(ends, (columns, rows, low_pass))
@@ -99,12 +105,36 @@ def intersect_tiles(
     entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
     surfels, surfel_ids = torch.zeros(room, **fill), torch.empty(room, **fill)
     emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
-    launch(means, kernels.emit, count, [*arguments, array(ends, wp.int32)], emitted)
+    launch(means, kernels.emit, count * lanes, [*arguments, array(counts, wp.int32)], emitted)
     _sort(tile_ids, entries, room, (columns * rows).bit_length())
     launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     offsets = torch.empty(columns * rows + 1, **fill)
     launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries[:room], offsets, tile_size, columns, exact)
+    return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact)
+
+
+def _footprints(
+    shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, low_pass: bool, tile_size: int
+) -> tuple[list[Any], torch.Tensor]:
+    """The supports' polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
+    like, count = shape[0], len(shape[0])
+    real = real_of(like)
+    t = types(real)
+    dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2)
+    arguments = [
+        *(array(x, dtype) for x, dtype in zip(shape, dtypes, strict=True)),
+        array(viewmat.contiguous()[None], t.mat44),
+        t.vec4(*camera.intrinsics),
+        camera.near,
+        -(-camera.height // tile_size),
+    ]
+    reaches, corners = like.new_empty(count, 2), like.new_empty(count, MAX_CORNERS, 2)
+    shapes = torch.empty(count, 3, dtype=torch.int32, device=like.device)
+    margins, discs = like.new_empty(count), like.new_empty(count if low_pass else 1, 3)
+    footprints = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
+    kernel = footprint_kernel(real, low_pass, tile_size)
+    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *footprints])
+    return footprints, reaches
 
 
 def _depth_order(centers: torch.Tensor, t: Any) -> torch.Tensor:

@@ -36,12 +36,16 @@ class _Unproject(torch.autograd.Function):
         _launch(depths, viewmat[None], 0, camera, (positions, directions))
         ctx.save_for_backward(depths, viewmat)
         ctx.camera = camera
+        ctx.set_materialize_grads(False)
+        if not ctx.needs_input_grad[1]:
+            # They depend on the camera alone: saves the texture the work of differentiating them.
+            ctx.mark_non_differentiable(directions)
         return positions, directions
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, grad_positions: torch.Tensor, grad_directions: torch.Tensor
+        ctx: Any, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         depths, viewmat = ctx.saved_tensors
         need_depths, step, _ = ctx.needs_input_grad
@@ -49,7 +53,7 @@ class _Unproject(torch.autograd.Function):
         grad_depths = grad_like(depths, need_depths)
         grad_viewmats = viewmat.new_zeros(pixels, 4, 4) if step else None
         viewmats = viewmat.expand(pixels, 4, 4) if step else viewmat[None]
-        grads = (grad_positions.contiguous(), grad_directions.contiguous())
+        grads = (grad_positions, None if grad_directions is None else grad_directions.contiguous())
         _launch(depths, viewmats, int(step), ctx.camera, grads, (grad_depths, grad_viewmats))
         return grad_depths, grad_viewmats.sum(0) if step else None, None
 
@@ -63,7 +67,7 @@ def _launch(
     viewmats: torch.Tensor,
     step: int,
     camera: Pinhole,
-    outputs: tuple[torch.Tensor, torch.Tensor],
+    outputs: tuple[torch.Tensor | None, torch.Tensor | None],
     grads: tuple[torch.Tensor | None, torch.Tensor | None] | None = None,
 ) -> None:
     """Launch forward into `outputs`, or, given `grads` to add to, backward from `outputs`' gradients."""
@@ -72,8 +76,8 @@ def _launch(
     pixels = depths.shape[0] * depths.shape[1]
     intrinsics = t.vec4(*camera.intrinsics)
     inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, intrinsics, camera.width]
-    arrays = [array(outputs[0].view(pixels, -1, 3) if depths.shape[2] else outputs[0].view(pixels, 0, 3), t.vec3)]
-    arrays.append(array(outputs[1].view(pixels, 3), t.vec3))
+    shapes = ((pixels, depths.shape[2], 3), (pixels, 3))
+    arrays = [array(None if x is None else x.view(s), t.vec3) for x, s in zip(outputs, shapes, strict=True)]
     if grads is None:
         launch(depths, unproject_kernel(real), pixels, inputs, arrays)
         return

@@ -1,0 +1,52 @@
+"""Vector loads. Warp reads a vector one component at a time; one wide load is what a GPU's memory wants.
+
+Rows must be aligned to their own size, as rows of whole arrays from an allocator are.
+"""
+
+import functools
+
+import warp as wp
+
+_LOAD_FLOAT4 = """
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(&wp::index(rows, i, j)));
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
+#else
+    return wp::index(rows, i, j);
+#endif
+"""
+
+_LOAD_FLOAT2 = """
+#if defined(__CUDA_ARCH__)
+    const float2 v = __ldg(reinterpret_cast<const float2*>(&wp::index(rows, i, j)));
+    return wp::vec_t<2, float>(v.x, v.y);
+#else
+    return wp::index(rows, i, j);
+#endif
+"""
+
+_LOAD_HALF2 = """
+#if defined(__CUDA_ARCH__)
+    const unsigned bits = __ldg(reinterpret_cast<const unsigned*>(&wp::index(rows, i, j)));
+    wp::vec_t<2, wp::half> v;
+    v.c[0].u = (unsigned short)(bits & 0xffffu);
+    v.c[1].u = (unsigned short)(bits >> 16);
+    return v;
+#else
+    return wp::index(rows, i, j);
+#endif
+"""
+
+_SNIPPETS = {(4, wp.float32): _LOAD_FLOAT4, (2, wp.float32): _LOAD_FLOAT2, (2, wp.float16): _LOAD_HALF2}
+
+
+@functools.cache
+def load_function(length: int, scalar: type) -> wp.Function:
+    """Make the function that returns rows[i, j], a vector of `length` scalars, in one load where one is known."""
+    row = wp.types.vector(length=length, dtype=scalar)
+    snippet = _SNIPPETS.get((length, scalar), "    return wp::index(rows, i, j);")
+
+    @wp.func_native(snippet)
+    def load(rows: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
+
+    return load
