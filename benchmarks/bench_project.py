@@ -17,15 +17,18 @@ def run(options: Options) -> list[Measurement]:
 
 def plain_colors(scene: Scene, options: Options) -> list[Measurement]:
     """SH of degree 3 of every surfel."""
-    sh, means = (x.detach().clone().requires_grad_() for x in (scene.surfels.sh, scene.surfels.means))
+    s = scene.surfels
+    leaves = [x.detach().clone().requires_grad_() for x in (s.sh0, s.shN, s.means)]
     position = scene.camera.position
-    colors = ops.plain_colors(sh, means, position, 3)
+    colors = ops.plain_colors(leaves[:2], leaves[2], position, 3)
     (signal,) = random_like((colors,))
     return [
-        options.time("plain colours, forward", lambda: ops.plain_colors(sh, means, position, 3), **scene.facts),
+        options.time(
+            "plain colours, forward", lambda: ops.plain_colors(leaves[:2], leaves[2], position, 3), **scene.facts
+        ),
         options.time(
             "plain colours, backward",
-            lambda: torch.autograd.grad(colors, [sh, means], signal, retain_graph=True),
+            lambda: torch.autograd.grad(colors, leaves, signal, retain_graph=True),
             **scene.facts,
         ),
     ]

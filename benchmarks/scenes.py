@@ -1,6 +1,6 @@
 """Seeded scenes that all benchmarks share. Made on the CPU, so that they are the same on every device."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,9 @@ import torch
 import nexwarp as nw
 from benchmarks.suite import Options
 from nexwarp import ops
+from nexwarp.checkpoint import load_cameras
 from nexwarp.paths import look_at
+from nexwarp.runs import CAMERAS_FILE
 
 SH_DC = 0.28209479177387814
 GARDEN_WIDTH = 648  # of the images that garden_points.npz's intrinsics are for
@@ -26,10 +28,12 @@ class Scene:
 
     Attributes:
         name: tells the sizes too.
-        surfels: gamma = 1 (but for 1e-6), SH of degree 3.
+        surfels: SH of degree 3, and gamma = 1 (but for 1e-6) unless they were trained.
         cameras: the first one is timed, training takes turns.
         photos: (H, W, 3) uint8 of these cameras, where there are any.
         note: where the scene is not what was asked for.
+        texture: the trained one, where there is one.
+        options: keyword arguments of `nexwarp.render` that the scene was trained with.
     """
 
     name: str
@@ -37,6 +41,8 @@ class Scene:
     cameras: tuple[nw.Camera, ...]
     photos: tuple[torch.Tensor, ...] = ()
     note: str = ""
+    texture: nw.NeuralTexture | None = None
+    options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def camera(self) -> nw.Camera:
@@ -50,8 +56,10 @@ class Scene:
         return {"scene": self.name, "sizes": sizes, "note": self.note}
 
     def to(self, device: torch.device | str) -> "Scene":
-        """Return this scene on a device; the photos stay. Moves the surfels in place, as modules do."""
-        return replace(self, surfels=self.surfels.to(device), cameras=tuple(c.to(device) for c in self.cameras))
+        """Return this scene on a device; the photos stay. Moves surfels and texture in place, as modules do."""
+        texture = None if self.texture is None else self.texture.to(device)
+        cameras = tuple(c.to(device) for c in self.cameras)
+        return replace(self, surfels=self.surfels.to(device), texture=texture, cameras=cameras)
 
 
 @dataclass(frozen=True)
@@ -94,7 +102,7 @@ def geometry(scene: Scene) -> Geometry:
     """Activate a scene's surfels, and their colours as its camera sees them."""
     s, c = scene.surfels, scene.camera
     shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
-    colors = ops.plain_colors(s.sh, s.means, c.position, 3).requires_grad_()
+    colors = ops.plain_colors((s.sh0, s.shN), s.means, c.position, 3).requires_grad_()
     pinhole = ops.Pinhole(c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.near)
     return Geometry(shape, colors, c.viewmat, pinhole)
 
@@ -116,24 +124,28 @@ def random_like(tensors: tuple[torch.Tensor, ...], seed: int = 1) -> list[torch.
 
 
 def texture(scene: Scene, **shape: Any) -> nw.NeuralTexture:
-    """Random field on the scene's device; a table of 2^20 on large scenes, of 2^15 on those that a CPU takes."""
+    """The scene's own field, or a random one: a table of 2^20 on large scenes, of 2^15 on those that a CPU takes."""
+    if scene.texture is not None:
+        return scene.texture
     large = len(scene.surfels) >= SAHAROV
     defaults = {"table_size": 2**20 if large else 2**15, "min_resolution": 16.0, "max_resolution": 1024.0}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(2)
-        field = nw.NeuralTexture(**(defaults | shape))
+        made = nw.NeuralTexture(**(defaults | shape))
         with torch.no_grad():
-            field.grid.uniform_(-0.5, 0.5)
-    return field.to(scene.surfels.device)
+            made.grid.uniform_(-0.5, 0.5)
+    return made.to(scene.surfels.device)
 
 
 def workload(options: Options) -> list[Scene]:
-    """Scenes for a pass: the garden on CUDA, and on every device one that a CPU can take, to compare them by."""
+    """Scenes for a pass: the garden on CUDA, the trained fox, and one that any CPU can take, to compare devices by."""
     small = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
     scenes = [small]
     if options.cuda:
         large = garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
         scenes.insert(0, large)
+    if options.model is not None:
+        scenes.append(fox(options.model, options.data))
     return [scene.to(options.device) for scene in scenes]
 
 
@@ -165,6 +177,22 @@ def saharov(n: int = SAHAROV, data: Path = Options.data) -> Scene:
     cameras = tuple(view.camera for view in loaded.train)
     name = f"saharov {_sizes(n, cameras[0].width, cameras[0].height)}"
     return Scene(name, surfels, cameras, tuple(view.image for view in loaded.train))
+
+
+def fox(model: Path, data: Path = Options.data) -> Scene:
+    """Take surfels, texture and options from a run of `nexwarp train` on "fox", and the cameras of its views.
+
+    Unlike those of the other scenes, these surfels are as training leaves them: of all sizes, in layers, most of them
+    behind others.
+    """
+    trained = nw.load(model)
+    file = model / CAMERAS_FILE
+    if file.is_file():
+        cameras = tuple(load_cameras(file)["train"].values())
+    else:
+        cameras = tuple(view.camera for view in nw.load_scene(data / "fox").train)
+    name = f"fox, trained, {_sizes(len(trained.surfels), cameras[0].width, cameras[0].height)}"
+    return Scene(name, trained.surfels, cameras, texture=trained.texture, options=trained.render_options)
 
 
 def cloud(n: int, width: int, height: int) -> Scene:

@@ -95,9 +95,9 @@ def render(
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
     background = _check(surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture)
-    shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
+    shape = surfels.activated()
     pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, sh_degree)
+    colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)

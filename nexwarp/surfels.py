@@ -1,16 +1,37 @@
 """The surfels: what is learned of the geometry and of the plain (untextured) appearance (paper Sec. 3.1)."""
 
+from typing import NamedTuple
+
 import torch
 from torch import nn
 
+from nexwarp import ops
 from nexwarp.ops.checks import check_finite, check_tensors
 
 # Raw values stay finite at the ends of the ranges; activated ones come back within 2e-6.
 END = 1e-6
 
 
+class Activated(NamedTuple):
+    """The geometry of N surfels as the passes read it; differentiable.
+
+    Attributes:
+        means: (N, 3) centres, world units.
+        quats: (N, 4) unit rotations surfel to world, wxyz.
+        scales: (N, 2) along the surfel's x and y axes, world units.
+        opacities: (N,) in (0, 1).
+        gammas: (N, 2) exponents of the generalised Gaussian, >= 1.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    gammas: torch.Tensor
+
+
 class Surfels(nn.Module):
-    """N surfels: raw values are the parameters, activated ones the properties that the passes read.
+    """N surfels: raw values are the parameters, activated ones properties; `activated()` gives the passes all at once.
 
     Parameters (raw): `means` (N, 3) world units; `raw_quats` (N, 4) wxyz, any length but zero; `log_scales` (N, 2);
     `logit_opacities` (N,); `raw_gammas` (N, 2), gamma = 1 + exp(raw); `sh0` (N, 1, 3); `shN` (N, C - 1, 3).
@@ -98,6 +119,11 @@ class Surfels(nn.Module):
     def device(self) -> torch.device:
         """Device of the parameters."""
         return self.means.device
+
+    def activated(self) -> Activated:
+        """Return what the properties of the same names do, to rounding, in one kernel."""
+        raw = (self.raw_quats, self.log_scales, self.logit_opacities, self.raw_gammas)
+        return Activated(self.means, *ops.activate(*raw))
 
     @property
     def quats(self) -> torch.Tensor:

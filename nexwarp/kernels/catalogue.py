@@ -1,9 +1,10 @@
 """Every kernel in the builds that rendering and training use, for ahead-of-time compilation and for tests."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import warp as wp
 
+from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.collect import (
     collect_backward_kernel,
     collect_kernel,
@@ -12,9 +13,17 @@ from nexwarp.kernels.collect import (
 )
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.project import project_kernel
-from nexwarp.kernels.sh import plain_colors_kernel, textured_colors_kernels
-from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
+from nexwarp.kernels.ssim import LANES, ssim_kernels
+from nexwarp.kernels.tiles import (
+    depth_keys_kernel,
+    footprint_kernel,
+    list_kernels,
+    surfel_ids_kernel,
+    tile_offsets_kernel,
+)
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.unproject import unproject_kernel
 
@@ -23,23 +32,54 @@ def all_kernels(
     real: type = wp.float32,
     storage: type = wp.float16,
     tile_size: int = 16,
-    max_hits: range = range(MAX_HITS + 1),
+    max_hits: Sequence[int] = range(MAX_HITS + 1),
 ) -> Iterator[wp.Kernel]:
-    """Yield each kernel for a scalar type, a texture storage type, a tile size and a range of K."""
+    """Yield each kernel for a scalar type, a texture storage type, a tile size and some K."""
+    yield from thread_kernels(real, storage, tile_size)
+    yield from walk_kernels(real, tile_size, max_hits)
+
+
+def thread_kernels(
+    real: type,
+    storage: type,
+    tile_size: int,
+    *,
+    degrees: Sequence[int] = range(4),
+    features: Sequence[int] = (1, 2, 4, 8),
+    clamps: Sequence[bool] = (False, True),
+    low_passes: Sequence[bool] = (False, True),
+    ssim_lanes: Sequence[int] = (1, LANES),
+) -> Iterator[wp.Kernel]:
+    """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
+    yield from (activate_kernels(real).forward, activate_kernels(real).backward)
     yield from (surfel_ids_kernel, tile_offsets_kernel)
     yield from (reduce_rows_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
-    for degree in range(4):
-        yield plain_colors_kernel(real, degree)
-        for clamp in (False, True):
+    yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
+    for lanes in ssim_lanes:
+        ssim = ssim_kernels(real, lanes)
+        yield from (ssim.moments, ssim.score, ssim.blur, ssim.gradient)
+    for degree in degrees:
+        plain = plain_colors_kernels(real, degree)
+        yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
+        for clamp in clamps:
             colors = textured_colors_kernels(real, storage, degree, clamp)
             yield from (colors.forward, colors.backward)
-    for features in (1, 2, 4, 8):
-        lookup = hashgrid_kernels(real, storage, features)
+    for count in features:
+        lookup = hashgrid_kernels(real, storage, count)
         yield from (lookup.forward, lookup.backward)
-    for low_pass in (False, True):
+    for low_pass in low_passes:
         lists = list_kernels(real, low_pass, tile_size)
-        yield from (lists.count, lists.emit, splat_error_kernel(real, low_pass, tile_size))
+        yield footprint_kernel(real, low_pass, tile_size)
+        yield from (lists.count, lists.emit)
+
+
+def walk_kernels(
+    real: type, tile_size: int, max_hits: Sequence[int], *, low_passes: Sequence[bool] = (False, True)
+) -> Iterator[wp.Kernel]:
+    """Yield the kernels of warps that walk along a tile's list, in blocks of `collect.BLOCK_DIM`."""
+    for low_pass in low_passes:
+        yield splat_error_kernel(real, low_pass, tile_size)
         for hits in max_hits:
             yield collect_kernel(real, hits, low_pass, tile_size)
             for watch in (False, True):

@@ -1,7 +1,7 @@
 """Spherical harmonics colours of degree 0 to 3: plain (a thread a surfel) and textured (a thread a point).
 
-Plain colours use Warp's own adjoint; textured ones are linear in the coefficients, and `wp.grad` differentiates the
-basis. Constants and signs are the field's.
+Colours are linear in the coefficients, and `wp.grad` differentiates the basis. The backward kernels write gradients,
+they do not add to them. Constants and signs are the field's.
 """
 
 import functools
@@ -60,37 +60,107 @@ def basis_function(real: type, degree: int) -> wp.Function:
 
 
 @functools.cache
-def plain_colors_kernel(real: type, degree: int) -> wp.Kernel:
-    """Make the kernel of max(0, 0.5 + SH(direction from the camera's centre to the surfel's))."""
+def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
+    """Make the kernels of max(0, 0.5 + SH(direction from the camera's centre to the surfel's)).
+
+    `sh0` is (N, 1), `shN` (N, C - 1). Backward is one kernel for the coefficients and one, a thread a surfel, for the
+    ray from the camera's centre to the surfel's. In the former, `lanes` threads share a surfel: with C of them each
+    writes one coefficient and neighbours write neighbouring addresses; one alone evaluates the basis but once. Both
+    read the colours: where one is 0 it was clamped and has no gradient.
+    """
     vec3 = types(real).vec3
     basis = basis_function(real, degree)
     count = (degree + 1) ** 2
+    vec = wp.types.vector(length=count, dtype=real)
     # A surfel at the camera's very centre has no direction; it takes the forward one, without gradient.
     TINY = wp.constant(real(1e-12))
 
-    @wp.kernel(module="unique")
-    def plain_colors(
-        first: wp.int32,
-        sh: wp.array2d(dtype=vec3),
-        means: wp.array(dtype=vec3),
-        positions: wp.array(dtype=vec3),
-        position_step: wp.int32,
-        # outputs
-        colors: wp.array(dtype=vec3),
-    ):
-        i = first + wp.tid()
-        ray = means[i] - positions[i * position_step]
+    @wp.func
+    def basis_along(ray: vec3):
         length = wp.length(ray)
         direction = vec3(real(0.0), real(0.0), real(1.0))
         if length > TINY:
             direction = ray / length
-        b = basis(direction)
-        color = vec3(real(0.5), real(0.5), real(0.5))
-        for k in range(wp.static(count)):
-            color += sh[i, k] * b[k]
+        return basis(direction)
+
+    @wp.func
+    def basis_dot(ray: vec3, w: vec):
+        return wp.dot(basis_along(ray), w)
+
+    @wp.func
+    def unclamped(grad: vec3, color: vec3):
+        """Gradient of what `color` was before it was clamped."""
+        out = vec3()
+        for c in range(3):
+            if color[c] > real(0.0):
+                out[c] = grad[c]
+        return out
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def plain_colors(
+        first: wp.int32,
+        sh0: wp.array2d(dtype=vec3),
+        shN: wp.array2d(dtype=vec3),
+        means: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        # outputs
+        colors: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        b = basis_along(means[i] - position[0])
+        color = vec3(real(0.5), real(0.5), real(0.5)) + sh0[i, 0] * b[0]
+        for k in range(1, wp.static(count)):
+            color += shN[i, k - 1] * b[k]
         colors[i] = wp.max(color, vec3())
 
-    return plain_colors
+    @wp.kernel(enable_backward=False, module="unique")
+    def plain_coefficients_backward(
+        first: wp.int32,
+        lanes: wp.int32,
+        means: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        colors: wp.array(dtype=vec3),
+        grad_colors: wp.array(dtype=vec3),
+        # outputs
+        grad_sh0: wp.array2d(dtype=vec3),
+        grad_shN: wp.array2d(dtype=vec3),
+    ):
+        thread = first + wp.tid()
+        i = thread // lanes
+        grad = unclamped(grad_colors[i], colors[i])
+        b = basis_along(means[i] - position[0])
+        for k in range(thread - i * lanes, grad_shN.shape[1] + 1, lanes):
+            # Not b[k]: an index that the compiler does not know moves the basis from registers to memory.
+            value = real(0.0)
+            for c in range(wp.static(count)):
+                value = wp.where(c == k, b[c], value)
+            if k == 0:
+                grad_sh0[i, 0] = grad * value
+            else:
+                grad_shN[i, k - 1] = grad * value
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def plain_rays_backward(
+        first: wp.int32,
+        shN: wp.array2d(dtype=vec3),
+        means: wp.array(dtype=vec3),
+        position: wp.array(dtype=vec3),
+        colors: wp.array(dtype=vec3),
+        grad_colors: wp.array(dtype=vec3),
+        # outputs
+        grad_rays: wp.array(dtype=vec3),
+    ):
+        i = first + wp.tid()
+        grad = unclamped(grad_colors[i], colors[i])
+        w = vec()
+        for k in range(1, wp.static(count)):
+            w[k] = wp.dot(grad, shN[i, k - 1])
+        ray, _w = wp.grad(basis_dot)(means[i] - position[0], w)
+        grad_rays[i] = ray
+
+    return SimpleNamespace(
+        forward=plain_colors, coefficients_backward=plain_coefficients_backward, rays_backward=plain_rays_backward
+    )
 
 
 @functools.cache

@@ -18,8 +18,15 @@ from nexwarp.kernels.collect import BLOCK_DIM, collect_backward_kernel, collect_
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.project import project_kernel
-from nexwarp.kernels.sh import plain_colors_kernel, textured_colors_kernels
-from nexwarp.kernels.tiles import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
+from nexwarp.kernels.tiles import (
+    MAX_CORNERS,
+    depth_keys_kernel,
+    footprint_kernel,
+    list_kernels,
+    surfel_ids_kernel,
+    tile_offsets_kernel,
+)
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernel
 
@@ -39,6 +46,7 @@ class Lists(NamedTuple):
     tile_offsets: wp.array
     order: wp.array
     ends: wp.array
+    reaches: wp.array
     tile_size: int
     columns: int
 
@@ -72,12 +80,66 @@ def _silent(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any], 
     wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=device, record_tape=False, block_dim=block_dim)
 
 
-def plain_colors(tape: wp.Tape, sh: wp.array, means: wp.array, position: wp.array, degree: int) -> wp.array:
-    """Plain colours (N) vec3 from sh (N, C) vec3, means (N) vec3 and the camera's position (1) vec3, world."""
+@wp.kernel(enable_backward=False, module="unique")
+def _add_points(
+    first: wp.int32, points: wp.array2d(dtype=Any), positions: wp.array(dtype=Any), depths: wp.array(dtype=Any)
+):
+    p = first + wp.tid()
+    g = points[0, p]
+    positions[p] += type(positions[p])(g[0], g[1], g[2])
+    depths[p] += g[3]
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _add_runs(first: wp.int32, values: wp.array(dtype=Any), length: wp.int32, sums: wp.array(dtype=Any)):
+    i = first + wp.tid()
+    for k in range(length):
+        sums[i] += values[i * length + k]
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _subtract_all(first: wp.int32, values: wp.array(dtype=Any), total: wp.array(dtype=Any)):
+    wp.atomic_sub(total, 0, values[first + wp.tid()])
+
+
+def plain_colors(
+    tape: wp.Tape, sh: wp.array | tuple[wp.array, wp.array], means: wp.array, position: wp.array, degree: int
+) -> wp.array:
+    """Plain colours (N) vec3 of sh (N, C) vec3, means (N) vec3 and the camera's position (1) vec3, world.
+
+    `sh` may come apart, as (N, 1) and (N, C - 1) vec3; `degree` is at most that of the C coefficients.
+    """
+    sh0, shN = (sh[:, :1], sh[:, 1:]) if isinstance(sh, wp.array) else sh
     colors = _new(means, means.shape, means.dtype)
-    kernel = plain_colors_kernel(_real(means), degree)
-    _launch(tape, kernel, len(means), [sh, means, position, 0], [colors])
+    kernels = plain_colors_kernels(_real(means), degree)
+    _silent(kernels.forward, len(means), [sh0, shN, means, position], [colors])
+
+    def backward() -> None:
+        seen, lanes = [means, position, colors, colors.grad], 1 + shN.shape[1]
+        *grads, grad_rays = (_new(x, x.shape, x.dtype, requires_grad=False) for x in (sh0, shN, means))
+        _silent(kernels.coefficients_backward, len(means) * lanes, [lanes, *seen], grads)
+        _silent(kernels.rays_backward, len(means), [shN, *seen], [grad_rays])
+        # These kernels write their outputs; a tape adds to what is there.
+        for x, grad in zip((sh0, shN, means), (*grads, grad_rays), strict=True):
+            if x.requires_grad:
+                _silent(_add_columns, len(x), [_columns(grad)], [_columns(x.grad)])
+        if position.requires_grad:
+            _silent(_subtract_all, len(means), [grad_rays], [position.grad])
+
+    given = [sh] if isinstance(sh, wp.array) else [sh0, shN]
+    tape.record_func(backward, [x for x in (*given, means, position, colors) if x.requires_grad])
     return colors
+
+
+def _columns(x: wp.array) -> wp.array:
+    return x if x.ndim == 2 else x.reshape((len(x), 1))
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _add_columns(first: wp.int32, values: wp.array2d(dtype=Any), sums: wp.array2d(dtype=Any)):
+    i = first + wp.tid()
+    for c in range(values.shape[1]):
+        sums[i, c] += values[i, c]
 
 
 def project(
@@ -121,25 +183,34 @@ def intersect_tiles(
         return _new(means, length, dtype, requires_grad=False)
 
     keys, order, ends = integers(2 * count, wp.uint32), integers(2 * count), integers(count)
+
+    def reals(shape: Any, dtype: type) -> wp.array:
+        return _new(means, shape, dtype, requires_grad=False)
+
+    shapes = integers(count, wp.vec3i)
+    reaches, corners = reals(count, t.vec2), reals((count, MAX_CORNERS), t.vec2)
+    margins, discs = reals(count, real), reals(count if low_pass else 1, t.vec3)
+    surfels = [means, quats, scales, opacities, gammas, viewmat, t.vec4(*image.intrinsics), image.near, rows]
+    footprints = [corners, shapes, margins, discs]
+    _silent(footprint_kernel(real, low_pass, tile_size), count, surfels, [reaches, *footprints])
     kernels = list_kernels(real, low_pass, tile_size)
-    surfels = [means, quats, scales, opacities, gammas, viewmat]
-    view = [t.vec4(*image.intrinsics), image.near, wp.vec2i(columns, rows)]
+    arguments = [order, *footprints, wp.vec2i(columns, rows), 1]
     total = 0
     if count:
         _silent(depth_keys_kernel(real), count, [centers], [keys, order])
         wp.utils.radix_sort_pairs(keys, order, count)
-        _silent(kernels.count, count, [order, *surfels, *view], [ends])
+        _silent(kernels.count, count, arguments, [ends])
         wp.utils.array_scan(ends, ends, inclusive=True)
         total = int(ends[count - 1 :].numpy()[0])
     tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
     if total:
         tile_ids = tiles.view(wp.int32)
-        _silent(kernels.emit, count, [order, *surfels, *view, ends], [tile_ids, entries, emitted])
+        _silent(kernels.emit, count, [*arguments, ends], [tile_ids, entries, emitted])
         wp.utils.radix_sort_pairs(tiles, entries, total, end_bit=(columns * rows).bit_length())
         _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
     offsets = integers(columns * rows + 1)
     _silent(tile_offsets_kernel, len(offsets), [tiles.view(wp.int32), total], [offsets])
-    return Lists(ids, offsets, order[:count], ends, tile_size, columns)
+    return Lists(ids, offsets, order[:count], ends, reaches, tile_size, columns)
 
 
 def collect(
@@ -166,17 +237,17 @@ def collect(
     )
     threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
     view = [wp.vec2i(*image.size), lists.columns, t.vec4(*image.intrinsics), image.near]
-    inputs = [records, centers, limits, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends, *view]
+    walked = [lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
+    inputs = [records, centers, limits, *walked, *view, lists.reaches]
     kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
     _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
 
     def backward() -> None:
         found = [hits.plain, hits.ids, hits.weights, hits.alphas, hits.stops]
         grads = [hits.plain.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
-        ids = [lists.surfel_ids, lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
         kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
         outputs = [records.grad, centers.grad, None]
-        _silent(kernel, threads, [records, centers, limits, *ids, *view, *found, *grads, None], outputs, BLOCK_DIM)
+        _silent(kernel, threads, [*inputs, None, *found, *grads, None], outputs, BLOCK_DIM)
 
     tape.record_func(backward, [records, centers, hits.plain, hits.depths, hits.weights, hits.alphas])
     return hits
@@ -205,23 +276,13 @@ def hashgrid(
     _silent(kernels.forward, (levels, count), inputs, [encoded])
     one = wp.ones(1, dtype=real, device=table.device)
 
-    def shared(grad: wp.array) -> wp.array:
-        strides = (0, grad.strides[0])
-        return wp.array(ptr=grad.ptr, dtype=grad.dtype, shape=(levels, count), strides=strides, device=grad.device)
-
     def backward() -> None:
-        outputs = [table.grad, shared(positions.grad), shared(depths.grad)]
-        _silent(kernels.backward, (levels, count), [*inputs, encoded.grad, one], outputs)
+        points = _new(positions, (1, count), types(real).vec4, requires_grad=False)
+        _silent(kernels.backward, (1, count), [*inputs, encoded.grad, one, levels], [table.grad, points])
+        _silent(_add_points, count, [points], [positions.grad, depths.grad])
 
     tape.record_func(backward, [table, positions, depths, encoded])
     return encoded
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _add_runs(first: wp.int32, values: wp.array(dtype=Any), length: wp.int32, sums: wp.array(dtype=Any)):
-    i = first + wp.tid()
-    for k in range(length):
-        sums[i] += values[i * length + k]
 
 
 def textured_colors(

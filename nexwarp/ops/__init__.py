@@ -1,5 +1,6 @@
 """What a tensor means and how it differentiates: one torch op a stage, the only torch <-> Warp boundary."""
 
+from nexwarp.ops.activate import activate
 from nexwarp.ops.collect import ErrorWatch, Hits, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.pinhole import Pinhole
@@ -15,6 +16,7 @@ __all__ = [
     "Pinhole",
     "Projection",
     "Tiles",
+    "activate",
     "collect",
     "compose",
     "intersect_tiles",

@@ -5,60 +5,82 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.sh import plain_colors_kernel
+from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops._interop import array, launch, real_of
 from nexwarp.ops.checks import check_tensors
 
 
-def plain_colors(sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int) -> torch.Tensor:
+def plain_colors(
+    sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor], means: torch.Tensor, position: torch.Tensor, degree: int
+) -> torch.Tensor:
     """Return max(0, 0.5 + SH(direction from the camera to the surfel)); differentiable in every tensor.
 
     Args:
-        sh: (N, C, 3) coefficients, DC first.
+        sh: (N, C, 3) coefficients, DC first; or sh0 (N, 1, 3) and shN (N, C - 1, 3) apart, which spares a copy. Those
+            above `degree` are not read and get zero gradients.
         means: (N, 3) world.
         position: (3,) camera centre, world.
-        degree: 0 to 3, degree to evaluate; less when `sh` holds less.
+        degree: 0 to 3, degree to evaluate; less when C is less.
 
     Returns:
         (N, 3) colours.
+
+    Raises:
+        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
-    check_tensors({"sh": (sh, ("N", "C", 3)), "means": (means, ("N", 3)), "position": (position, (3,))})
-    degree = min(degree, round(sh.shape[1] ** 0.5) - 1)
-    return _PlainColors.apply(sh.contiguous(), means.contiguous(), position.contiguous(), degree)
+    if isinstance(sh, torch.Tensor):
+        check_tensors({"sh": (sh, ("N", "C", 3))})
+        sh = (sh[:, :1], sh[:, 1:])
+    sh0, shN = sh
+    check_tensors(
+        {
+            "sh0": (sh0, ("N", 1, 3)),
+            "shN": (shN, ("N", "C - 1", 3)),
+            "means": (means, ("N", 3)),
+            "position": (position, (3,)),
+        }
+    )
+    degree = min(degree, round((shN.shape[1] + 1) ** 0.5) - 1)
+    return _PlainColors.apply(*(x.contiguous() for x in (sh0, shN, means, position)), degree)
 
 
 class _PlainColors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sh: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int) -> torch.Tensor:
+    def forward(
+        ctx: Any, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
+    ) -> torch.Tensor:
         real = real_of(means)
         vec3 = types(real).vec3
         colors = torch.empty_like(means)
-        arrays = [array(x, vec3) for x in (sh, means, position[None])]
-        launch(means, plain_colors_kernel(real, degree), len(means), [*arrays, 0], [array(colors, vec3)])
-        ctx.save_for_backward(sh, means, position)
+        inputs = [array(x, vec3) for x in (sh0, shN, means, position[None])]
+        launch(means, plain_colors_kernels(real, degree).forward, len(means), inputs, [array(colors, vec3)])
+        ctx.save_for_backward(shN, means, position, colors)
         ctx.degree = degree
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        sh, means, position = ctx.saved_tensors
-        need_sh, need_means, step, _ = ctx.needs_input_grad
+        shN, means, position, colors = ctx.saved_tensors
+        need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad
         real, count = real_of(means), len(means)
         vec3 = types(real).vec3
-        grads = [
-            grad_like(sh, need_sh),
-            grad_like(means, need_means),
-            means.new_zeros(count, 3) if step else None,
-        ]
-        positions = position.expand(count, 3) if step else position[None]
-        launch(
-            means,
-            plain_colors_kernel(real, ctx.degree),
-            count,
-            [*(array(x, vec3) for x in (sh, means, positions)), int(step)],
-            [None],
-            adjoint=([*(array(x, vec3) for x in grads), None], [array(grad_colors.contiguous(), vec3)]),
-        )
-        return grads[0], grads[1], grads[2].sum(0) if step else None, None
+        kernels = plain_colors_kernels(real, ctx.degree)
+        # An empty gradient is contiguous whatever its strides, but Warp looks at them.
+        grad_colors = grad_colors.contiguous() if count else colors
+        seen = [array(x, vec3) for x in (means, position[None], colors, grad_colors)]
+        grad_sh0 = grad_shN = grad_means = grad_position = None
+        if need_sh0 or need_shN:
+            grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
+            # Memory is what counts on CUDA, arithmetic on a CPU.
+            lanes = 1 if means.device.type == "cpu" else shN.shape[1] + 1
+            outputs = [array(x, vec3) for x in (grad_sh0, grad_shN)]
+            launch(means, kernels.coefficients_backward, count * lanes, [lanes, *seen], outputs)
+        if need_means or need_position:
+            grad_means = torch.empty_like(means)
+            launch(means, kernels.rays_backward, count, [array(shN, vec3), *seen], [array(grad_means, vec3)])
+            # A ray is the surfel's centre minus the camera's.
+            grad_position = -grad_means.sum(0) if need_position else None
+        grads = (grad_sh0, grad_shN, grad_means, grad_position)
+        return (*(x if need else None for x, need in zip(grads, ctx.needs_input_grad, strict=False)), None)

@@ -1,0 +1,168 @@
+"""Plain colours: values and gradients against the reference, for every pair of stored and evaluated degrees."""
+
+import itertools
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from nexwarp import ops
+from nexwarp.kernels import launch
+from tests.reference import sh as reference
+from tests.tolerances import assert_close
+
+DEGREES = list(itertools.product(range(4), range(4)))
+NAMES = ("sh0", "shN", "means", "position")
+Leaves = list[torch.Tensor]
+
+
+def make(
+    count: int, stored: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu", seed: int = 0
+) -> Leaves:
+    """Leaves sh0, shN, means and the camera's position; about every fifth channel is below 0, where it is clamped."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(count, 1, 3), (count, (stored + 1) ** 2 - 1, 3), (count, 3), (3,)]
+    values = [torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes]
+    return [x.float().to(device=device, dtype=dtype).requires_grad_() for x in values]
+
+
+@pytest.fixture
+def poisoned_memory() -> Iterator[None]:
+    """In this mode torch fills what `torch.empty` gives with NaN."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def signal(colors: torch.Tensor) -> torch.Tensor:
+    return torch.randn(colors.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(colors)
+
+
+def gradients(leaves: Leaves, degree: int) -> Leaves:
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], degree)
+    return list(torch.autograd.grad(colors, leaves, signal(colors)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(("stored", "degree"), DEGREES)
+def test_plain_colors_agree_with_the_reference(
+    stored: int, degree: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    leaves = make(300, stored, dtype, device)
+    twins = [x.detach().double().cpu().requires_grad_() for x in leaves]
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], degree)
+    sh0, shN, means, position = twins
+    expected = reference.plain_colors(torch.cat([sh0, shN], dim=1), means, position, degree)
+    assert 0.02 < (expected == 0).double().mean() < 0.5
+    assert_close(colors, expected, kind="value", name="colors")
+    grads = torch.autograd.grad(colors, leaves, signal(colors))
+    # At degree 0 nothing depends on the direction.
+    wanted = torch.autograd.grad(expected, twins, signal(expected), allow_unused=True, materialize_grads=True)
+    for name, actual, want in zip(NAMES, grads, wanted, strict=True):
+        assert_close(actual, want, kind="gradient", name=name)
+
+
+@pytest.mark.parametrize(("stored", "degree"), [(s, d) for s, d in DEGREES if d < s])
+@pytest.mark.usefixtures("poisoned_memory")
+def test_coefficients_above_the_degree_have_zero_gradients(stored: int, degree: int, device: torch.device) -> None:
+    """All others have some. Memory that no kernel wrote would show as NaN."""
+    leaves = make(300, stored, torch.float32, device)
+    grad_sh0, grad_shN, _, _ = gradients(leaves, degree)
+    used = (degree + 1) ** 2 - 1
+    assert grad_shN[:, used:].eq(0).all() and grad_shN[:, :used].ne(0).any(dim=2).any(dim=0).all()
+    assert grad_sh0.any()
+
+
+def test_clamped_channels_have_no_gradient(device: torch.device) -> None:
+    leaves = make(300, 3, torch.float64, device)
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    clamped = colors == 0
+    sh0, shN, means, position = torch.autograd.grad(colors, leaves, signal(colors) * clamped)
+    assert clamped.any() and not any(x.any() for x in (sh0, shN, means, position))
+    # At exactly 0 too.
+    dark = torch.full((4, 1, 3), -0.5 / 0.28209479177387814, dtype=torch.float64, device=device)
+    dark.requires_grad_()
+    colors = ops.plain_colors((dark, dark.new_zeros(4, 0, 3)), means.new_ones(4, 3), position.new_zeros(3), 0)
+    (gradient,) = torch.autograd.grad(colors.sum(), dark)
+    assert not colors.any() and not gradient.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_surfel_at_the_camera_takes_the_forward_direction(dtype: torch.dtype, device: torch.device) -> None:
+    sh0, shN, means, position = make(5, 3, dtype, device)
+    with torch.no_grad():
+        sh0.fill_(3.0)
+        shN *= 0.1
+        means[2] = position
+    leaves = [sh0, shN, means, position]
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=device)
+    expected = 0.5 + reference.evaluate(torch.cat([sh0, shN], dim=1)[2], forward, 3)
+    assert_close(colors[2], expected, kind="value", name="colour at the camera")
+    grad_sh0, grad_shN, grad_means, grad_position = gradients(leaves, 3)
+    assert not grad_means[2].any() and grad_means[3].any()
+    for name, x in zip(NAMES, (grad_sh0, grad_shN, grad_means, grad_position), strict=True):
+        assert x.isfinite().all(), name
+    assert grad_sh0[2].all() and grad_shN[2].any()
+
+
+def test_moving_the_camera_is_moving_the_surfels_the_other_way(device: torch.device) -> None:
+    _, _, grad_means, grad_position = gradients(make(300, 3, torch.float64, device), 3)
+    assert_close(grad_position, -grad_means.sum(0), kind="gradient", name="position")
+
+
+@pytest.mark.parametrize("stored", range(4))
+def test_gradcheck(stored: int, device: torch.device) -> None:
+    leaves = make(6, stored, torch.float64, device)
+    assert torch.autograd.gradcheck(lambda *x: ops.plain_colors(x[:2], *x[2:], 3), leaves)
+
+
+@pytest.mark.parametrize("wanted", NAMES)
+def test_one_gradient_alone(wanted: str, device: torch.device) -> None:
+    leaves = make(40, 2, torch.float64, device)
+    expected = dict(zip(NAMES, gradients(leaves, 2), strict=True))
+    for name, x in zip(NAMES, leaves, strict=True):
+        x.requires_grad_(name == wanted)
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], 2)
+    colors.backward(signal(colors))
+    for name, x in zip(NAMES, leaves, strict=True):
+        assert torch.equal(x.grad, expected[name]) if name == wanted else x.grad is None, name
+
+
+@pytest.mark.parametrize("stored", range(4))
+def test_no_surfels(stored: int, device: torch.device) -> None:
+    leaves = make(0, stored, torch.float32, device)
+    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    assert colors.shape == (0, 3)
+    colors.sum().backward()
+    for x in leaves:
+        assert x.grad.shape == x.shape and not x.grad.any()
+
+
+def test_strided_input(device: torch.device) -> None:
+    sh0, shN, means, position = make(30, 3, torch.float64, device)
+    strided = torch.cat([sh0, shN], dim=1).detach().requires_grad_()
+    colors = ops.plain_colors((strided[:, :1], strided[:, 1:]), means, position, 3)
+    assert torch.equal(colors, ops.plain_colors((sh0, shN), means, position, 3))
+    colors.backward(signal(colors))
+    grad_sh0, grad_shN, _, _ = gradients([sh0, shN, means, position], 3)
+    assert torch.equal(strided.grad, torch.cat([grad_sh0, grad_shN], dim=1))
+
+
+def test_plain_colors_do_not_depend_on_threads() -> None:
+    leaves = make(1500, 3, torch.float32)
+    before = launch.get_num_threads()
+    results = []
+    for count in (1, 3):
+        launch.set_num_threads(count)
+        results.append([ops.plain_colors(leaves[:2], *leaves[2:], 3), *gradients(leaves, 3)])
+    launch.set_num_threads(before)
+    assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
+
+
+def test_bad_input() -> None:
+    sh0, shN, means, position = make(4, 3)
+    with pytest.raises(ValueError, match=r"^shN: expected shape \(N=4, C - 1=15, 3\), got \(3, 15, 3\)$"):
+        ops.plain_colors((sh0, shN[:3]), means, position, 3)
+    with pytest.raises(ValueError, match=r"^sh0: expected shape \(N=4, 1, 3\), got \(4, 15, 3\)$"):
+        ops.plain_colors((shN, shN), means, position, 3)
