@@ -1,10 +1,14 @@
-"""Cold start: a fresh process with empty kernel caches, as after an install. What a user waits for."""
+"""Cold start: a fresh process with empty kernel caches, as after an install. What a user waits for.
+
+And what `nexwarp warmup` takes, which does the compiling ahead of time: at most 60 s of it are meant to be on CUDA.
+"""
 
 import json
 import os
 import subprocess
 import sys
 import tempfile
+import time
 
 from benchmarks import suite
 from benchmarks.suite import Options
@@ -41,23 +45,40 @@ print(json.dumps(seconds))
 
 
 def run(options: Options) -> list[Measurement]:
-    """Twice: with empty caches, then with what the first process left in them."""
+    """With empty caches, then with what the first process left in them; and warmed up, twice, then with that."""
+    with tempfile.TemporaryDirectory() as cache:
+        results = [m for state in ("empty", "filled") for m in parts(state, cache, options)]
     with tempfile.TemporaryDirectory() as cache:
         return [
-            figure(f"{name}, {state} cache", value, options.device, unit="s", scene="fresh process")
-            for state in ("empty", "filled")
-            for name, value in fresh_process(options.device.type, cache).items()
+            *results,
+            *(warm_up(state, cache, options) for state in ("empty", "filled")),
+            *parts("warmed-up", cache, options),
         ]
 
 
-def fresh_process(device: str, cache: str) -> dict[str, float]:
+def parts(state: str, cache: str, options: Options) -> list[Measurement]:
     """Seconds of each part of PROGRAM with kernel caches in a folder."""
+    line, _ = fresh_process([sys.executable, "-c", PROGRAM, options.device.type], cache)
+    return [
+        figure(f"{name}, {state} cache", value, options.device, unit="s", scene="fresh process")
+        for name, value in json.loads(line).items()
+    ]
+
+
+def warm_up(state: str, cache: str, options: Options) -> Measurement:
+    """Seconds of the whole command, imports too; the note is what it says itself, with the seconds without those."""
+    line, seconds = fresh_process([sys.executable, "-m", "nexwarp", "warmup", "--device", options.device.type], cache)
+    return figure(f"nexwarp warmup, {state} cache", seconds, options.device, unit="s", scene="fresh process", note=line)
+
+
+def fresh_process(command: list[str], cache: str) -> tuple[str, float]:
+    """Run a command with kernel caches in a folder; the last line that it prints, and its seconds."""
     environment = os.environ | {"WARP_CACHE_PATH": f"{cache}/warp", "CUDA_CACHE_PATH": f"{cache}/cuda"}
-    command = [sys.executable, "-c", PROGRAM, device]
+    start = time.perf_counter()
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"the fresh process failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return done.stdout.splitlines()[-1], time.perf_counter() - start
 
 
 if __name__ == "__main__":

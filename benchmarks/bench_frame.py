@@ -26,7 +26,7 @@ def frame(scene: Scene, options: Options) -> list[Measurement]:
 
     @torch.no_grad()
     def render() -> torch.Tensor:
-        return nw.render(scene.surfels, field, scene.camera).image
+        return nw.render(scene.surfels, field, scene.camera, **scene.options).image
 
     return [
         options.time("frame", render, **scene.facts),

@@ -1,7 +1,8 @@
 """gsplat's 2DGS rasterisation on the same surfels, camera and image size, gamma = 1, in the same process.
 
 gsplat is optional: `pip install gsplat==1.5.3`, with a CUDA compiler to build it. Its forward pass does what our
-collection stage does (project, tiles, blending), so the whole calls are compared.
+collection stage does (project, tiles, blending), so the whole calls are compared. It is called as its users call it:
+one camera, RGB of given colours, not packed, without the distortion loss.
 """
 
 import sys
@@ -52,11 +53,15 @@ def gsplat_2dgs(scene: Scene, options: Options, gsplat) -> list[Measurement]:
 
 
 def gsplat_call(g: Geometry, gsplat) -> tuple[Rasterize, list[torch.Tensor]]:
-    """A function that gives gsplat's (1, H, W, 3) colours and (1, H, W, 1) alphas, and what it differentiates."""
+    """A function that gives gsplat's (1, H, W, 3) colours and (1, H, W, 1) alphas, and what it differentiates.
+
+    Colours that are not spherical harmonics must be there for every camera: its check of (N, 3) ones passes, but the
+    rasterisation then fails.
+    """
     means, quats, scales, opacities, _ = (x.detach() for x in g.shape)
     # A surfel has no third scale; 2DGS ignores it.
     scales = torch.cat([scales, torch.ones_like(scales[:, :1])], dim=1)
-    leaves = [x.clone().requires_grad_() for x in (means, quats, scales, opacities, g.colors.detach())]
+    leaves = [x.clone().requires_grad_() for x in (means, quats, scales, opacities, g.colors.detach()[None])]
     p = g.pinhole
     K = torch.tensor([[p.fx, 0.0, p.cx], [0.0, p.fy, p.cy], [0.0, 0.0, 1.0]], device=means.device)
     call = {"viewmats": g.viewmat[None], "Ks": K[None], "width": p.width, "height": p.height, "near_plane": p.near}

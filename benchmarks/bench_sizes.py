@@ -1,6 +1,11 @@
-"""Time and memory against the number of surfels, of pixels, and K: a whole frame, and a frame with its backward."""
+"""Time and memory against surfels, pixels and K, one changed at a time: a whole frame, and one with its backward.
+
+Every row tells what its step from the next smaller size costs; one that costs more than its share is a cliff.
+"""
 
 import sys
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
@@ -8,56 +13,153 @@ import nexwarp as nw
 from benchmarks import suite
 from benchmarks.scenes import Scene, cloud, random_like, texture
 from benchmarks.suite import Options
-from benchmarks.timing import Measurement
+from benchmarks.timing import Measurement, figure
 
-# (surfels, megapixels, K), one of them changed at a time.
-CUDA = {
-    "base": (400_000, 1.66, 2),
-    "surfels": (10_000, 40_000, 100_000, 1_000_000, 4_000_000),
-    "megapixels": (0.25, 0.5, 1.0, 2.0, 4.0, 8.0),
-    "hits": (0, 1, 4, 8),
-}
-CPU = {"base": (10_000, 0.06, 2), "surfels": (2_500, 40_000), "megapixels": (0.03, 0.12), "hits": (0, 4, 8)}
-QUICK = {"base": (500, 0.003, 2), "surfels": (1_000,), "megapixels": (0.006,), "hits": (0,)}
 ASPECT = 1.543
+# A step may cost this much more than its share: medians of short runs vary.
+SLACK = 1.25
+CLIFF = " CLIFF"
+
+
+class Point(NamedTuple):
+    """A size to measure at."""
+
+    surfels: int
+    megapixels: float
+    hits: int
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Sizes to measure at: `base`, and for each of its fields the values that it takes while the others stay.
+
+    Attributes:
+        base: where the sweeps meet.
+        surfels, megapixels, hits: values, with or without that of `base`.
+        table_size: of the texture.
+        limit: a step that would make a frame and its backward longer than this, in seconds, is left out.
+        repeats: how `timing.measure` repeats.
+    """
+
+    base: Point
+    surfels: tuple[int, ...]
+    megapixels: tuple[float, ...]
+    hits: tuple[int, ...]
+    table_size: int
+    limit: float
+    repeats: dict[str, float]
+
+    def along(self, axis: str) -> list[Point]:
+        """Points of one sweep, small to large."""
+        values = {getattr(self.base, axis), *getattr(self, axis)}
+        return [self.base._replace(**{axis: value}) for value in sorted(values)]
+
+
+SURFELS = (10_000, 20_000, 40_000, 100_000, 200_000, 400_000, 1_000_000, 2_000_000, 4_000_000)
+MEGAPIXELS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+HITS = (0, 1, 2, 4, 8)
+CUDA = Sweep(Point(400_000, 2.0, 2), SURFELS, MEGAPIXELS, HITS, 2**20, 2.0, {"seconds": 0.4})
+CPU = Sweep(
+    Point(10_000, 0.0625, 2),
+    SURFELS,
+    (0.03125, 0.0625, 0.125, *MEGAPIXELS),
+    HITS,
+    2**15,
+    3.0,
+    {"seconds": 0.5, "warmup": 1, "least": 3},
+)
+QUICK = Sweep(Point(500, 0.003, 2), (1_000,), (0.006,), (0,), 2**15, 10.0, {})
 
 
 def run(options: Options) -> list[Measurement]:
-    sizes = QUICK if options.quick else CUDA if options.cuda else CPU
-    surfels, megapixels, hits = sizes["base"]
-    points = [sizes["base"]]
-    points += [(n, megapixels, hits) for n in sizes["surfels"]]
-    points += [(surfels, m, hits) for m in sizes["megapixels"]]
-    points += [(surfels, megapixels, k) for k in sizes["hits"]]
-    return [m for point in points for m in at_size(*point, options)]
+    """Sweep one size after the other; the largest memory comes last, since Warp's high-water mark never falls."""
+    sweep = QUICK if options.quick else CUDA if options.cuda else CPU
+    results = [m for axis in ("hits", "megapixels", "surfels") for m in along(axis, sweep, options)]
+    steps = [m for m in results if " for x" in m.note]
+    cliffs = sum(CLIFF in m.note for m in steps)
+    name = f"steps that cost over {SLACK} times their share"
+    return [*results, figure(name, cliffs, options.device, unit="steps", scene="sizes", note=f"of {len(steps)}")]
 
 
-def at_size(surfels: int, megapixels: float, hits: int, options: Options) -> list[Measurement]:
-    height = round((1e6 * megapixels / ASPECT) ** 0.5)
-    scene = cloud(surfels, round(ASPECT * height), height).to(options.device)
-    try:
-        return sized(scene, hits, options)
-    finally:
-        del scene
-        if options.cuda:
-            torch.cuda.empty_cache()
+def along(axis: str, sweep: Sweep, options: Options) -> list[Measurement]:
+    """Measure along one axis as far as the device can take it; the base anew, to compare what was measured together."""
+    found: list[list[Measurement]] = []
+    points = sweep.along(axis)
+    scene = None
+    for i, point in enumerate(points):
+        step = share(axis, points[i - 1], point) if i else None
+        if step and found[-1][-1].median / 1e3 * step > sweep.limit:
+            found[-1][-1] = left_out(found[-1][-1], axis, points[i:], "too slow")
+            break
+        try:
+            scene = scene_at(point, scene, sweep, options)
+            rows = [replace(m, name=f"{m.name}, by {axis}") for m in at_size(scene, point.hits, sweep, options)]
+        except torch.OutOfMemoryError:
+            if not found:
+                raise
+            found[-1][-1] = left_out(found[-1][-1], axis, points[i:], "out of memory")
+            break
+        if found:
+            rows = [replace(m, note=growth(before, m, step)) for before, m in zip(found[-1], rows, strict=True)]
+        found.append(rows)
+    del scene
+    if options.cuda:
+        torch.cuda.empty_cache()
+    return [m for rows in found for m in rows]
 
 
-def sized(scene: Scene, hits: int, options: Options) -> list[Measurement]:
-    field = texture(scene, table_size=2**20 if options.cuda and not options.quick else 2**15)
-    leaves = [*scene.surfels.parameters(), *(field.parameters() if hits else ())]
+def share(axis: str, before: Point, after: Point) -> float | None:
+    """How many times as much work a step is, at most; None from K = 0, which has no texture at all."""
+    return getattr(after, axis) / getattr(before, axis) if getattr(before, axis) else None
 
-    def image() -> torch.Tensor:
-        return nw.render(scene.surfels, field, scene.camera, max_hits=hits).image
 
-    facts = scene.facts
+def growth(before: Measurement, after: Measurement, step: float | None) -> str:
+    """What a step costs in time and memory, against its share of the work."""
+    ratios = {"time": after.median / before.median}
+    if before.peak_mib and after.peak_mib:
+        ratios["memory"] = after.peak_mib / before.peak_mib
+    costs = [
+        f"{name} x{ratio:.2f}" + CLIFF * (step is not None and ratio > SLACK * step) for name, ratio in ratios.items()
+    ]
+    return ", ".join(costs) + (f" for x{step:.2f}" if step else "")
+
+
+def left_out(last: Measurement, axis: str, points: list[Point], reason: str) -> Measurement:
+    """Say in the last row that was measured what was not."""
+    note = f"left out, {reason}: {axis} {', '.join(f'{getattr(point, axis):,}' for point in points)}"
+    return replace(last, note="; ".join(filter(None, (last.note, note))))
+
+
+def scene_at(point: Point, before: Scene | None, sweep: Sweep, options: Options) -> Scene:
+    """Make a cloud and its texture, or see the ones before in an image of another size."""
+    height = round((1e6 * point.megapixels / ASPECT) ** 0.5)
+    width = round(ASPECT * height)
+    if before is None or len(before.surfels) != point.surfels:
+        made = cloud(point.surfels, width, height).to(options.device)
+        return replace(made, texture=texture(made, table_size=sweep.table_size))
+    seen = cloud(1, width, height).to(options.device)
+    return replace(before, name=f"cloud {point.surfels:,} at {width}x{height}", cameras=seen.cameras)
+
+
+def at_size(scene: Scene, hits: int, sweep: Sweep, options: Options) -> list[Measurement]:
+    field = texture(scene) if hits else None
+    leaves = [*scene.surfels.parameters(), *(field.parameters() if field else ())]
+
+    def render() -> nw.Rendering:
+        return nw.render(scene.surfels, field, scene.camera, max_hits=hits)
+
+    facts = scene.facts | sweep.repeats
     facts["scene"] += f", K = {hits}"
     facts["sizes"]["max_hits"] = hits
-    facts["seconds"] = 0.5
     with torch.no_grad():
-        (signal,) = random_like((image(),))
-        forward = options.time("frame", image, **facts)
-    return [forward, options.time("frame + backward", lambda: torch.autograd.grad(image(), leaves, signal), **facts)]
+        out = render()
+        if not out.image.isfinite().all() or out.alpha.mean() < 0.5:
+            raise RuntimeError(f"{facts['scene']}: expected a finite picture of the scene, got something else")
+        (signal,) = random_like((out.image,))
+        del out
+        forward = options.time("frame", lambda: render().image, **facts)
+    both = options.time("frame + backward", lambda: torch.autograd.grad(render().image, leaves, signal), **facts)
+    return [forward, both]
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from benchmarks.timing import ROOT, Measurement, measure
+from nexwarp.checkpoint import MODEL_FILE
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,13 @@ class Options:
         device: where.
         quick: tiny scenes and few repeats: does everything run?
         data: folder with garden_points.npz and the scenes.
+        model: run folder of a trained fox, None to leave that scene out.
     """
 
     device: torch.device
     quick: bool = False
     data: Path = ROOT.parent / "shared" / "data"
+    model: Path | None = None
 
     @property
     def cuda(self) -> bool:
@@ -50,10 +53,13 @@ def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="tiny scenes, few repeats")
     parser.add_argument("--out", type=Path, help="also write one JSON line a measurement to this file")
     parser.add_argument("--data", type=Path, default=Options.data, help="shared data (default: %(default)s)")
+    parser.add_argument("--model", type=Path, metavar="DIR", help="run folder of a trained fox, to be timed too")
     given = parser.parse_args(arguments)
     chosen = given.only.split(",") if given.only else list(stages)
     if unknown := set(chosen) - set(stages):
         parser.error(f"--only: expected some of {', '.join(stages)}, got {', '.join(sorted(unknown))}")
+    if given.model is not None and not (given.model / MODEL_FILE).is_file():
+        parser.error(f"--model: expected a run folder with a {MODEL_FILE}, got {given.model}")
     kinds = _devices(given.device, parser)
     wp.config.log_level = wp.LOG_WARNING
     if given.out is not None:
@@ -65,7 +71,7 @@ def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
             print(f"{name} on {kind} ...", file=sys.stderr, flush=True)
             device = torch.device("cuda", torch.cuda.current_device()) if kind == "cuda" else torch.device(kind)
             try:
-                found = stages[name](Options(device, given.quick, given.data))
+                found = stages[name](Options(device, given.quick, given.data, given.model))
             except Exception:
                 # The other stages' figures must not be lost to this one's trouble.
                 traceback.print_exc()
@@ -76,6 +82,8 @@ def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
                 with given.out.open("a") as file:
                     file.writelines(m.json() + "\n" for m in found)
     print(table(results))
+    if given.model is None:
+        print("the trained fox was left out: name its run folder with --model DIR")
     if failed:
         print(f"FAILED: {', '.join(failed)}")
     return 1 if failed else 0

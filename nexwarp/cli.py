@@ -1,8 +1,9 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `info`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `info`, `warmup`."""
 
 import dataclasses
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp import console as display
+from nexwarp import warmup
 from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
 from nexwarp.config import Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene
@@ -100,8 +102,7 @@ class Train:
         config = self._config(run)
         if self.downscale < 1:
             raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
-        name = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
-        console.print(f"{source.name} on {name}, preset {config.preset}")
+        console.print(f"{source.name} on {_name(device)}, preset {config.preset}")
         scene = source.load()
         size = scene.train[0].camera
         console.print(
@@ -133,8 +134,7 @@ class Train:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
         given = {name: value for name, value in (given | {"seed": self.seed}).items() if value is not None}
-        if self.max_hits is not None and not 0 <= self.max_hits <= MAX_HITS:
-            raise ValueError(f"--max-hits: expected 0 to {MAX_HITS}, got {self.max_hits}")
+        _check_max_hits(self.max_hits)
         if self.resume:
             config = read_run(run)[1]
             for name, value in given.items():
@@ -241,12 +241,57 @@ class Info:
         console.print(display.results_table(rows, str(self.run)))
 
 
+@dataclass
+class Warmup:
+    """Compile ahead of time what train, eval and render need, into Warp's kernel cache."""
+
+    preset: str = "default"
+    """`default` or `paper`, as will be given to train."""
+    max_hits: int | None = None
+    """K, as will be given to train (2)."""
+    device: str | None = None
+    """`cuda` or `cpu`; CUDA where present by default."""
+
+    def __call__(self, console: Console) -> None:
+        """Compile."""
+        start = time.perf_counter()
+        _check_max_hits(self.max_hits)
+        device = pick_device(self.device)
+        config = preset(self.preset)
+        if self.max_hits is not None:
+            config = dataclasses.replace(config, max_hits=self.max_hits)
+        before = warmup.cached_binaries()
+        builds = warmup.needed(config, device)
+        with display.counting(console, "compiling", len(builds) + 1) as done:
+            warmup.compile_all(builds, device, done)
+            listed = warmup.cached_binaries()
+            warmup.rehearse(config, device)
+            done()
+        cached = warmup.cached_binaries()
+        total = len(builds) + len(cached - listed)
+        new = min(len(cached - before), total)  # another process may be compiling too
+        console.print(
+            f"{total} kernels ready on {_name(device)}, preset {config.preset}: {new} compiled, "
+            f"{total - new} found in the cache, {time.perf_counter() - start:.1f} s",
+            soft_wrap=True,
+        )
+
+
 def pass_buffers(out: Rendering) -> dict[str, torch.Tensor]:
     """Name every pass of a rendering, for an OpenEXR file: (H, W), (H, W, 3) float or (H, W) int32 each."""
     parts = {name: getattr(out, name) for name in ("image", "plain", "textured", "alpha")}
     for k in range(out.ids.shape[2]):
         parts |= {f"{name}.{k}": getattr(out, name)[..., k] for name in ("ids", "depths", "weights")}
     return parts
+
+
+def _name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
+
+
+def _check_max_hits(max_hits: int | None) -> None:
+    if max_hits is not None and not 0 <= max_hits <= MAX_HITS:
+        raise ValueError(f"--max-hits: expected 0 to {MAX_HITS}, got {max_hits}")
 
 
 def _train(trainer: Trainer, run: Path, console: Console) -> None:
@@ -341,7 +386,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
     wp.config.log_level = wp.LOG_ERROR
-    commands = {"train": Train, "eval": Eval, "render": Render, "info": Info}
+    commands = {"train": Train, "eval": Eval, "render": Render, "info": Info, "warmup": Warmup}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments
     )

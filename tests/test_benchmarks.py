@@ -2,17 +2,23 @@
 
 import json
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from benchmarks import __main__ as command
-from benchmarks import bench_cpu, bench_peers
-from benchmarks.scenes import Scene, cloud, garden, geometry, outputs, random_like
+from benchmarks import bench_cpu, bench_frame, bench_peers, bench_sizes
+from benchmarks.scenes import Scene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
 from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
-from nexwarp import ops
+from nexwarp import Camera, NeuralTexture, ops
+from nexwarp.checkpoint import Model, save_cameras, save_model
 from nexwarp.ops import Pinhole
 from tests.tolerances import assert_close
 
@@ -115,6 +121,65 @@ def test_command_writes_well_formed_json(tmp_path: Path, capsys: pytest.CaptureF
     assert all(name in shown for name in names)
 
 
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    """What `nexwarp train` leaves behind, as far as the benchmarks need it."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    scene = small_scene()
+    options = {"max_hits": 1, "background": [0.0, 1.0, 0.0], "sh_degree": 2, "low_pass": False, "clamp_texture": True}
+    field = NeuralTexture(levels=4, table_size=2**8, width=16)
+    save_model(folder, Model(scene.surfels, field, options))
+    cameras = {str(i): camera for i, camera in enumerate(scene.cameras)}
+    save_cameras(folder / "cameras.json", {"train": cameras, "test": {}})
+    return folder
+
+
+def test_trained_scene_is_that_of_the_run(run_folder: Path) -> None:
+    scene, made = fox(run_folder), small_scene()
+    assert torch.equal(scene.surfels.means, made.surfels.means)
+    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(scene.cameras, made.cameras, strict=True))
+    assert texture(scene) is scene.texture and scene.texture.config["table_size"] == 2**8
+    assert scene.options["max_hits"] == 1 and scene.options["clamp_texture"]
+    assert "fox" in scene.name and "300 at 43x30" in scene.name
+
+
+def test_trained_scene_takes_part_only_when_it_is_named(run_folder: Path) -> None:
+    without, with_model = (workload(Options(CPU, quick=True, model=model)) for model in (None, run_folder))
+    assert [scene.name for scene in with_model[:-1]] == [scene.name for scene in without]
+    assert "fox" in with_model[-1].name and not any("fox" in scene.name for scene in without)
+
+
+def test_frames_of_the_trained_scene_are_timed_with_its_options(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    render = bench_frame.nw.render
+
+    def note(*args: Any, **options: Any) -> Any:
+        seen.append(options)
+        return render(*args, **options)
+
+    monkeypatch.setattr(bench_frame.nw, "render", note)
+    scene = fox(run_folder)
+    bench_frame.frame(scene, Options(CPU, quick=True))
+    assert seen and all(options == scene.options for options in seen)
+
+
+def test_command_names_the_trained_scene_or_says_that_it_is_absent(
+    run_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = ["--quick", "--device", "cpu", "--only", "tiles"]
+    assert command.main(quick) == 0
+    assert "the trained fox was left out" in capsys.readouterr().out
+    assert command.main([*quick, "--model", str(run_folder)]) == 0
+    shown = capsys.readouterr().out
+    assert "left out" not in shown and "fox, trained, 300 at 43x30" in shown
+    with pytest.raises(SystemExit):
+        command.main([*quick, "--model", str(run_folder.parent)])
+    assert "model.safetensors" in capsys.readouterr().err
+
+
 def test_command_refuses_unknown_stages(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         command.main(["--only", "colect"])
@@ -167,8 +232,87 @@ def test_peer_gets_the_same_scene() -> None:
         "quats": (300, 4),
         "scales": (300, 3),
         "opacities": (300,),
-        "colors": (300, 3),
+        "colors": (1, 300, 3),
         "viewmats": (1, 4, 4),
         "Ks": (1, 3, 3),
     }
     assert all(x.is_leaf and x.requires_grad for x in leaves)
+
+
+# Cost against size
+
+
+def test_sizes_cover_what_they_should() -> None:
+    sweep = bench_sizes.CUDA
+    ends = {axis: [getattr(p, axis) for p in sweep.along(axis)] for axis in ("surfels", "megapixels", "hits")}
+    assert (ends["surfels"][0], ends["surfels"][-1]) == (10_000, 4_000_000)
+    assert (ends["megapixels"][0], ends["megapixels"][-1]) == (0.25, 8.0)
+    assert (ends["hits"][0], ends["hits"][-1]) == (0, 8)
+    for axis in ends:
+        points = sweep.along(axis)
+        assert sweep.base in points
+        assert all((bench_sizes.share(axis, a, b) or 1) <= 2.5 for a, b in pairwise(points)), axis
+
+
+def test_sizes_mark_a_cliff_and_nothing_else() -> None:
+    before = figure("frame", 10.0, CPU, peak_mib=100.0)
+    fair, steep = (figure("frame", t, CPU, peak_mib=200.0) for t in (20.0, 30.0))
+    assert bench_sizes.growth(before, fair, 2.0) == "time x2.00, memory x2.00 for x2.00"
+    assert bench_sizes.growth(before, steep, 2.0) == "time x3.00 CLIFF, memory x2.00 for x2.00"
+    assert "memory x2.00 CLIFF" in bench_sizes.growth(before, fair, 1.5)
+    assert "CLIFF" not in bench_sizes.growth(before, steep, None), "a texture is more than its share of K = 0"
+
+
+def sizes(monkeypatch: pytest.MonkeyPatch, cost: Callable[[SimpleNamespace, int], float]) -> list[Measurement]:
+    """Run the CUDA sweeps over made-up costs in ms."""
+
+    def at_size(scene: SimpleNamespace, hits: int, *_: object) -> list[Measurement]:
+        return [figure(name, cost(scene, hits), CPU, **scene.facts) for name in ("frame", "frame + backward")]
+
+    monkeypatch.setattr(bench_sizes, "CPU", bench_sizes.CUDA)
+    monkeypatch.setattr(bench_sizes, "at_size", at_size)
+
+    def scene_at(point: bench_sizes.Point, *_: object) -> SimpleNamespace:
+        return SimpleNamespace(point=point, facts={"scene": str(point), "sizes": {"surfels": point.surfels}})
+
+    monkeypatch.setattr(bench_sizes, "scene_at", scene_at)
+    return bench_sizes.run(Options(CPU))
+
+
+def test_sizes_count_cliffs_and_leave_out_what_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    *rows, cliffs = sizes(monkeypatch, lambda scene, hits: scene.point.surfels / 1000)  # 4M: 4 s, over the limit
+    assert cliffs.median == 0 and not any(bench_sizes.CLIFF in m.note for m in rows)
+    by_surfels = [m for m in rows if m.name == "frame + backward, by surfels"]
+    assert by_surfels[-1].sizes["surfels"] == 2_000_000
+    assert "left out, too slow: surfels 4,000,000" in by_surfels[-1].note
+
+    *rows, cliffs = sizes(monkeypatch, lambda scene, hits: 1.0 if scene.point.megapixels < 4.0 else 100.0)
+    marked = [m for m in rows if bench_sizes.CLIFF in m.note]
+    assert cliffs.median == len(marked) == 2 and all("megapixels=4.0" in m.scene for m in marked)
+
+
+def test_sizes_leave_out_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def cost(scene: SimpleNamespace, hits: int) -> float:
+        if scene.point.surfels > 1_000_000:
+            raise torch.OutOfMemoryError("full")
+        return 1.0
+
+    rows = [m for m in sizes(monkeypatch, cost) if m.name == "frame + backward, by surfels"]
+    assert rows[-1].sizes["surfels"] == 1_000_000
+    assert "left out, out of memory: surfels 2,000,000, 4,000,000" in rows[-1].note
+
+
+def test_sizes_measure_a_scene_that_is_seen() -> None:
+    rows = bench_sizes.run(Options(CPU, quick=True))
+    assert {m.name.rpartition(" by ")[2] for m in rows[:-1]} == {"surfels", "megapixels", "hits"}
+    assert {m.sizes["max_hits"] for m in rows[:-1]} == {0, 2}
+    empty = replace(small_scene(), cameras=(away(small_scene().camera),))
+    with pytest.raises(RuntimeError, match="finite picture"):
+        bench_sizes.at_size(empty, 0, bench_sizes.QUICK, Options(CPU, quick=True))
+
+
+def away(camera: Camera) -> Camera:
+    """The same camera, far outside and looking away."""
+    viewmat = camera.viewmat.clone()
+    viewmat[2, 3] = -1000.0
+    return Camera(viewmat, camera.K, camera.width, camera.height)

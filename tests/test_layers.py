@@ -17,7 +17,7 @@ LAYERS = [
     {"config"},
     {"initial"},
     {"trainer"},
-    {"runs", "console"},
+    {"runs", "console", "warmup"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
