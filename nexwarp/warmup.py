@@ -50,7 +50,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         low_passes=(config.low_pass,),
         ssim_lanes=(LANES if cpu else 1,),
     )
-    walks = walk_kernels(wp.float32, TILE_SIZE, (config.max_hits,), low_passes=(config.low_pass,))
+    walks = walk_kernels(wp.float32, TILE_SIZE, (config.max_hits,), low_passes=(config.low_pass,), cpu=cpu)
     return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 
 

@@ -11,6 +11,7 @@ from nexwarp.kernels.collect import (
     reduce_rows_kernel,
     splat_error_kernel,
 )
+from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.photometric import photometric_kernels
@@ -33,10 +34,11 @@ def all_kernels(
     storage: type = wp.float16,
     tile_size: int = 16,
     max_hits: Sequence[int] = range(MAX_HITS + 1),
+    cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
-    """Yield each kernel for a scalar type, a texture storage type, a tile size and some K."""
+    """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     yield from thread_kernels(real, storage, tile_size)
-    yield from walk_kernels(real, tile_size, max_hits)
+    yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
 
 
 def thread_kernels(
@@ -75,12 +77,19 @@ def thread_kernels(
 
 
 def walk_kernels(
-    real: type, tile_size: int, max_hits: Sequence[int], *, low_passes: Sequence[bool] = (False, True)
+    real: type,
+    tile_size: int,
+    max_hits: Sequence[int],
+    *,
+    low_passes: Sequence[bool] = (False, True),
+    cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
-    """Yield the kernels of warps that walk along a tile's list, in blocks of `collect.BLOCK_DIM`."""
+    """Yield the kernels that walk along a tile's list, on CUDA in blocks of `collect.BLOCK_DIM`."""
+    forward = collect_rows_kernel if cpu else collect_kernel
+    backward = collect_rows_backward_kernel if cpu else collect_backward_kernel
     for low_pass in low_passes:
         yield splat_error_kernel(real, low_pass, tile_size)
         for hits in max_hits:
-            yield collect_kernel(real, hits, low_pass, tile_size)
+            yield forward(real, hits, low_pass, tile_size)
             for watch in (False, True):
-                yield collect_backward_kernel(real, hits, low_pass, tile_size, watch)
+                yield backward(real, hits, low_pass, tile_size, watch)

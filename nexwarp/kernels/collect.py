@@ -67,8 +67,7 @@ def surfel_at(k: wp.int32, listed: wp.array(dtype=wp.int32), order: wp.array(dty
 def view_functions(real: type, tile_size: int) -> SimpleNamespace:
     """Which pixel a thread has, its ray, and the block of pixels that its warp has."""
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
-    HALF, ONE = t.HALF, t.ONE
+    vec2, vec4, HALF = t.vec2, t.vec4, t.HALF
     # Half of the distances between the outer pixel centres of a block, and a little.
     HALF_WIDTH, HALF_HEIGHT = wp.constant(real(3.51)), wp.constant(real(1.51))
     pixels = tile_size * tile_size
@@ -88,8 +87,8 @@ def view_functions(real: type, tile_size: int) -> SimpleNamespace:
 
     @wp.func
     def ray(x: real, y: real, intrinsics: vec4):
-        """Direction, of z 1, through pixel coordinates."""
-        return vec3((x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], ONE)
+        """Direction through pixel coordinates; its z is 1."""
+        return vec2((x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1])
 
     @wp.func
     def ray_of(xy: wp.vec2i, intrinsics: vec4):
@@ -128,8 +127,8 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     vec, ivec, colors = buffer_types(real, max_hits)
-    v = view_functions(real, tile_size)
-    pixels = v.pixels
+    view = view_functions(real, tile_size)
+    pixels = view.pixels
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     @wp.kernel(
@@ -162,15 +161,15 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = v.pixel_of(thread, tile_columns)
+        xy = view.pixel_of(thread, tile_columns)
         # Lanes outside the image cull along: all lanes of a warp must reach the votes together.
         done = int(0)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             done = 1
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = v.ray_of(xy, intrinsics)
-        middle = v.block_of(xy, intrinsics)
-        half = v.half_block(intrinsics)
+        d = view.ray_of(xy, intrinsics)
+        middle = view.block_of(xy, intrinsics)
+        half = view.half_block(intrinsics)
         transmittance = real(1.0)
         color = vec3()
         buffer_ids = ivec()
@@ -218,24 +217,24 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                     rb = load(records, i, 1)
                     rn = load(records, i, 2)
                     rc = load(records, i, 3)
-                    uvt = h.plane(ra, rb, rn, rc[3], d)
-                    hit = vec2()
+                    u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                    alpha = real(0.0)
                     # On a GPU some lane nearly always needs the exponentials.
-                    if width > 1 or not h.far_outside(uvt, limits[i]):
+                    if width > 1 or not h.far_outside(u, v, limits[i]):
                         center = vec3()
                         if wp.static(low_pass):
                             center = centers[i]
-                        hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
-                    if hit[0] >= ALPHA_MIN and hit[1] > near:
-                        weight = hit[0] * transmittance
-                        transmittance = transmittance * (ONE - hit[0])
+                        alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
+                    if alpha >= ALPHA_MIN and depth > near:
+                        weight = alpha * transmittance
+                        transmittance = transmittance * (ONE - alpha)
                         stop = base + next_lane + 1
                         # Insert into the buffer before the first lighter hit, and move that and all behind it down by
                         # one, so that of equal ones the nearer stays; what falls out is blended as plain.
                         displaced = int(0)
                         out_id = int(i)
                         out_weight = real(weight)
-                        out_depth = real(hit[1])
+                        out_depth = real(depth)
                         out_color = vec3(rc[0], rc[1], rc[2])
                         for j in range(wp.static(max_hits)):
                             if displaced == 1 or out_weight > buffer_weights[j]:
@@ -283,8 +282,8 @@ def collect_backward_kernel(
     load = load_function(4, real)
     hit_dot = h.hit_dot
     vec, ivec, _ = buffer_types(real, max_hits)
-    v = view_functions(real, tile_size)
-    pixels = v.pixels
+    view = view_functions(real, tile_size)
+    pixels = view.pixels
     sum1, sum3, add_record = lane_sum(real), lane_sum(vec3), record_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
@@ -326,16 +325,16 @@ def collect_backward_kernel(
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = v.pixel_of(thread, tile_columns)
+        xy = view.pixel_of(thread, tile_columns)
         # Lanes outside the image walk along with nothing to give: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = v.ray_of(xy, intrinsics)
-        middle = v.block_of(xy, intrinsics)
-        half = v.half_block(intrinsics)
+        d = view.ray_of(xy, intrinsics)
+        middle = view.block_of(xy, intrinsics)
+        half = view.half_block(intrinsics)
         gn = grad_plain[p]
         ga = grad_alphas[p]
         rest = wp.dot(gn, plain[p]) + ga * alphas[p]
@@ -391,14 +390,13 @@ def collect_backward_kernel(
                 center = vec3()
                 if wp.static(low_pass):
                     center = centers[i]
-                uvt = h.plane(ra, rb, rn, rc[3], d)
-                hit = vec2()
+                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                alpha = real(0.0)
                 # Straight on, so that the compiler can use the exponentials again for the derivative.
-                if width > 1 or not h.far_outside(uvt, limits[i]):
-                    hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
-                alpha = ZERO
-                if k < stop and hit[0] >= ALPHA_MIN and hit[1] > near:
-                    alpha = hit[0]
+                if width > 1 or not h.far_outside(u, v, limits[i]):
+                    alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
+                if not (k < stop and alpha >= ALPHA_MIN and depth > near):
+                    alpha = ZERO
                 if any_lane(wp.where(alpha > ZERO, 1, 0)) != 0:
                     g0 = vec4()
                     g1 = vec4()
@@ -423,8 +421,8 @@ def collect_backward_kernel(
                         rest -= q * weight
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
                         transmittance = transmittance * (ONE - alpha)
-                        g0, g1, g2, gm, gc, _d, _f, _n, _a, _t = wp.grad(hit_dot)(
-                            ra, rb, rn, rc[3], center, d, focal, near, grad_alpha, gt
+                        g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
+                            ra, rb, rn, rc[3], center, d[0], d[1], focal, near, grad_alpha, gt
                         )
                         g3[3] = gm
                     row = int(i)
@@ -451,8 +449,8 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
-    v = view_functions(real, tile_size)
-    pixels = v.pixels
+    view = view_functions(real, tile_size)
+    pixels = view.pixels
     sum1 = lane_sum(real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
@@ -483,13 +481,13 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     ):
         thread = first + wp.tid()
         tile = thread // pixels
-        xy = v.pixel_of(thread, tile_columns)
+        xy = view.pixel_of(thread, tile_columns)
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = v.ray_of(xy, intrinsics)
+        d = view.ray_of(xy, intrinsics)
         error = errors[p]
         transmittance = real(1.0)
         me = lane()
@@ -509,12 +507,12 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
             center = vec3()
             if wp.static(low_pass):
                 center = centers[i]
-            uvt = h.plane(ra, rb, rn, rc[3], d)
-            alpha = ZERO
-            if live == 1 and not h.far_outside(uvt, limits[i]):
-                hit = h.kernel(uvt, ra, rb, rn, center, d, focal, near)
-                if hit[0] >= ALPHA_MIN and hit[1] > near:
-                    alpha = hit[0]
+            u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+            alpha = real(0.0)
+            if live == 1 and not h.far_outside(u, v, limits[i]):
+                alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
+            if not (alpha >= ALPHA_MIN and depth > near):
+                alpha = ZERO
             share = alpha * transmittance * error
             transmittance = transmittance * (ONE - alpha)
             counts = int(0)

@@ -16,10 +16,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.simd import lane_functions
 from nexwarp.kernels.types import types
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
 BLOCK_SLACK = 1e-6
+# Bounds for SIMD, where a lane without a hit is computed too: far beyond what a hit can have.
+LARGEST_SQUARE = 1e30
+LEAST_COSINE = 1e-18
 
 
 @functools.cache
@@ -74,36 +78,58 @@ def frame_functions(real: type) -> SimpleNamespace:
 
 
 @functools.cache
-def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
-    """The hit of a ray on a surfel (paper Eq. 3), and its contraction for `wp.grad`."""
+def hit_functions(real: type, low_pass: bool, lanes: int = 1) -> SimpleNamespace:
+    """The hit of a ray on a surfel (paper Eq. 3), and its contraction for `wp.grad`.
+
+    Rays have directions (dx, dy, 1). With `lanes` of them at once (see `simd`), dx and what follows from it are
+    vectors, dy and the surfel are the same for all, and the contraction is the sum over the lanes.
+
+    The contraction calls copies of the functions: `wp.grad` finds no derivative, and silently takes 0, of a function
+    two calls down that the kernel has already used for its value.
+    """
+    values = _hit_functions(real, low_pass, lanes, lane_functions(real, lanes))
+    values.hit_dot = _hit_functions(real, low_pass, lanes, lane_functions(real, lanes, for_gradients=True)).hit_dot
+    return values
+
+
+def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -> SimpleNamespace:
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
-    ALPHA_MAX, TINY, ZERO, HALF, ONE, TWO = t.ALPHA_MAX, t.TINY, t.ZERO, t.HALF, t.ONE, t.TWO
+    ZERO, HALF, ONE, TWO = t.ZERO, t.HALF, t.ONE, t.TWO
+    lane = f.lane
+    splat, scaled, times, over, inner = f.splat, f.scaled, f.times, f.over, f.inner
+    power_of_e, logarithm, below, pick = f.power_of_e, f.logarithm, f.below, f.pick
     SLACK = wp.constant(real(BLOCK_SLACK))
+    ALPHA_MAX, TINY = t.ALPHA_MAX, t.TINY
+    LARGE, LEAST = wp.constant(real(LARGEST_SQUARE)), wp.constant(real(LEAST_COSINE))
 
     @wp.func
-    def plane(a: vec4, b: vec4, n: vec4, m: real, d: vec3):
-        """(u, v, t) where the ray along d meets the surfel's plane."""
-        inverse = ONE / (n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
-        u = (a[0] * d[0] + a[1] * d[1] + a[2] * d[2]) * inverse
-        v = (b[0] * d[0] + b[1] * d[1] + b[2] * d[2]) * inverse
-        return vec3(u, v, m * inverse)
+    def plane(a: vec4, b: vec4, n: vec4, m: real, dx: lane, dy: real):
+        """(u, v, t) where the rays meet the surfel's plane."""
+        cosine = scaled(n[0], dx) + splat(n[1] * dy + n[2])
+        if wp.static(lanes > 1):
+            # All lanes are differentiated, those without a hit by 0: which must not meet an infinity.
+            cosine = pick(below(times(cosine, cosine), splat(LEAST * LEAST)), splat(LEAST), cosine)
+        inverse = over(splat(ONE), cosine)
+        u = times(scaled(a[0], dx) + splat(a[1] * dy + a[2]), inverse)
+        v = times(scaled(b[0], dx) + splat(b[1] * dy + b[2]), inverse)
+        return u, v, scaled(m, inverse)
 
     @wp.func
-    def far_outside(uvt: vec3, limit: real):
+    def far_outside(u: real, v: real, limit: real):
         """True only where alpha is certainly below 1/255: spares the exponentials.
 
         Beyond 1, |u|^(2g) is at least u^2; `limit` is what the exponent of a hit cannot exceed.
         """
         if wp.static(low_pass):
             return False
-        u2 = uvt[0] * uvt[0]
-        v2 = uvt[1] * uvt[1]
+        u2 = u * u
+        v2 = v * v
         low = wp.where(u2 > ONE, u2, ZERO) + wp.where(v2 > ONE, v2, ZERO)
         return low > limit
 
     @wp.func
-    def beside(side: vec4, n: vec4, facing: real, reach: real, d: vec3, half: vec2):
+    def beside(side: vec4, n: vec4, facing: real, reach: real, d: vec2, half: vec2):
         """Whether all rays of a block, d +- half, meet the plane where |coordinate| > reach, `side` being a or b.
 
         Where the hit lies before the camera, facing * n . d > 0, so that side . d <= reach * facing * n . d is linear
@@ -124,9 +150,9 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
 
     @wp.func
     def misses_block(
-        a: vec4, b: vec4, n: vec4, m: real, reach: vec2, limit: real, center: vec3, d: vec3, half: vec2, focal: vec2
+        a: vec4, b: vec4, n: vec4, m: real, reach: vec2, limit: real, center: vec3, d: vec2, half: vec2, focal: vec2
     ):
-        """Whether no ray of a block of pixels, d +- half, can hit; d[2] = 1. Only culls: conservative."""
+        """Whether no ray of a block of pixels, d +- half, can hit. Only culls: conservative."""
         facing = wp.where(m < ZERO, -ONE, ONE)
         out = beside(a, n, facing, reach[0], d, half) or beside(b, n, facing, reach[1], d, half)
         if wp.static(low_pass):
@@ -139,22 +165,33 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
         return out
 
     @wp.func
-    def kernel(uvt: vec3, a: vec4, b: vec4, n: vec4, center: vec3, d: vec3, focal: vec2, near: real):
+    def power(x: lane, gamma: real):
+        """|x|^(2 gamma)."""
+        square = times(x, x)
+        square = pick(below(square, splat(TINY)), splat(TINY), square)
+        if wp.static(lanes > 1):
+            square = pick(below(splat(LARGE), square), splat(LARGE), square)
+        return power_of_e(scaled(gamma, logarithm(square)))
+
+    @wp.func
+    def kernel(
+        u: lane, v: lane, t: lane, a: vec4, b: vec4, n: vec4, center: vec3, dx: lane, dy: real, focal: vec2, near: real
+    ):
         """(alpha, t): the generalised Gaussian, its low-pass where asked for, and the depth of the hit."""
-        u2 = wp.max(uvt[0] * uvt[0], TINY)
-        v2 = wp.max(uvt[1] * uvt[1], TINY)
-        exponent = wp.exp(b[3] * wp.log(u2)) + wp.exp(n[3] * wp.log(v2))
-        depth = uvt[2]
+        exponent = power(u, b[3]) + power(v, n[3])
+        depth = t
         if wp.static(low_pass):
             # 2DGS's object-space low-pass: a screen-space Gaussian of variance 1/2 pixel^2 around the projected centre.
             if center[2] > near:
-                x = focal[0] * (d[0] - center[0] / center[2])
-                y = focal[1] * (d[1] - center[1] / center[2])
-                screen = TWO * (x * x + y * y)
-                if screen < exponent or not (exponent >= real(0.0)):
-                    exponent = screen
-                    depth = center[2]
-        return vec2(wp.min(a[3] * wp.exp(-HALF * exponent), ALPHA_MAX), depth)
+                x = scaled(focal[0], dx - splat(center[0] / center[2]))
+                y = focal[1] * (dy - center[1] / center[2])
+                screen = scaled(TWO, times(x, x)) + splat(TWO * y * y)
+                # Also where the exponent is not a number.
+                inside = below(exponent, screen)
+                exponent = pick(inside, exponent, screen)
+                depth = pick(inside, depth, splat(center[2]))
+        alpha = scaled(a[3], power_of_e(scaled(-HALF, exponent)))
+        return pick(below(splat(ALPHA_MAX), alpha), splat(ALPHA_MAX), alpha), depth
 
     @wp.func
     def hit_dot(
@@ -163,15 +200,17 @@ def hit_functions(real: type, low_pass: bool) -> SimpleNamespace:
         n: vec4,
         m: real,
         center: vec3,
-        d: vec3,
+        dx: lane,
+        dy: real,
         focal: vec2,
         near: real,
-        grad_alpha: real,
-        grad_depth: real,
+        grad_alpha: lane,
+        grad_depth: lane,
     ):
         """grad_alpha * alpha + grad_depth * t: wp.grad of a scalar contraction is the vector-Jacobian product."""
-        hit = kernel(plane(a, b, n, m, d), a, b, n, center, d, focal, near)
-        return grad_alpha * hit[0] + grad_depth * hit[1]
+        u, v, t = plane(a, b, n, m, dx, dy)
+        alpha, depth = kernel(u, v, t, a, b, n, center, dx, dy, focal, near)
+        return inner(grad_alpha, alpha) + inner(grad_depth, depth)
 
     return SimpleNamespace(
         plane=plane, far_outside=far_outside, misses_block=misses_block, kernel=kernel, hit_dot=hit_dot

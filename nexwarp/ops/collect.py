@@ -14,6 +14,7 @@ from nexwarp.kernels.collect import (
     reduce_rows_kernel,
     splat_error_kernel,
 )
+from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel, row_lanes
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.ops._interop import array, launch, real_of
 from nexwarp.ops.checks import check_tensors
@@ -110,17 +111,23 @@ def splat_error(
     errors = errors.detach().to(records.dtype).contiguous()
     inputs += [array(rows, wp.int32), array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
-    launch(records, kernel, _threads(tiles), inputs, [array(sums, real)], **_options(tiles))
+    _walk(records, kernel, tiles, inputs, [array(sums, real)])
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
 
 
-def _threads(tiles: Tiles) -> int:
-    return (len(tiles.tile_offsets) - 1) * tiles.tile_size**2
+def _walk(
+    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Any], outputs: list[Any], lanes: int = 1
+) -> None:
+    """Launch a kernel over the pixels of all tiles, `lanes` of them a thread."""
+    threads = tiles.tile_size**2 // lanes
+    # All pixels of a tile write to its entries, so one CPU thread must walk them all.
+    options = {"block_dim": BLOCK_DIM, "align": threads}
+    launch(like, kernel, (len(tiles.tile_offsets) - 1) * threads, inputs, outputs, **options)
 
 
-def _options(tiles: Tiles) -> dict[str, int]:
-    """Launch options: all pixels of a tile write to its entries, so one CPU thread must walk them all."""
-    return {"block_dim": BLOCK_DIM, "align": tiles.tile_size**2}
+def _rows_a_thread(like: torch.Tensor) -> bool:
+    """Whether a thread walks with a row of pixels, as pays on a CPU, or with one pixel."""
+    return like.device.type == "cpu"
 
 
 def _inputs(
@@ -189,9 +196,12 @@ class _Collect(torch.autograd.Function):
             array(alphas.view(-1), real),
             array(stops.view(-1), wp.int32),
         ]
-        kernel = collect_kernel(real, max_hits, low_pass, tiles.tile_size)
         inputs = [*_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
-        launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
+        if _rows_a_thread(records):
+            kernel = collect_rows_kernel(real, max_hits, low_pass, tiles.tile_size)
+            _walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
+        else:
+            _walk(records, collect_kernel(real, max_hits, low_pass, tiles.tile_size), tiles, inputs, outputs)
         ctx.save_for_backward(records, centers, limits, plain, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, watch)
@@ -238,8 +248,11 @@ class _Collect(torch.autograd.Function):
         ]
         error_rows = None if watch.errors is None else records.new_zeros(count)
         outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
-        kernel = collect_backward_kernel(real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
-        launch(records, kernel, _threads(tiles), inputs, outputs, **_options(tiles))
+        variant = (real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
+        if _rows_a_thread(records):
+            _walk(records, collect_rows_backward_kernel(*variant), tiles, inputs, outputs, row_lanes(tiles.tile_size))
+        else:
+            _walk(records, collect_backward_kernel(*variant), tiles, inputs, outputs)
         if error_rows is not None:
             watch.sums = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
         grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)

@@ -1,0 +1,340 @@
+"""Collection pass for CPUs: a thread walks with a row of pixels of a tile, whose lanes are those of SIMD registers.
+
+The same as `collect`, line by line, with vectors for what pixels differ in and masks for which of them something holds;
+a test compares the two. What misses the whole row is culled before any of it.
+"""
+
+import functools
+
+import warp as wp
+
+from nexwarp.kernels.collect import overflowed, surfel_at, walk
+from nexwarp.kernels.simd import lane_functions
+from nexwarp.kernels.surfel import hit_functions
+from nexwarp.kernels.types import types
+
+
+def row_lanes(tile_size: int) -> int:
+    """Pixels that a thread takes: as many as AVX-512 has lanes for float32, where tiles are that wide."""
+    return 16 if tile_size % 16 == 0 else 8
+
+
+@functools.cache
+def row_function(tile_size: int) -> wp.Function:
+    """Make the function that gives the first pixel, (column, row), of a thread's row."""
+    lanes = row_lanes(tile_size)
+    rows = tile_size * tile_size // lanes
+    across = tile_size // lanes
+
+    @wp.func
+    def row_of(thread: int, tile_columns: int):
+        tile = thread // rows
+        local = thread % rows
+        return wp.vec2i(
+            (tile % tile_columns) * tile_size + (local % across) * lanes,
+            (tile // tile_columns) * tile_size + local // across,
+        )
+
+    return row_of
+
+
+@functools.cache
+def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
+    """Make the forward kernel."""
+    t = types(real)
+    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    lanes = row_lanes(tile_size)
+    h = hit_functions(real, low_pass, lanes)
+    f = lane_functions(real, lanes)
+    lane, word, integer = f.lane, f.word, f.integer
+    slots = max(max_hits, 1)
+    lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
+    words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
+    row_of = row_function(tile_size)
+    rows = tile_size * tile_size // lanes
+    ALPHA_MIN, TRANSMITTANCE_MIN, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.HALF, t.ONE
+    # Half of the distance between the outer pixel centres, and a little.
+    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+    )
+    def collect_rows(
+        first: wp.int32,
+        records: wp.array2d(dtype=vec4),
+        centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
+        surfel_ids: wp.array(dtype=wp.int32),
+        tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        size: wp.vec2i,
+        tile_columns: wp.int32,
+        intrinsics: vec4,
+        near: real,
+        reaches: wp.array(dtype=vec2),
+        # outputs
+        plain: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+    ):
+        thread = first + wp.tid()
+        xy = row_of(thread, tile_columns)
+        if xy[0] >= size[0] or xy[1] >= size[1]:
+            return
+        focal = vec2(intrinsics[0], intrinsics[1])
+        dx = lane()
+        alive = word()
+        for l in range(wp.static(lanes)):
+            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / focal[0]
+            if xy[0] + l < size[0]:
+                alive[l] = integer(-1)
+        y = (real(float(xy[1])) + HALF - intrinsics[3]) / focal[1]
+        middle = vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / focal[0], y)
+        half = vec2(HALF_ROW / focal[0], SLIVER / focal[1])
+        one = lane(ONE)
+        transmittance = lane(ONE)
+        red = lane()
+        green = lane()
+        blue = lane()
+        buffer_ids = words_by_slot(integer(-1))
+        buffer_weights = lanes_by_slot()
+        buffer_depths = lanes_by_slot()
+        buffer_red = lanes_by_slot()
+        buffer_green = lanes_by_slot()
+        buffer_blue = lanes_by_slot()
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // rows, tile_offsets, ends, overflow)
+        stop = word(integer(bounds[0]))
+        for k in range(bounds[0], bounds[1]):
+            i = surfel_at(k, surfel_ids, order, overflow)
+            ra = records[i, 0]
+            rb = records[i, 1]
+            rn = records[i, 2]
+            rc = records[i, 3]
+            center = vec3()
+            if wp.static(low_pass):
+                center = centers[i]
+            if h.misses_block(ra, rb, rn, rc[3], reaches[i], limits[i], center, middle, half, focal):
+                continue
+            u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
+            alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
+            seen = f.both(f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False)), alive)
+            if not f.any_of(seen):
+                continue
+            alpha = f.pick(seen, alpha, lane())
+            out_weight = wp.cw_mul(alpha, transmittance)
+            transmittance = wp.cw_mul(transmittance, one - alpha)
+            stop = f.pick_words(seen, word(integer(k + 1)), stop)
+            # Pixels without a hit insert the weight 0, which displaces nothing and adds nothing.
+            displaced = word()
+            out_id = word(integer(i))
+            out_depth = depth
+            out_red = lane(rc[0])
+            out_green = lane(rc[1])
+            out_blue = lane(rc[2])
+            for j in range(wp.static(max_hits)):
+                w_ = buffer_weights[j]
+                displaced = f.either(displaced, f.below(w_, out_weight))
+                i_ = buffer_ids[j]
+                d_ = buffer_depths[j]
+                r_ = buffer_red[j]
+                g_ = buffer_green[j]
+                b_ = buffer_blue[j]
+                buffer_weights[j] = f.pick(displaced, out_weight, w_)
+                buffer_ids[j] = f.pick_words(displaced, out_id, i_)
+                buffer_depths[j] = f.pick(displaced, out_depth, d_)
+                buffer_red[j] = f.pick(displaced, out_red, r_)
+                buffer_green[j] = f.pick(displaced, out_green, g_)
+                buffer_blue[j] = f.pick(displaced, out_blue, b_)
+                out_weight = f.pick(displaced, w_, out_weight)
+                out_id = f.pick_words(displaced, i_, out_id)
+                out_depth = f.pick(displaced, d_, out_depth)
+                out_red = f.pick(displaced, r_, out_red)
+                out_green = f.pick(displaced, g_, out_green)
+                out_blue = f.pick(displaced, b_, out_blue)
+            red += wp.cw_mul(out_red, out_weight)
+            green += wp.cw_mul(out_green, out_weight)
+            blue += wp.cw_mul(out_blue, out_weight)
+            alive = f.both(alive, f.above(transmittance, lane(TRANSMITTANCE_MIN), True))
+            if not f.any_of(alive):
+                break
+        for l in range(wp.static(lanes)):
+            if xy[0] + l < size[0]:
+                p = xy[1] * size[0] + xy[0] + l
+                plain[p] = vec3(red[l], green[l], blue[l])
+                for j in range(wp.static(max_hits)):
+                    ids[p, j] = wp.int32(buffer_ids[j, l])
+                    depths[p, j] = buffer_depths[j, l]
+                    weights[p, j] = buffer_weights[j, l]
+                alphas[p] = ONE - transmittance[l]
+                stops[p] = wp.int32(stop[l])
+
+    return collect_rows
+
+
+@functools.cache
+def collect_rows_backward_kernel(
+    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False
+) -> wp.Kernel:
+    """Make the backward kernel; with `watch` it also adds up weight * error a row of gradients."""
+    t = types(real)
+    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    lanes = row_lanes(tile_size)
+    h = hit_functions(real, low_pass, lanes)
+    hit_dot = h.hit_dot
+    f = lane_functions(real, lanes)
+    lane, word, integer, inner = f.lane, f.word, f.integer, f.inner
+    slots_ = max(max_hits, 1)
+    lanes_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=real)
+    words_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=integer)
+    row_of = row_function(tile_size)
+    rows_a_tile = tile_size * tile_size // lanes
+    ALPHA_MIN, HALF, ONE = t.ALPHA_MIN, t.HALF, t.ONE
+    # Half of the distance between the outer pixel centres, and a little.
+    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+    )
+    def collect_rows_backward(
+        first: wp.int32,
+        records: wp.array2d(dtype=vec4),
+        centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
+        surfel_ids: wp.array(dtype=wp.int32),
+        tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        size: wp.vec2i,
+        tile_columns: wp.int32,
+        intrinsics: vec4,
+        near: real,
+        reaches: wp.array(dtype=vec2),
+        rows: wp.array(dtype=wp.int32),
+        plain: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+        grad_plain: wp.array(dtype=vec3),
+        grad_depths: wp.array2d(dtype=real),
+        grad_weights: wp.array2d(dtype=real),
+        grad_alphas: wp.array(dtype=real),
+        errors: wp.array(dtype=real),
+        # outputs
+        grad_records: wp.array2d(dtype=vec4),
+        grad_centers: wp.array(dtype=vec3),
+        error_sums: wp.array(dtype=real),
+    ):
+        thread = first + wp.tid()
+        xy = row_of(thread, tile_columns)
+        if xy[0] >= size[0] or xy[1] >= size[1]:
+            return
+        focal = vec2(intrinsics[0], intrinsics[1])
+        dx = lane()
+        stop = word()
+        last = int(0)
+        grad_red = lane()
+        grad_green = lane()
+        grad_blue = lane()
+        grad_alpha_sum = lane()
+        rest = lane()
+        error = lane()
+        slots = words_by_slot(integer(-1))
+        gw = lanes_by_slot()
+        gd = lanes_by_slot()
+        for l in range(wp.static(lanes)):
+            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / focal[0]
+            if xy[0] + l < size[0]:
+                p = xy[1] * size[0] + xy[0] + l
+                stop[l] = integer(stops[p])
+                last = wp.max(last, stops[p])
+                gn = grad_plain[p]
+                grad_red[l] = gn[0]
+                grad_green[l] = gn[1]
+                grad_blue[l] = gn[2]
+                grad_alpha_sum[l] = grad_alphas[p]
+                total = wp.dot(gn, plain[p]) + grad_alphas[p] * alphas[p]
+                for j in range(wp.static(max_hits)):
+                    slots[j, l] = integer(ids[p, j])
+                    gw[j, l] = grad_weights[p, j]
+                    gd[j, l] = grad_depths[p, j]
+                    total += grad_weights[p, j] * weights[p, j]
+                rest[l] = total
+                if wp.static(watch):
+                    error[l] = errors[p]
+        y = (real(float(xy[1])) + HALF - intrinsics[3]) / focal[1]
+        middle = vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / focal[0], y)
+        half = vec2(HALF_ROW / focal[0], SLIVER / focal[1])
+        one = lane(ONE)
+        transmittance = lane(ONE)
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // rows_a_tile, tile_offsets, ends, overflow)
+        for k in range(bounds[0], wp.min(bounds[1], last)):
+            i = surfel_at(k, surfel_ids, order, overflow)
+            ra = records[i, 0]
+            rb = records[i, 1]
+            rn = records[i, 2]
+            rc = records[i, 3]
+            center = vec3()
+            if wp.static(low_pass):
+                center = centers[i]
+            if h.misses_block(ra, rb, rn, rc[3], reaches[i], limits[i], center, middle, half, focal):
+                continue
+            u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
+            alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
+            seen = f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False))
+            seen = f.both(seen, f.below_words(word(integer(k)), stop))
+            if not f.any_of(seen):
+                continue
+            alpha = f.pick(seen, alpha, lane())
+            weight = wp.cw_mul(alpha, transmittance)
+            q = grad_alpha_sum
+            gt = lane()
+            buffered = word()
+            for j in range(wp.static(max_hits)):
+                same = f.equal_words(slots[j], word(integer(i)))
+                q += f.pick(same, gw[j], lane())
+                gt = f.pick(same, gd[j], gt)
+                buffered = f.either(buffered, same)
+            q += f.pick(buffered, lane(), grad_red * rc[0] + grad_green * rc[1] + grad_blue * rc[2])
+            bare = f.pick(buffered, lane(), weight)
+            rest -= wp.cw_mul(q, weight)
+            grad_alpha = wp.cw_mul(transmittance, q) - wp.cw_div(rest, one - alpha)
+            transmittance = wp.cw_mul(transmittance, one - alpha)
+            # Lanes without a hit are differentiated along, by 0.
+            g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
+                ra,
+                rb,
+                rn,
+                rc[3],
+                center,
+                dx,
+                y,
+                focal,
+                near,
+                f.pick(seen, grad_alpha, lane()),
+                f.pick(seen, gt, lane()),
+            )
+            row = int(i)
+            if k < rows.shape[0]:
+                row = rows[k]
+            wp.atomic_add(grad_records, row, 0, g0)
+            wp.atomic_add(grad_records, row, 1, g1)
+            wp.atomic_add(grad_records, row, 2, g2)
+            colors = vec4(inner(grad_red, bare), inner(grad_green, bare), inner(grad_blue, bare), gm)
+            wp.atomic_add(grad_records, row, 3, colors)
+            if wp.static(low_pass):
+                wp.atomic_add(grad_centers, row, gc)
+            if wp.static(watch):
+                wp.atomic_add(error_sums, row, inner(weight, error))
+
+    return collect_rows_backward
