@@ -34,8 +34,9 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Any:
     if layout is None:
         if len(_layouts) >= _MOST_LAYOUTS:
             _layouts.clear()
-        layout = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-        _layouts[key] = layout
+        owner = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        # Without what it keeps alive.
+        layout = _layouts[key] = type(owner).from_buffer_copy(owner)
     view = type(layout).from_buffer_copy(layout)
     view.data = tensor.data_ptr()
     # The view is a bare pointer: it must keep alive what may be a temporary, like grad.contiguous().
