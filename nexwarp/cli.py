@@ -31,6 +31,7 @@ from nexwarp.runs import (
     METRICS_FILE,
     SceneSource,
     create_run,
+    keep_freed_memory,
     pick_device,
     prepare_run,
     read_metrics,
@@ -109,6 +110,8 @@ class Train:
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
             f"{len(scene.points):,} points"
         )
+        if device.type == "cpu":
+            keep_freed_memory()
         trainer = Trainer(scene, config, device)
         if self.resume:
             trainer.restore(run)

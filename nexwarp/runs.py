@@ -4,8 +4,10 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 `checkpoint/`.
 """
 
+import ctypes
 import json
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,8 @@ CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
 CAMERAS_FILE = "cameras.json"
 DEMO = "demo"
+# Of glibc's mallopt.
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 
 
 @dataclass(frozen=True)
@@ -114,3 +118,18 @@ def pick_device(name: str | None) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device: cuda was asked for, but torch finds no CUDA device; use --device cpu")
     return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep what a CPU training frees: each step takes the same blocks again, page by page from the system.
+
+    A tenth of a step's time. Does nothing where the C library is another one.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    for parameter, value in ((M_MMAP_THRESHOLD, 32 * 2**20), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 64 * 2**20)):
+        mallopt(parameter, value)

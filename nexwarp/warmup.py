@@ -49,6 +49,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         clamps=(config.clamp_texture,) * textured,
         low_passes=(config.low_pass,),
         ssim_lanes=(LANES if cpu else 1,),
+        cpu=cpu,
     )
     walks = walk_kernels(wp.float32, TILE_SIZE, (config.max_hits,), low_passes=(config.low_pass,), cpu=cpu)
     return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]

@@ -14,6 +14,7 @@ from nexwarp.kernels.collect import (
 from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.project import project_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
@@ -37,7 +38,7 @@ def all_kernels(
     cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
-    yield from thread_kernels(real, storage, tile_size)
+    yield from thread_kernels(real, storage, tile_size, cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
 
 
@@ -51,6 +52,7 @@ def thread_kernels(
     clamps: Sequence[bool] = (False, True),
     low_passes: Sequence[bool] = (False, True),
     ssim_lanes: Sequence[int] = (1, LANES),
+    cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
@@ -68,7 +70,7 @@ def thread_kernels(
             colors = textured_colors_kernels(real, storage, degree, clamp)
             yield from (colors.forward, colors.backward)
     for count in features:
-        lookup = hashgrid_kernels(real, storage, count)
+        lookup = (hashgrid_rows_kernels if cpu else hashgrid_kernels)(real, storage, count)
         yield from (lookup.forward, lookup.backward)
     for low_pass in low_passes:
         lists = list_kernels(real, low_pass, tile_size)

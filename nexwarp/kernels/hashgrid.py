@@ -1,12 +1,12 @@
 """Hash-grid lookup (paper Eq. 1 and 2): unbounded, every level hashed, features down-weighted by a pixel's footprint.
 
-Forward one thread a (level, point), backward one thread a point and a run of levels. Features are stored level-major,
+Forward one thread a (level, point), backward one thread a point. Features are stored level-major,
 (levels * features, n): neighbouring threads write neighbouring values, and the MLP's matrix product takes the array as
 it is. A point with depth 0 (an empty hit slot) gets zeros and gives no gradient.
 
 The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may
-be half precision while their gradients are summed in float32. On a CPU a launch is split by level: a level's table
-belongs to one thread, and gradients of points go to a slot a level; on CUDA a thread takes all levels of its point.
+be half precision while their gradients are summed in float32. The backward kernel adds to the table by atomics; a CPU
+has none: see `hashgrid_rows`.
 """
 
 import functools
@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.loads import load_function
+from nexwarp.kernels.simd import lane_functions
 from nexwarp.kernels.types import types
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
@@ -90,6 +91,85 @@ def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
 
 
 @functools.cache
+def interpolation_functions(real: type, features: int, lanes: int = 1) -> SimpleNamespace:
+    """Interpolation in a cell, and its contraction for `wp.grad`, for one point or for `lanes` of them (see `simd`).
+
+    Returns:
+        Types `corners` (8 corners x features; for more points, rows of lanes, corner-major) and `values` (features; for
+        more points, rows of lanes), and functions interpolate and interpolate_dot.
+    """
+    values = _interpolation(real, features, lanes, lane_functions(real, lanes))
+    copies = _interpolation(real, features, lanes, lane_functions(real, lanes, for_gradients=True))
+    values.interpolate_dot = copies.interpolate_dot  # see `surfel.hit_functions`
+    return values
+
+
+def _interpolation(real: type, features: int, lanes: int, f: SimpleNamespace) -> SimpleNamespace:
+    lane, splat, scaled, times, over, inner = f.lane, f.splat, f.scaled, f.times, f.over, f.inner
+    power_of_e = f.power_of_e
+    ONE = types(real).ONE
+    INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
+    if lanes == 1:
+        corners_type = wp.types.matrix(shape=(8, features), dtype=real)
+        values_type = wp.types.vector(length=features, dtype=real)
+
+        @wp.func
+        def corner_of(corners: corners_type, j: int, k: int):
+            return corners[j, k]
+    else:
+        corners_type = wp.types.matrix(shape=(8 * features, lanes), dtype=real)
+        values_type = wp.types.matrix(shape=(features, lanes), dtype=real)
+
+        @wp.func
+        def corner_of(corners: corners_type, j: int, k: int):
+            return corners[j * features + k]
+
+    @wp.func
+    def interpolate(fx: lane, fy: lane, fz: lane, corners: corners_type, scale: real, depth: lane, focal: real):
+        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 2."""
+        gx = splat(ONE) - fx
+        gy = splat(ONE) - fy
+        gz = splat(ONE) - fz
+        ratio = over(splat(focal), scaled(scale, depth))
+        fade = splat(ONE) - power_of_e(scaled(-INVERSE_TWO_PI, times(ratio, ratio)))
+        near = times(gz, fade)
+        far = times(fz, fade)
+        w00 = times(gx, gy)
+        w10 = times(fx, gy)
+        w01 = times(gx, fy)
+        w11 = times(fx, fy)
+        out = values_type()
+        for k in range(wp.static(features)):
+            front = times(w00, corner_of(corners, 0, k)) + times(w10, corner_of(corners, 1, k))
+            front += times(w01, corner_of(corners, 2, k)) + times(w11, corner_of(corners, 3, k))
+            back = times(w00, corner_of(corners, 4, k)) + times(w10, corner_of(corners, 5, k))
+            back += times(w01, corner_of(corners, 6, k)) + times(w11, corner_of(corners, 7, k))
+            out[k] = times(near, front) + times(far, back)
+        return out
+
+    @wp.func
+    def interpolate_dot(
+        fx: lane,
+        fy: lane,
+        fz: lane,
+        corners: corners_type,
+        scale: real,
+        depth: lane,
+        focal: real,
+        grad: values_type,
+    ):
+        value = interpolate(fx, fy, fz, corners, scale, depth, focal)
+        total = real(0.0)
+        for k in range(wp.static(features)):
+            total += inner(value[k], grad[k])
+        return total
+
+    return SimpleNamespace(
+        corners=corners_type, values=values_type, interpolate=interpolate, interpolate_dot=interpolate_dot
+    )
+
+
+@functools.cache
 def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespace:
     """Make the forward and backward kernels.
 
@@ -102,35 +182,11 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
     vec3, vec4 = t.vec3, t.vec4
     row = wp.types.vector(length=features, dtype=storage)
     vec = wp.types.vector(length=features, dtype=real)
-    mat = wp.types.matrix(shape=(8, features), dtype=real)
-    vec8 = wp.types.vector(length=8, dtype=real)
-    ONE, ZERO = t.ONE, t.ZERO
-    INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
+    f = interpolation_functions(real, features)
+    mat, interpolate, interpolate_dot = f.corners, f.interpolate, f.interpolate_dot
+    ZERO = t.ZERO
     load = load_function(features, storage)
     pairs = features == 2 and real is wp.float32
-
-    @wp.func
-    def interpolate(f: vec3, corners: mat, scale: real, depth: real, focal: real):
-        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 2."""
-        gx = ONE - f[0]
-        gy = ONE - f[1]
-        gz = ONE - f[2]
-        w = vec8(
-            gx * gy * gz,
-            f[0] * gy * gz,
-            gx * f[1] * gz,
-            f[0] * f[1] * gz,
-            gx * gy * f[2],
-            f[0] * gy * f[2],
-            gx * f[1] * f[2],
-            f[0] * f[1] * f[2],
-        )
-        ratio = focal / (scale * depth)
-        return (w @ corners) * (ONE - wp.exp(-ratio * ratio * INVERSE_TWO_PI))
-
-    @wp.func
-    def interpolate_dot(f: vec3, corners: mat, scale: real, depth: real, focal: real, grad: vec):
-        return wp.dot(interpolate(f, corners, scale, depth, focal), grad)
 
     @wp.func
     def cell(x: vec3):
@@ -166,7 +222,8 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
             x = positions[p] * scale
             base = cell(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-            value = interpolate(x - base, gather(table, level, corner, mask), scale, depth, focal[0])
+            x -= base
+            value = interpolate(x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0])
         for k in range(wp.static(features)):
             encoded[level * features + k, p] = storage(value[k])
 
@@ -181,20 +238,18 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         mask: wp.uint32,
         grad_encoded: wp.array2d(dtype=storage),
         unscale: wp.array(dtype=real),
-        run: wp.int32,
         # outputs
         grad_table: wp.array2d(dtype=vec),
-        grad_points: wp.array2d(dtype=vec4),
+        grad_points: wp.array(dtype=vec4),
     ):
-        r_, p = wp.tid()
-        start = (first + r_) * run
+        p = first + wp.tid()
         depth = depths[p]
         if not (depth > ZERO):
             if grad_points.shape[0] > 0:
-                grad_points[first + r_, p] = vec4()
+                grad_points[p] = vec4()
             return
         total = vec4()
-        for level in range(start, wp.min(start + run, resolutions.shape[0])):
+        for level in range(resolutions.shape[0]):
             grad = vec()
             for k in range(wp.static(features)):
                 grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
@@ -202,8 +257,9 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
             x = positions[p] * scale
             base = cell(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-            gf, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-                x - base, gather(table, level, corner, mask), scale, depth, focal[0], grad
+            x -= base
+            gx, gy, gz, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+                x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0], grad
             )
             if wp.static(pairs):
                 gc = merge_cells(corner[0], corner[1], corner[2], gc)
@@ -216,8 +272,8 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
                         add_pair(grad_table, level, hash_slot(corner, j, mask), part)
                 else:
                     wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
-            total += vec4(gf[0] * scale, gf[1] * scale, gf[2] * scale, gd)
+            total += vec4(gx * scale, gy * scale, gz * scale, gd)
         if grad_points.shape[0] > 0:
-            grad_points[first + r_, p] = total
+            grad_points[p] = total
 
     return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)

@@ -5,7 +5,7 @@ The number of chunks is fixed, whatever the number of threads, so that nothing d
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -13,6 +13,8 @@ import warp as wp
 
 CHUNKS = 16
 SMALLEST_CHUNK = 256
+# Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
+LIGHT_CHUNK = 2048
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -35,11 +37,27 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="nexwarp")
 
 
-def chunks(dim: int, align: int = 1) -> list[tuple[int, int]]:
-    """Split [0, dim) into at most CHUNKS ranges of at least SMALLEST_CHUNK, at multiples of `align`."""
-    size = max(SMALLEST_CHUNK, -(-dim // CHUNKS))
+def chunks(dim: int, align: int = 1, smallest: int = SMALLEST_CHUNK) -> list[tuple[int, int]]:
+    """Split [0, dim) into at most CHUNKS ranges of at least `smallest`, at multiples of `align`."""
+    size = max(smallest, -(-dim // CHUNKS))
     size = -(-size // align) * align
     return [(first, min(first + size, dim)) for first in range(0, dim, size)]
+
+
+def _share(part: Callable[[tuple[int, int]], None], ranges: list[tuple[int, int]]) -> None:
+    """Do all ranges, this thread and the pool's taking the next one in turns."""
+    waiting = iter(ranges)  # next() of it is atomic
+
+    def work() -> None:
+        for bounds in waiting:
+            part(bounds)
+
+    helpers = [_pool(_threads - 1).submit(work) for _ in range(min(_threads, len(ranges)) - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            helper.result()
 
 
 def launch(
@@ -52,6 +70,7 @@ def launch(
     stream: wp.Stream | None = None,
     block_dim: int = 256,
     align: int = 1,
+    smallest: int = LIGHT_CHUNK,
     adjoint: tuple[Sequence[Any], Sequence[Any]] | None = None,
 ) -> None:
     """Launch a kernel whose first argument is `first` over the leading dimension of `dim`.
@@ -65,6 +84,7 @@ def launch(
         stream: CUDA stream, by default the device's current one.
         block_dim: threads a block on CUDA.
         align: on a CPU, runs of this many neighbours stay in one thread, since they write to the same place.
+        smallest: on a CPU, what one thread is given at least.
         adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs
             no gradient. Gradients are added to.
     """
@@ -89,11 +109,11 @@ def launch(
     if not device.is_cpu:
         part((0, shape[0]))
         return
-    ranges = chunks(shape[0], align) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
+    ranges = chunks(shape[0], align, smallest) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
     if _threads == 1 or len(ranges) == 1:
         for bounds in ranges:
             part(bounds)
         return
     # Loading inside the threads would compile twice.
     wp.load_module(module=kernel.module, device=device)
-    list(_pool(_threads).map(part, ranges))
+    _share(part, ranges)

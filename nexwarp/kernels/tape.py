@@ -82,10 +82,10 @@ def _silent(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any], 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _add_points(
-    first: wp.int32, points: wp.array2d(dtype=Any), positions: wp.array(dtype=Any), depths: wp.array(dtype=Any)
+    first: wp.int32, points: wp.array(dtype=Any), positions: wp.array(dtype=Any), depths: wp.array(dtype=Any)
 ):
     p = first + wp.tid()
-    g = points[0, p]
+    g = points[p]
     positions[p] += type(positions[p])(g[0], g[1], g[2])
     depths[p] += g[3]
 
@@ -277,8 +277,8 @@ def hashgrid(
     one = wp.ones(1, dtype=real, device=table.device)
 
     def backward() -> None:
-        points = _new(positions, (1, count), types(real).vec4, requires_grad=False)
-        _silent(kernels.backward, (1, count), [*inputs, encoded.grad, one, levels], [table.grad, points])
+        points = _new(positions, count, types(real).vec4, requires_grad=False)
+        _silent(kernels.backward, count, [*inputs, encoded.grad, one], [table.grad, points])
         _silent(_add_points, count, [points], [positions.grad, depths.grad])
 
     tape.record_func(backward, [table, positions, depths, encoded])

@@ -121,7 +121,7 @@ def _walk(
     """Launch a kernel over the pixels of all tiles, `lanes` of them a thread."""
     threads = tiles.tile_size**2 // lanes
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    options = {"block_dim": BLOCK_DIM, "align": threads}
+    options = {"block_dim": BLOCK_DIM, "align": threads, "smallest": threads}
     launch(like, kernel, (len(tiles.tile_offsets) - 1) * threads, inputs, outputs, **options)
 
 

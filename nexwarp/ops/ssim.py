@@ -50,13 +50,21 @@ class _Blocks:
         groups = -(-self.height // rows_a_thread(self.lanes))
         inputs = [self.array(sources[i] if i < len(sources) else None) for i in range(3)]
         inputs += [self.height, self.width]
-        launch(blurred, kernel, groups * blocks, inputs, [self.array(blurred)], align=blocks)
+        launch(blurred, kernel, groups * blocks, inputs, [self.array(blurred)], align=blocks, smallest=blocks)
         return blurred
 
     def blur_rows(self, kernel: wp.Kernel, blurred: torch.Tensor, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch `score` or `gradient` on what `blur_columns` returned."""
         blocks = -(-self.width // self.lanes)
-        launch(blurred, kernel, self.height * blocks, [self.array(blurred), *inputs], outputs, align=blocks)
+        launch(
+            blurred,
+            kernel,
+            self.height * blocks,
+            [self.array(blurred), *inputs],
+            outputs,
+            align=blocks,
+            smallest=blocks,
+        )
 
 
 class _DSSIM(torch.autograd.Function):

@@ -8,6 +8,8 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.hashgrid_rows import LANES as ROW
+from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import STORAGES, array, launch, real_of
@@ -16,6 +18,8 @@ from nexwarp.ops._interop import STORAGES, array, launch, real_of
 HALF_GRADIENT = 64.0
 # Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
 POINT_MULTIPLE = 64
+# Runs of levels that CPU threads share out in the backward pass.
+RUNS = 8
 
 
 def texture(
@@ -80,7 +84,7 @@ class _Texture(torch.autograd.Function):
         launch(
             positions,
             kernels.forward,
-            (grid.shape[0], len(positions)),
+            (grid.shape[0], -(-count // ROW) if _rows_a_thread(positions) else count),
             arguments,
             [array(encoded, STORAGES[dtype])],
         )
@@ -143,7 +147,12 @@ class _Texture(torch.autograd.Function):
 
 def _padded(count: int, dtype: torch.dtype) -> int:
     """Columns that the MLP works on for `count` points."""
-    return -(-count // POINT_MULTIPLE) * POINT_MULTIPLE if dtype == torch.float16 else count
+    if dtype == torch.float16:
+        return -(-count // POINT_MULTIPLE) * POINT_MULTIPLE
+    # An odd number of cache lines a row: with rows at multiples of 4096 bytes, a column would fall into one set of a
+    # CPU's cache and push itself out.
+    line = 64 // dtype.itemsize
+    return (-(-count // line) | 1) * line
 
 
 def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
@@ -178,7 +187,13 @@ def _lookup(
         array(focal, real),
         wp.uint32(size - 1),
     ]
-    return hashgrid_kernels(real, storage, features), arguments
+    make = hashgrid_rows_kernels if _rows_a_thread(positions) else hashgrid_kernels
+    return make(real, storage, features), arguments
+
+
+def _rows_a_thread(like: torch.Tensor) -> bool:
+    """Whether a thread takes one level of a row of points, as pays on a CPU, or one point."""
+    return like.device.type == "cpu"
 
 
 def _lookup_backward(
@@ -195,19 +210,22 @@ def _lookup_backward(
     levels, _, features = table.shape
     count = len(positions)
     grad_grid = torch.zeros_like(table, dtype=positions.dtype)
-    # A run of levels is one thread's: a level on a CPU, where it owns the level's table, and all of them on CUDA.
-    runs = levels if positions.device.type == "cpu" else 1
-    grad_points = positions.new_empty(runs if need_points else 0, count, 4)
+    # On a CPU a run of levels has its slots, since its thread owns their tables; on CUDA a thread takes all levels.
+    rows = _rows_a_thread(positions)
+    run = -(-levels // RUNS)
+    runs = -(-levels // run)
+    grad_points = positions.new_empty((runs if rows else 1) if need_points else 0, count, 4)
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
-    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real), levels // runs]
+    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real), *([run] * rows)]
     outputs = [
         array(grad_grid, wp.types.vector(length=features, dtype=real)),
-        array(grad_points, types(real).vec4),
+        array(grad_points if rows else grad_points.view(-1, 4), types(real).vec4),
     ]
-    launch(positions, kernels.backward, (runs, count), arguments, outputs)
+    threads = (runs, -(-count // ROW)) if rows else count
+    launch(positions, kernels.backward, threads, arguments, outputs)
     if not need_points:
         return grad_grid, None, None
-    points = grad_points.sum(0) if runs > 1 else grad_points[0]
+    points = grad_points.sum(0) if rows else grad_points[0]
     return grad_grid, points[:, :3], points[:, 3]
 
 
