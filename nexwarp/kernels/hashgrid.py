@@ -186,6 +186,7 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
     mat, interpolate, interpolate_dot = f.corners, f.interpolate, f.interpolate_dot
     ZERO = t.ZERO
     load = load_function(features, storage)
+    options = {"fast_math": real is wp.float32}
     pairs = features == 2 and real is wp.float32
 
     @wp.func
@@ -201,7 +202,7 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
                 corners[j, k] = real(value[k])
         return corners
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def hashgrid(
         first: wp.int32,
         table: wp.array2d(dtype=row),
@@ -227,7 +228,7 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         for k in range(wp.static(features)):
             encoded[level * features + k, p] = storage(value[k])
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def hashgrid_backward(
         first: wp.int32,
         table: wp.array2d(dtype=row),

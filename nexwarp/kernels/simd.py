@@ -235,10 +235,11 @@ def lane_functions(real: type, lanes: int, for_gradients: bool = False) -> Simpl
     Their names are not those of Warp's own, mul or div: Warp would call them for the operators.
 
     Returns:
-        `lane`, the type (`real` itself for one pixel), and functions: splat(x), times(a, b), over(a, b), power_of_e(v),
-        logarithm(v), inner(a, b) to a scalar, below(a, b) to a mask, pick(mask, a, b). For vectors also `word`, the
-        type of masks (0 or -1) and of whole numbers, `integer`, of the width of `real`; above(a, b, or_equal) to a
-        mask; and of words equal_words, below_words, both, either, pick_words, any_of.
+        `lane`, the type (`real` itself for one pixel), and functions: splat(x), scaled(s, a), times(a, b), over(a, b),
+        power_of_e(v), logarithm(v), inner(a, b) to a scalar, at_least(a, low), at_most(a, high), below(a, b) to a mask,
+        pick(mask, a, b). For vectors also `word`, the type of masks (0 or -1) and of whole numbers, `integer`, of the
+        width of `real`; above(a, b, or_equal) to a mask; and of words equal_words, below_words, both, either,
+        pick_words, any_of.
     """
     return _vector_functions(real, lanes) if lanes > 1 else _scalar_functions(real)
 
@@ -276,6 +277,14 @@ def _scalar_functions(real: type) -> SimpleNamespace:
     def pick(mask: wp.bool, a: real, b: real):
         return wp.where(mask, a, b)
 
+    @wp.func
+    def at_least(a: real, low: real):
+        return wp.max(a, low)
+
+    @wp.func
+    def at_most(a: real, high: real):
+        return wp.min(a, high)
+
     return SimpleNamespace(
         lane=real,
         splat=splat,
@@ -287,6 +296,8 @@ def _scalar_functions(real: type) -> SimpleNamespace:
         logarithm=logarithm,
         below=below,
         pick=pick,
+        at_least=at_least,
+        at_most=at_most,
     )
 
 
@@ -342,6 +353,15 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
     @wp.func_native(snippet(_PICK), adj_snippet=snippet(_ADJOINT_PICK))
     def pick(mask: word, a: lane, b: lane) -> lane: ...
 
+    # Warp's own min and max of vectors call a function an element in their derivative.
+    @wp.func
+    def at_least(a: lane, low: real):
+        return pick(below(a, splat(low)), splat(low), a)
+
+    @wp.func
+    def at_most(a: lane, high: real):
+        return pick(below(splat(high), a), splat(high), a)
+
     @wp.func_native(snippet(_ABOVE))
     def above(a: lane, b: lane, or_equal: wp.bool) -> word: ...
 
@@ -376,6 +396,8 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
         logarithm=logarithm,
         below=below,
         pick=pick,
+        at_least=at_least,
+        at_most=at_most,
         above=above,
         equal_words=equal_words,
         below_words=below_words,

@@ -99,6 +99,7 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
     lane = f.lane
     splat, scaled, times, over, inner = f.splat, f.scaled, f.times, f.over, f.inner
     power_of_e, logarithm, below, pick = f.power_of_e, f.logarithm, f.below, f.pick
+    at_least, at_most = f.at_least, f.at_most
     SLACK = wp.constant(real(BLOCK_SLACK))
     ALPHA_MAX, TINY = t.ALPHA_MAX, t.TINY
     LARGE, LEAST = wp.constant(real(LARGEST_SQUARE)), wp.constant(real(LEAST_COSINE))
@@ -167,10 +168,9 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
     @wp.func
     def power(x: lane, gamma: real):
         """|x|^(2 gamma)."""
-        square = times(x, x)
-        square = pick(below(square, splat(TINY)), splat(TINY), square)
+        square = at_least(times(x, x), TINY)
         if wp.static(lanes > 1):
-            square = pick(below(splat(LARGE), square), splat(LARGE), square)
+            square = at_most(square, LARGE)
         return power_of_e(scaled(gamma, logarithm(square)))
 
     @wp.func
@@ -191,7 +191,7 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
                 exponent = pick(inside, exponent, screen)
                 depth = pick(inside, depth, splat(center[2]))
         alpha = scaled(a[3], power_of_e(scaled(-HALF, exponent)))
-        return pick(below(splat(ALPHA_MAX), alpha), splat(ALPHA_MAX), alpha), depth
+        return at_most(alpha, ALPHA_MAX), depth
 
     @wp.func
     def hit_dot(

@@ -79,7 +79,8 @@ class _Texture(torch.autograd.Function):
         count = len(positions)
         encoded = torch.empty(grid.shape[0] * grid.shape[2], _padded(count, dtype), dtype=dtype, device=grid.device)
         # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
-        encoded[:, count:] = 0
+        if encoded.shape[1] > count:
+            encoded[:, count:] = 0
         kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
         launch(
             positions,
@@ -249,7 +250,8 @@ def _colors_backward(
     vec3 = types(real).vec3
     count = len(grad_colors)
     signal = torch.empty_like(coefficients)
-    signal[:, count:] = 0
+    if signal.shape[1] > count:
+        signal[:, count:] = 0
     slots = directions.new_zeros(count if need_directions else 0, 3)
     kernels, arguments = _colors(coefficients, directions, count, clamp)
     arguments += [array(scale, real), array(grad_colors, vec3)]
