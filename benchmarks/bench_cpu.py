@@ -1,6 +1,7 @@
 """Collection on a CPU: against torch vectorised per tile, and with one thread against two."""
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -14,6 +15,8 @@ from benchmarks.timing import Measurement, figure, ratio
 from nexwarp import ops
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY, TRANSMITTANCE_MIN
+
+ROUNDS = 9
 
 
 def run(options: Options) -> list[Measurement]:
@@ -41,15 +44,31 @@ def collection(scene: Scene, options: Options) -> list[Measurement]:
     def theirs() -> tuple[torch.Tensor, ...]:
         return torch.autograd.grad(torch_collect(records, tiles, g.pinhole), records, signals)
 
-    name = "collect, forward + backward, {}, {}"
-    facts = scene.facts | {"warmup": 1, "least": 3}
-    mine, others, bits = [], [], []
+    bits = []
     for count in (1, 2):
         with threads(count):
             bits.append(ours())
-            label = f"{count} thread{'s' * (count > 1)}"
-            mine.append(options.time(name.format("ours", label), ours, **facts))
-            others.append(options.time(name.format("torch by tile", label), theirs, **facts))
+            theirs()
+    # In turns, so that a machine that gets slower or faster meanwhile does so for all.
+    times: dict[tuple[str, int], list[float]] = {
+        (who, count): [] for who in ("ours", "torch by tile") for count in (1, 2)
+    }
+    for _ in range(2 if options.quick else ROUNDS):
+        for (who, count), values in times.items():
+            with threads(count):
+                start = time.perf_counter()
+                (ours if who == "ours" else theirs)()
+                values.append(1e3 * (time.perf_counter() - start))
+    timed = {
+        (who, count): figure(
+            f"collect, forward + backward, {who}, {count} thread{'s' * (count > 1)}",
+            values,
+            options.device,
+            **scene.facts,
+        )
+        for (who, count), values in times.items()
+    }
+    mine, others = ([timed[who, count] for count in (1, 2)] for who in ("ours", "torch by tile"))
     different = sum(int((a != b).sum()) for a, b in zip(*bits, strict=True))
     same = figure("values that differ between 1 and 2 threads", different, options.device, unit="", **scene.facts)
     ratios = [
