@@ -166,3 +166,10 @@ def test_bad_input() -> None:
         ops.plain_colors((sh0, shN[:3]), means, position, 3)
     with pytest.raises(ValueError, match=r"^sh0: expected shape \(N=4, 1, 3\), got \(4, 15, 3\)$"):
         ops.plain_colors((shN, shN), means, position, 3)
+
+
+def test_no_surfels_give_empty_gradients() -> None:
+    """Also when the gradient comes expanded from a sum, with strides that no contiguous tensor has."""
+    leaves = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (2,), (), (2,), (3,))]
+    ops.project(*leaves, torch.eye(4)).records.sum().backward()
+    assert [x.grad.shape for x in leaves] == [x.shape for x in leaves]

@@ -29,6 +29,9 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Any:
     """View a tensor as a Warp array argument of the given element type; None stays None."""
     if tensor is None:
         return None
+    if tensor.numel() == 0:
+        # An empty tensor is contiguous whatever its strides, but Warp looks at them.
+        tensor = tensor.new_empty(tensor.shape)
     key = (dtype, tensor.dtype, tensor.shape, tensor.stride())
     layout = _layouts.get(key)
     if layout is None:

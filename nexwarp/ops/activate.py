@@ -63,8 +63,6 @@ class _Activate(torch.autograd.Function):
         raw = ctx.saved_tensors
         real = real_of(raw[0])
         grad_raw = [torch.empty_like(x) for x in raw]
-        # An empty gradient is contiguous whatever its strides, but Warp looks at them.
-        if len(raw[0]):
-            inputs = [*_arrays(real, raw), *_arrays(real, (x.contiguous() for x in grads))]
-            launch(raw[0], activate_kernels(real).backward, len(raw[0]), inputs, _arrays(real, grad_raw))
+        inputs = [*_arrays(real, raw), *_arrays(real, (x.contiguous() for x in grads))]
+        launch(raw[0], activate_kernels(real).backward, len(raw[0]), inputs, _arrays(real, grad_raw))
         return tuple(x if need else None for x, need in zip(grad_raw, ctx.needs_input_grad, strict=True))

@@ -67,9 +67,7 @@ class _PlainColors(torch.autograd.Function):
         real, count = real_of(means), len(means)
         vec3 = types(real).vec3
         kernels = plain_colors_kernels(real, ctx.degree)
-        # An empty gradient is contiguous whatever its strides, but Warp looks at them.
-        grad_colors = grad_colors.contiguous() if count else colors
-        seen = [array(x, vec3) for x in (means, position[None], colors, grad_colors)]
+        seen = [array(x, vec3) for x in (means, position[None], colors, grad_colors.contiguous())]
         grad_sh0 = grad_shN = grad_means = grad_position = None
         if need_sh0 or need_shN:
             grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
