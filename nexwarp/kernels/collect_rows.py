@@ -5,6 +5,7 @@ a test compares the two. What misses the whole row is culled before any of it.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -20,14 +21,20 @@ def row_lanes(tile_size: int) -> int:
 
 
 @functools.cache
-def row_function(tile_size: int) -> wp.Function:
-    """Make the function that gives the first pixel, (column, row), of a thread's row."""
+def row_functions(real: type, tile_size: int) -> SimpleNamespace:
+    """Which row of pixels a thread has, and where its rays go; `rows` is the number of rows of a tile."""
+    t = types(real)
+    vec2, vec4, HALF = t.vec2, t.vec4, t.HALF
     lanes = row_lanes(tile_size)
+    lane = lane_functions(real, lanes).lane
     rows = tile_size * tile_size // lanes
     across = tile_size // lanes
+    # Half of the distance between the outer pixel centres, and a little.
+    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
 
     @wp.func
     def row_of(thread: int, tile_columns: int):
+        """First pixel, (column, row)."""
         tile = thread // rows
         local = thread % rows
         return wp.vec2i(
@@ -35,7 +42,24 @@ def row_function(tile_size: int) -> wp.Function:
             (tile // tile_columns) * tile_size + local // across,
         )
 
-    return row_of
+    @wp.func
+    def rays_of(xy: wp.vec2i, intrinsics: vec4):
+        """Directions of the row's pixels: x of each, the y of all; z is 1."""
+        dx = lane()
+        for l in range(wp.static(lanes)):
+            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / intrinsics[0]
+        return dx, (real(float(xy[1])) + HALF - intrinsics[3]) / intrinsics[1]
+
+    @wp.func
+    def middle_of(xy: wp.vec2i, y: real, intrinsics: vec4):
+        """Direction through the middle of the row."""
+        return vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / intrinsics[0], y)
+
+    @wp.func
+    def half_row(intrinsics: vec4):
+        return vec2(HALF_ROW / intrinsics[0], SLIVER / intrinsics[1])
+
+    return SimpleNamespace(row_of=row_of, rays_of=rays_of, middle_of=middle_of, half_row=half_row, rows=rows)
 
 
 @functools.cache
@@ -50,11 +74,9 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
     slots = max(max_hits, 1)
     lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
     words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
-    row_of = row_function(tile_size)
-    rows = tile_size * tile_size // lanes
-    ALPHA_MIN, TRANSMITTANCE_MIN, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.HALF, t.ONE
-    # Half of the distance between the outer pixel centres, and a little.
-    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+    view = row_functions(real, tile_size)
+    rows = view.rows
+    ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     @wp.kernel(
         enable_backward=False,
@@ -84,19 +106,17 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         stops: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        xy = row_of(thread, tile_columns)
+        xy = view.row_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
         focal = vec2(intrinsics[0], intrinsics[1])
-        dx = lane()
+        dx, y = view.rays_of(xy, intrinsics)
         alive = word()
         for l in range(wp.static(lanes)):
-            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / focal[0]
             if xy[0] + l < size[0]:
                 alive[l] = integer(-1)
-        y = (real(float(xy[1])) + HALF - intrinsics[3]) / focal[1]
-        middle = vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / focal[0], y)
-        half = vec2(HALF_ROW / focal[0], SLIVER / focal[1])
+        middle = view.middle_of(xy, y, intrinsics)
+        half = view.half_row(intrinsics)
         one = lane(ONE)
         transmittance = lane(ONE)
         red = lane()
@@ -193,11 +213,9 @@ def collect_rows_backward_kernel(
     slots_ = max(max_hits, 1)
     lanes_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=real)
     words_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=integer)
-    row_of = row_function(tile_size)
-    rows_a_tile = tile_size * tile_size // lanes
-    ALPHA_MIN, HALF, ONE = t.ALPHA_MIN, t.HALF, t.ONE
-    # Half of the distance between the outer pixel centres, and a little.
-    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+    view = row_functions(real, tile_size)
+    rows_a_tile = view.rows
+    ALPHA_MIN, ONE = t.ALPHA_MIN, t.ONE
 
     @wp.kernel(
         enable_backward=False,
@@ -235,11 +253,11 @@ def collect_rows_backward_kernel(
         error_sums: wp.array(dtype=real),
     ):
         thread = first + wp.tid()
-        xy = row_of(thread, tile_columns)
+        xy = view.row_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
         focal = vec2(intrinsics[0], intrinsics[1])
-        dx = lane()
+        dx, y = view.rays_of(xy, intrinsics)
         stop = word()
         last = int(0)
         grad_red = lane()
@@ -252,7 +270,6 @@ def collect_rows_backward_kernel(
         gw = lanes_by_slot()
         gd = lanes_by_slot()
         for l in range(wp.static(lanes)):
-            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / focal[0]
             if xy[0] + l < size[0]:
                 p = xy[1] * size[0] + xy[0] + l
                 stop[l] = integer(stops[p])
@@ -271,9 +288,8 @@ def collect_rows_backward_kernel(
                 rest[l] = total
                 if wp.static(watch):
                     error[l] = errors[p]
-        y = (real(float(xy[1])) + HALF - intrinsics[3]) / focal[1]
-        middle = vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / focal[0], y)
-        half = vec2(HALF_ROW / focal[0], SLIVER / focal[1])
+        middle = view.middle_of(xy, y, intrinsics)
+        half = view.half_row(intrinsics)
         one = lane(ONE)
         transmittance = lane(ONE)
         overflow = overflowed(ends, surfel_ids)

@@ -1,6 +1,7 @@
 """Sums and votes over the 32 lanes of a CUDA warp; on a CPU a warp is one thread.
 
-Used by backward passes to add up what neighbouring pixels give to one surfel before any atomic.
+Walks use them to cull for all pixels of a warp at once, backward passes to add up what neighbouring pixels give to one
+surfel before any atomic.
 All lanes of a warp must reach these calls together.
 """
 

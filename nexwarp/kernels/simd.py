@@ -179,44 +179,21 @@ _ADJOINT_PICK = """
     __builtin_memcpy(&adj_b, &y, sizeof(y));
 """
 
-_LESS = """
+_COMPARE = """
     lane_t x, y;
     __builtin_memcpy(&x, &a, sizeof(x));
     __builtin_memcpy(&y, &b, sizeof(y));
-    const word_t m = (word_t)(x < y);
+    const word_t m = COMPARISON;
     wp::vec_t<LANES, INT> mask;
     __builtin_memcpy(&mask, &m, sizeof(m));
     return mask;
 """
 
-_LESS_WORDS = """
+_WORDS = """
     word_t x, y;
     __builtin_memcpy(&x, &a, sizeof(x));
     __builtin_memcpy(&y, &b, sizeof(y));
-    x = (word_t)(x < y);
-    __builtin_memcpy(&a, &x, sizeof(x));
-    return a;
-"""
-
-_EQUAL_WORDS = _LESS_WORDS.replace("x < y", "x == y")
-_ABOVE = """
-    lane_t x, y;
-    __builtin_memcpy(&x, &a, sizeof(x));
-    __builtin_memcpy(&y, &b, sizeof(y));
-    const word_t m = or_equal ? (word_t)(x >= y) : (word_t)(x > y);
-    wp::vec_t<LANES, INT> mask;
-    __builtin_memcpy(&mask, &m, sizeof(m));
-    return mask;
-"""
-_BOTH = _LESS_WORDS.replace("x < y", "x & y")
-_EITHER = _LESS_WORDS.replace("x < y", "x | y")
-
-_PICK_WORDS = """
-    word_t m, x, y;
-    __builtin_memcpy(&m, &mask, sizeof(m));
-    __builtin_memcpy(&x, &a, sizeof(x));
-    __builtin_memcpy(&y, &b, sizeof(y));
-    x = m != 0 ? x : y;
+    x = (word_t)(OPERATION);
     __builtin_memcpy(&a, &x, sizeof(x));
     return a;
 """
@@ -347,7 +324,7 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
     @wp.func_native(snippet(log_body, _RETURN), adj_snippet=snippet(log_body, _ADJOINT, DERIVATIVE="g / x"))
     def logarithm(v: lane) -> lane: ...
 
-    @wp.func_native(snippet(_LESS), adj_snippet="")
+    @wp.func_native(snippet(_COMPARE, COMPARISON="(word_t)(x < y)"), adj_snippet="")
     def below(a: lane, b: lane) -> word: ...
 
     @wp.func_native(snippet(_PICK), adj_snippet=snippet(_ADJOINT_PICK))
@@ -362,22 +339,22 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
     def at_most(a: lane, high: real):
         return pick(below(splat(high), a), splat(high), a)
 
-    @wp.func_native(snippet(_ABOVE))
+    @wp.func_native(snippet(_COMPARE, COMPARISON="or_equal ? (word_t)(x >= y) : (word_t)(x > y)"))
     def above(a: lane, b: lane, or_equal: wp.bool) -> word: ...
 
-    @wp.func_native(snippet(_EQUAL_WORDS))
+    @wp.func_native(snippet(_WORDS, OPERATION="x == y"))
     def equal_words(a: word, b: word) -> word: ...
 
-    @wp.func_native(snippet(_LESS_WORDS))
+    @wp.func_native(snippet(_WORDS, OPERATION="x < y"))
     def below_words(a: word, b: word) -> word: ...
 
-    @wp.func_native(snippet(_BOTH))
+    @wp.func_native(snippet(_WORDS, OPERATION="x & y"))
     def both(a: word, b: word) -> word: ...
 
-    @wp.func_native(snippet(_EITHER))
+    @wp.func_native(snippet(_WORDS, OPERATION="x | y"))
     def either(a: word, b: word) -> word: ...
 
-    @wp.func_native(snippet(_PICK_WORDS))
+    @wp.func_native(snippet(_PICK.replace("lane_t", "word_t")))
     def pick_words(mask: word, a: word, b: word) -> word: ...
 
     @wp.func_native(snippet(_ANY))
