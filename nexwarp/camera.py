@@ -1,5 +1,6 @@
 """Pinhole cameras: world to camera, x right, y down, z forward (OpenCV, as COLMAP writes them)."""
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,6 +71,16 @@ class Camera:
     def position(self) -> torch.Tensor:
         """(3,) centre of projection in the world frame, differentiable with respect to `viewmat`."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """Return the camera of a window of this one's image, in pixels; the window may reach beyond the image."""
+        shift = self.K.new_zeros(3, 3)
+        shift[0, 2], shift[1, 2] = left, top
+        camera = copy(self)  # checked already; checking again would wait for a GPU
+        changes = {"K": self.K - shift, "width": width, "height": height, "cx": self.cx - left, "cy": self.cy - top}
+        for name, value in changes.items():
+            object.__setattr__(camera, name, value)
+        return camera
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """Return this camera with `viewmat` and `K` moved like `torch.Tensor.to` does."""

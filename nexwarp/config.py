@@ -56,6 +56,12 @@ class TextureConfig:
     """Of the hidden layers."""
     hidden_layers: int = 2
     """Number of hidden layers."""
+    sh_degree: int | None = None
+    """Highest degree of the texture's colours; None is that of the run."""
+    residual: bool = True
+    """Add the texture's colours to the plain ones instead of replacing them."""
+    down_weighting: bool = True
+    """Fade levels whose cells are smaller than a pixel (paper Eq. 2)."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +82,16 @@ class Config:
     """Iterations, of a run of 30,000, between those."""
     coarse: float = 0.0
     """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind everything."""
+    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    """Colour behind everything; None takes the mean colour of the training photos."""
+    random_hits: bool = False
+    """Draw K anew for each step, from 0 to max_hits."""
+    border: float = 0.0
+    """Share of the frame's size by which some steps look beyond it, where the photo's edge goes on; 0 never does."""
+    border_every: int = 4
+    """Every how many steps that is."""
+    border_weight: float = 0.1
+    """Factor of the loss there."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     clamp_texture: bool = False
@@ -135,6 +149,28 @@ def _tuples(data: dict[str, Any]) -> dict[str, Any]:
     return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
 
 
+def with_settings(config: Config, settings: dict[str, Any]) -> Config:
+    """Return a config with some settings replaced.
+
+    Args:
+        config: what to start from.
+        settings: name -> value; a dot leads into a part, as in "texture.residual". Lists stand for tuples.
+
+    Raises:
+        ValueError: there is no setting of that name, or its value is out of range.
+    """
+    for name, value in settings.items():
+        part, _, key = name.rpartition(".")
+        target = getattr(config, part, None) if part else config
+        if not (dataclasses.is_dataclass(target) and key in {f.name for f in dataclasses.fields(target)}):
+            known = sorted(f.name for f in dataclasses.fields(target if dataclasses.is_dataclass(target) else config))
+            raise ValueError(f"{name}: expected a setting, one of {', '.join(known)}")
+        value = tuple(value) if isinstance(value, list) else value
+        changed = dataclasses.replace(target, **{key: value})
+        config = dataclasses.replace(config, **{part: changed}) if part else changed
+    return config
+
+
 PRESETS: dict[str, Config] = {
     "default": Config(),
     "paper": Config(
@@ -143,7 +179,7 @@ PRESETS: dict[str, Config] = {
         filter_points=False,
         orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
-        texture=TextureConfig(min_resolution=16.0, max_resolution=256.0),
+        texture=TextureConfig(min_resolution=16.0, max_resolution=256.0, residual=False),
         densify=DensifyConfig(prune_at_cap=False),
     ),
 }

@@ -73,6 +73,8 @@ def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
     percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing.
     """
     shape = dataclasses.asdict(config.texture)
+    if shape["sh_degree"] is None:
+        shape["sh_degree"] = config.sh_degree
     if shape["max_resolution"] is None:
         shape["max_resolution"] = _pixel_resolution(scene)
     if shape["min_resolution"] is None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
+from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
@@ -45,6 +46,7 @@ def training_losses(
     grid: torch.Tensor | None,
     resolutions: torch.Tensor | None,
     loss_weights: LossWeights,
+    mask: torch.Tensor | None = None,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of the training loss, already multiplied by their factors: their sum is the loss.
 
@@ -57,11 +59,16 @@ def training_losses(
         grid: (L, T, F), hash-grid values; None without a texture: no grid term.
         resolutions: (L,), cells per world unit; may be None when `grid` is.
         loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
+        mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
+            and the texture are 0. None is True everywhere.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
     """
     factors, has_slots = loss_weights, weights.shape[-1] > 0
+    if mask is not None:
+        check_tensors({"mask": (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
+        image, textured, weights = _masked(image, textured, weights, target, mask)
     l1_term, texture_term, alpha_term = photometric_terms(
         image,
         textured,
@@ -80,6 +87,20 @@ def training_losses(
         "grid": factors.grid * grid_loss(grid, resolutions) if factors.grid > 0.0 and grid is not None else None,
     }
     return {name: term for name, term in terms.items() if term is not None}
+
+
+def _masked(
+    image: torch.Tensor, textured: torch.Tensor, weights: torch.Tensor, target: torch.Tensor, mask: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Put the photograph, without a gradient, where the mask is False."""
+    seen = mask[..., None]
+    fixed = weights.detach()
+    perfect = target * (fixed.sum(-1, keepdim=True) + WEIGHT_EPSILON)
+    return (
+        torch.where(seen, image, target),
+        torch.where(seen, textured, perfect),
+        torch.where(seen, weights, fixed),
+    )
 
 
 def l1(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

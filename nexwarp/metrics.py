@@ -9,11 +9,13 @@ import torch.nn.functional as F
 
 from nexwarp.ops.checks import check_finite
 
+PIXELS_PER_DEGREE = 67.02064514160156  # what FLIP's authors assume: 0.7 m from a display of 0.7 m and 3840 pixels
+
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
     "C2 = 0.03^2, mean over all pixels and channels. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to "
-    "[-1, 1]. "
+    "[-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the map. "
     "A set's figure is the mean over its images."
 )
 
@@ -66,6 +68,22 @@ def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
         return None
     with torch.no_grad():
         return network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False).item()
+
+
+def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
+    """Mean LDR-FLIP error, 0 to 1, of two (H, W, 3) sRGB images at 67 pixels per degree, or None where not available.
+
+    It needs the `flip-evaluator` package (`pip install nexwarp[flip]`).
+    """
+    test, reference = _unit_images(image, target)
+    try:
+        from flip_evaluator import evaluate
+    except ImportError as error:
+        warnings.warn(f"FLIP is left out: {error} (pip install nexwarp[flip])", RuntimeWarning, stacklevel=2)
+        return None
+    pair = (x.cpu().contiguous().numpy() for x in (reference, test))
+    _, error, _ = evaluate(*pair, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})
+    return float(error)
 
 
 @lru_cache(maxsize=2)

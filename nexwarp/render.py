@@ -32,7 +32,8 @@ class Rendering:
     Attributes:
         image: (H, W, 3) = plain + textured + (1 - alpha) background; not clamped.
         plain: (H, W, 3) blended colours of the hits that are not textured, N of paper Eq. 4; without background.
-        textured: (H, W, 3) sum over the K textured hits of weight * colour.
+        textured: (H, W, 3) sum over the K textured hits of weight * colour; of their plain colour without a texture,
+            of that plus the texture's with a residual one.
         ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
         depths: (H, W, K) their z-depths, world units; 0 in empty slots.
         weights: (H, W, K) their blending weights; 0 in empty slots.
@@ -89,7 +90,7 @@ def render(
         background: a number, three numbers or a (3,) tensor, seen through what is left of the transmittance.
         sh_degree: 0 to 3, limits the degree of both appearances.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
-        clamp_texture: limit textured colours to >= 0.
+        clamp_texture: limit textured colours to >= 0; not for residual textures.
 
     Raises:
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
@@ -102,13 +103,15 @@ def render(
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     if texture is None:
-        texels = colors[hits.ids.clamp_min(0).long()] if len(surfels) else colors.new_zeros(*hits.ids.shape, 3)
+        texels, weights = hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
     else:
+        weights = hits.weights
         positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
         texels = texture.colors(
             positions, hits.depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture
         )
-    image, textured = ops.compose(hits.plain, texels, hits.weights, hits.alpha, background)
+    base = hits.base if texture is None or texture.residual else None
+    image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
     rendering = Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.
@@ -155,6 +158,8 @@ def _check(
     for name, value in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
         if not isinstance(value, bool):
             raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
+    if clamp_texture and texture is not None and texture.residual:
+        raise ValueError("clamp_texture: expected False with a residual texture, got True")
     means = surfels.means
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")

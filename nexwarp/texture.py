@@ -11,6 +11,8 @@ from nexwarp.ops.checks import check_range, check_tensors
 GRID_INIT = 0.01
 # Cells are indexed by int32: finer grids wrap around at once.
 LARGEST_RESOLUTION = 1e9
+# A focal length in pixels at which every cell is larger than a pixel.
+NO_FOOTPRINT = 1e12
 
 
 class NeuralTexture(nn.Module):
@@ -35,6 +37,8 @@ class NeuralTexture(nn.Module):
         width: int = 64,
         hidden_layers: int = 2,
         sh_degree: int = 3,
+        residual: bool = False,
+        down_weighting: bool = True,
     ) -> None:
         """Make a fresh field.
 
@@ -47,6 +51,9 @@ class NeuralTexture(nn.Module):
             width: of the hidden layers.
             hidden_layers: number of hidden layers.
             sh_degree: of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
+            residual: colours are added to the surfels' plain ones instead of replacing them, so that a field of 0, as
+                it is where no photo looked, leaves those.
+            down_weighting: fade levels whose cells are smaller than a pixel (Delta of paper Eq. 2).
 
         Raises:
             ValueError: naming the argument that is out of its range.
@@ -62,6 +69,9 @@ class NeuralTexture(nn.Module):
             if isinstance(value, bool) or not isinstance(value, int):
                 raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
             check_range(name, value, low, high)
+        for name, value in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(value, bool):
+                raise TypeError(f"{name}: expected True or False, got {value!r}")
         if table_size & (table_size - 1):
             raise ValueError(f"table_size: expected a power of two, got {table_size}")
         if isinstance(features, bool) or not isinstance(features, int):
@@ -82,8 +92,11 @@ class NeuralTexture(nn.Module):
             "width": width,
             "hidden_layers": hidden_layers,
             "sh_degree": sh_degree,
+            "residual": residual,
+            "down_weighting": down_weighting,
         }
         self.sh_degree = sh_degree
+        self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
         ends = torch.tensor([min_resolution, max_resolution], dtype=torch.float64).log()
@@ -130,7 +143,7 @@ class NeuralTexture(nn.Module):
         sh_degree: int = 3,
         clamp: bool = False,
     ) -> torch.Tensor:
-        """Return the textured colours 0.5 + SH(direction) of hits.
+        """Return the textured colours 0.5 + SH(direction) of hits; SH(direction) alone when `residual`.
 
         Args:
             positions: (..., K, 3) hit points, world.
@@ -158,6 +171,8 @@ class NeuralTexture(nn.Module):
         clamp: bool = False,
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
+        if not self.down_weighting:
+            focal = NO_FOOTPRINT
         if isinstance(focal, torch.Tensor):
             if focal.numel() != 1:
                 raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
@@ -174,6 +189,7 @@ class NeuralTexture(nn.Module):
             self.resolutions.to(self.grid.dtype),
             focal,
             directions=directions,
+            offset=0.0 if self.residual else 0.5,
             clamp=clamp,
             half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
         )

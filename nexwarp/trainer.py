@@ -65,13 +65,14 @@ class Trainer:
         _seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
-        self.texture = NeuralTexture(**texture_shape(scene, config), sh_degree=config.sh_degree).to(self.device)
+        self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.optimizer = _make_optimizer(self.surfels, self.texture, config, scene.scale)
         self.densifier = Densifier(_densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration = 0
         self.seconds = 0.0
         self.order: list[int] = []
         self.views = _Views(scene.train, self.device)
+        self.background = mean_colour(scene.train) if config.background is None else config.background
 
     def run(self, observe: Callable[[Progress], None] | None = None) -> None:
         """Train until `config.iterations`, calling `observe` after each step."""
@@ -91,11 +92,15 @@ class Trainer:
         coarse = self.iteration <= config.coarse * config.iterations
         camera, target = self.views.get(self._next_view(), 2 if coarse else 1)
         self._schedule_rates()
-        out = render(self.surfels, self.texture if config.max_hits else None, camera, **self.render_options())
-        losses = self._losses(out, target)
+        inside = None
+        if config.border > 0 and self.iteration % config.border_every == 0:
+            camera, target, inside = self._beyond_the_frame(camera, target)
+        out = render(self.surfels, self.texture if config.max_hits else None, camera, **self._training_options())
+        losses = self._losses(out, target, inside)
         watch = None
         if self.densifier.active(self.iteration):
-            watch = out.watch_error((out.image.detach() - target).abs().mean(dim=-1))
+            errors = (out.image.detach() - target).abs().mean(dim=-1)
+            watch = out.watch_error(errors if inside is None else errors * inside)
         sum(losses.values()).backward()
         if watch is not None:
             self.densifier.accumulate(watch.sums)
@@ -111,11 +116,34 @@ class Trainer:
         unlocked = self.iteration // config.scaled(config.sh_every)
         return {
             "max_hits": config.max_hits,
-            "background": config.background,
-            "sh_degree": min(config.sh_degree, unlocked),
+            "background": self.background,
+            "sh_degree": min(max(config.sh_degree, self.texture.sh_degree), unlocked),
             "low_pass": config.low_pass,
             "clamp_texture": config.clamp_texture,
         }
+
+    def _training_options(self) -> dict[str, Any]:
+        options = self.render_options()
+        if self.config.random_hits:
+            options["max_hits"] = int(torch.randint(self.config.max_hits + 1, (), generator=self.generator))
+        return options
+
+    def _beyond_the_frame(self, camera: Camera, photo: torch.Tensor) -> tuple[Camera, torch.Tensor, torch.Tensor]:
+        """Shift the window at random; where it leaves the photo, the photo's edge goes on.
+
+        Returns:
+            Camera, target and where it is the photo's own (H, W).
+        """
+        sizes = (camera.height, camera.width)
+        shifts = (2 * torch.rand(2, generator=self.generator) - 1) * self.config.border * torch.tensor(sizes)
+        top, left = (round(x) for x in shifts.tolist())
+        rows, columns = (
+            torch.arange(first, first + size, device=self.device)
+            for first, size in zip((top, left), sizes, strict=True)
+        )
+        inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))[None]
+        target = photo[rows.clamp(0, sizes[0] - 1)][:, columns.clamp(0, sizes[1] - 1)]
+        return camera.crop(left, top, camera.width, camera.height), target, inside
 
     def model(self) -> Model:
         """Return the model as it is now."""
@@ -200,9 +228,9 @@ class Trainer:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
-    def _losses(self, out: Rendering, target: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _losses(self, out: Rendering, target: torch.Tensor, inside: torch.Tensor | None) -> dict[str, torch.Tensor]:
         textured = self.config.max_hits > 0
-        return training_losses(
+        losses = training_losses(
             image=out.image.clamp(0, 1) if self.config.clamp_image else out.image,
             textured=out.textured,
             weights=out.weights,
@@ -211,13 +239,19 @@ class Trainer:
             grid=self.texture.grid if textured else None,
             resolutions=self.texture.resolutions if textured else None,
             loss_weights=self.config.losses,
+            mask=inside,
         )
+        if inside is not None:
+            outside = ~inside
+            error = (out.image - target).abs().mean(-1) + self.config.losses.alpha * (1 - out.alpha)
+            losses["border"] = self.config.border_weight * (error * outside).mean()
+        return losses
 
     def _schedule_rates(self) -> None:
         progress = (self.iteration - 1) / max(self.config.iterations - 1, 1)
         for group in self.optimizer.param_groups:
             first, last = group["ends"]
-            group["lr"] = math.exp((1 - progress) * math.log(first) + progress * math.log(last))
+            group["lr"] = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
 
 
 class _Views:
@@ -286,6 +320,14 @@ def _densify_schedule(config: Config) -> DensifyConfig:
     d = config.densify
     every = max(config.scaled(d.every), min(d.every, 10))
     return dataclasses.replace(d, start=config.scaled(d.start), stop=config.scaled(d.stop), every=every)
+
+
+def mean_colour(views: list[View]) -> tuple[float, float, float]:
+    """Mean sRGB colour in [0, 1] of all pixels of the photos."""
+    sums = torch.stack([view.image.sum((0, 1), dtype=torch.int64) for view in views]).sum(0).double()
+    pixels = sum(view.image.shape[0] * view.image.shape[1] for view in views)
+    red, green, blue = (sums / pixels / 255).tolist()
+    return red, green, blue
 
 
 def _seed(seed: int) -> None:

@@ -134,6 +134,7 @@ def make_texture(
     *,
     seed: int = 0,
     sh_degree: int = 3,
+    residual: bool = False,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> nw.NeuralTexture:
@@ -147,6 +148,7 @@ def make_texture(
         width=16,
         hidden_layers=2,
         sh_degree=sh_degree,
+        residual=residual,
     )
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

@@ -62,7 +62,8 @@ def reference_render(
     """Hand the public objects, in float64 on the CPU, to the reference."""
     field = None
     if texture is not None:
-        field = reference.Texture(texture.grid, texture.resolutions.double(), list(texture.mlp.parameters()))
+        mlp = list(texture.mlp.parameters())
+        field = reference.Texture(texture.grid, texture.resolutions.double(), mlp, texture.residual)
     return reference.render(
         surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas, surfels.sh, field,
         camera.viewmat, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
@@ -87,7 +88,7 @@ def twin(module: torch.nn.Module | None) -> Any:
 
 
 CASES = [
-    # scene, textured, max_hits, low_pass, sh_degree, clamp_texture
+    # scene, textured (True, False or "residual"), max_hits, low_pass, sh_degree, clamp_texture
     ("random", True, 2, False, 3, False),
     ("random", True, 1, True, 1, True),
     ("random", True, 4, False, 2, True),
@@ -100,6 +101,10 @@ CASES = [
     ("off_centre", True, 2, False, 3, True),
     ("specks", True, 2, True, 3, False),
     ("specks", False, 4, False, 1, False),
+    ("random", "residual", 2, False, 3, False),
+    ("layered", "residual", 8, True, 1, False),
+    ("off_centre", "residual", 1, False, 2, False),
+    ("random", "residual", 0, False, 3, False),
 ]
 
 
@@ -116,7 +121,7 @@ def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
 @pytest.mark.parametrize(("name", "textured", "max_hits", "low_pass", "sh_degree", "clamp_texture"), CASES)
 def test_render_agrees_with_the_reference(
     name: str,
-    textured: bool,
+    textured: bool | str,
     max_hits: int,
     low_pass: bool,
     sh_degree: int,
@@ -135,7 +140,8 @@ def test_render_agrees_with_the_reference(
     dtype = torch.float32 if half else row
     scene = make_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
-    texture = make_texture(dtype=dtype, device=device) if textured else None
+    residual = textured == "residual"
+    texture = make_texture(dtype=dtype, device=device, residual=residual) if textured else None
     if texture is not None:
         texture.half_precision = half
         if half:
@@ -267,6 +273,26 @@ def test_buffers_follow_their_definition(device: torch.device) -> None:
     assert out.ids.dtype == torch.int32 and out.image.dtype == torch.float32
     behind = (1 - out.alpha)[..., None] * torch.tensor(BACKGROUND, device=device)
     assert_close(out.image, out.plain + out.textured + behind, kind="value", name="image")
+
+
+@pytest.mark.parametrize("max_hits", [0, 2, MAX_HITS])
+def test_a_residual_texture_of_zeros_shows_the_plain_colours(max_hits: int, device: torch.device) -> None:
+    """What no photo looked at: features that the regulariser has taken to 0."""
+    scene = random_scene(device=device)
+    texture = make_texture(device=device, residual=True)
+    torch.nn.init.zeros_(texture.grid)
+    assert_alike(draw(scene, texture, max_hits=max_hits), draw(scene, max_hits=max_hits))
+    absent = draw(scene, make_texture(device=device), max_hits=0)
+    assert_alike(draw(scene, texture, max_hits=max_hits), absent, ("image", "alpha"))
+
+
+def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    with_it, without = (draw(scene, make_texture(device=device, residual=flag)) for flag in (True, False))
+    shift = draw(scene).textured - 0.5 * without.weights.sum(-1, keepdim=True)
+    assert_close(with_it.textured, without.textured + shift, kind="value", name="textured")
+    with pytest.raises(ValueError, match="^clamp_texture: expected False with a residual texture, got True$"):
+        draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
 
 
 def test_background_may_be_a_tensor(device: torch.device) -> None:

@@ -206,9 +206,9 @@ def test_gradients_of_collect(max_hits: int, low_pass: bool) -> None:
 
     def blend(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         hits = collect(*tensors, **pinhole(scene), max_hits=max_hits, low_pass=low_pass)
-        return hits.plain, hits.depths, hits.weights, hits.alpha
+        return hits.plain, hits.base, hits.depths, hits.weights, hits.alpha
 
-    assert blend(*inputs)[3].max() > 0.3
+    assert blend(*inputs)[4].max() > 0.3
     assert torch.autograd.gradcheck(blend, inputs)
 
 

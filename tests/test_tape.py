@@ -1,5 +1,6 @@
 """A Warp-only program differentiates a whole render with `tape.backward()`, and agrees with torch's gradients."""
 
+import pytest
 import torch
 import warp as wp
 
@@ -41,13 +42,14 @@ def to_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     return wp.from_torch(tensor.detach().clone().contiguous(), dtype=dtype, requires_grad=True)
 
 
-def test_tape_and_torch_give_the_same_gradients(device: torch.device) -> None:
+@pytest.mark.parametrize("residual", [False, True])
+def test_tape_and_torch_give_the_same_gradients(residual: bool, device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
     surfels = nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
     viewmat = scene["viewmat"].clone().requires_grad_()
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
     torch.manual_seed(1)
-    texture = nw.NeuralTexture(levels=3, table_size=2**8, min_resolution=1.0, max_resolution=4.0, width=8)
+    texture = nw.NeuralTexture(3, 2**8, min_resolution=1.0, max_resolution=4.0, width=8, residual=residual)
     texture = texture.to(device=device, dtype=torch.float64)
     with torch.no_grad():
         texture.grid.uniform_(-1, 1)
@@ -115,7 +117,8 @@ def warp_program(
         if index:
             features = launch(tape, relu, features.shape, [features])
         features = launch(tape, matmul, (matrix.shape[0], features.shape[1]), [matrix, features])
-    texels = passes.textured_colors(tape, features, directions, 3)
+    offset = 0.0 if texture.residual else 0.5
+    texels = passes.textured_colors(tape, features, directions, 3, offset=offset)
     out, _ = passes.compose(
         tape,
         hits.plain,
@@ -123,6 +126,7 @@ def warp_program(
         hits.weights,
         hits.alphas,
         to_warp(background[None], t.vec3),
+        hits.base if texture.residual else None,
     )
     loss = wp.zeros(1, dtype=REAL, device=out.device, requires_grad=True)
     with tape:

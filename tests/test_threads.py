@@ -10,7 +10,7 @@ from nexwarp.kernels import launch
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
-BUFFERS = ("plain", "ids", "depths", "weights", "alpha")
+BUFFERS = ("plain", "base", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
 WIDE = {"width": 300, "height": 200}
@@ -50,7 +50,7 @@ class Passes:
         generator = torch.Generator().manual_seed(2)
         loss = sum(
             (x * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)).sum()
-            for x in (self.hits.plain, self.hits.depths, self.hits.weights, self.hits.alpha)
+            for x in (self.hits.plain, self.hits.base, self.hits.depths, self.hits.weights, self.hits.alpha)
         )
         loss.backward()
         return {name: leaf.grad for name, leaf in self.leaves.items()}

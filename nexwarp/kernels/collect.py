@@ -3,6 +3,7 @@
 One thread a pixel. The forward pass writes
 
     plain    N = sum over hits outside the buffer of weight * colour (paper Eq. 4)
+    base     the same sum over the hits in the buffer: what they would look like without a texture
     ids, depths, weights    the K heaviest hits, heaviest first; on a tie the nearer one stays
     alphas   1 - final transmittance
     stops    end of the part of the list that was walked
@@ -15,7 +16,7 @@ hand, front to back in one pass. With q_i = dL/dw_i,
 
 and the sum over all i, which the walk then uses up hit by hit, is known from the outputs:
 
-    rest = gN . N + sum_k gW_k W_k + gA A.
+    rest = gN . N + gB . B + sum_k gW_k W_k + gA A.
 
 Each hit is differentiated by `wp.grad` of the one function that the forward pass calls.
 
@@ -153,6 +154,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         reaches: wp.array(dtype=vec2),
         # outputs
         plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
         depths: wp.array2d(dtype=real),
         weights: wp.array2d(dtype=real),
@@ -183,12 +185,12 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         stop = int(bounds[0])
         width = lanes()
         me = lane()
-        for base in range(bounds[0], bounds[1], width):
+        for batch in range(bounds[0], bounds[1], width):
             if any_lane(1 - done) == 0:
                 break
             mine = int(-1)
-            if base + me < bounds[1]:
-                mine = surfel_at(base + me, surfel_ids, order, overflow)
+            if batch + me < bounds[1]:
+                mine = surfel_at(batch + me, surfel_ids, order, overflow)
                 if width > 1:
                     center = vec3()
                     if wp.static(low_pass):
@@ -228,7 +230,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                     if alpha >= ALPHA_MIN and depth > near:
                         weight = alpha * transmittance
                         transmittance = transmittance * (ONE - alpha)
-                        stop = base + next_lane + 1
+                        stop = batch + next_lane + 1
                         # Insert into the buffer before the first lighter hit, and move that and all behind it down by
                         # one, so that of equal ones the nearer stays; what falls out is blended as plain.
                         displaced = int(0)
@@ -261,10 +263,13 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
             return
         p = xy[1] * size[0] + xy[0]
         plain[p] = color
+        kept = vec3()
         for j in range(wp.static(max_hits)):
+            kept += vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2]) * buffer_weights[j]
             ids[p, j] = buffer_ids[j]
             depths[p, j] = buffer_depths[j]
             weights[p, j] = buffer_weights[j]
+        base[p] = kept
         alphas[p] = ONE - transmittance
         stops[p] = stop
 
@@ -309,11 +314,13 @@ def collect_backward_kernel(
         reaches: wp.array(dtype=vec2),
         rows: wp.array(dtype=wp.int32),
         plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
         weights: wp.array2d(dtype=real),
         alphas: wp.array(dtype=real),
         stops: wp.array(dtype=wp.int32),
         grad_plain: wp.array(dtype=vec3),
+        grad_base: wp.array(dtype=vec3),
         grad_depths: wp.array2d(dtype=real),
         grad_weights: wp.array2d(dtype=real),
         grad_alphas: wp.array(dtype=real),
@@ -336,8 +343,9 @@ def collect_backward_kernel(
         middle = view.block_of(xy, intrinsics)
         half = view.half_block(intrinsics)
         gn = grad_plain[p]
+        gb = grad_base[p]
         ga = grad_alphas[p]
-        rest = wp.dot(gn, plain[p]) + ga * alphas[p]
+        rest = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + ga * alphas[p]
         gw = vec()
         gd = vec()
         slots = ivec()
@@ -355,10 +363,10 @@ def collect_backward_kernel(
         bounds = walk(tile, tile_offsets, ends, overflow)
         width = lanes()
         last = wp.min(lane_max(stop), bounds[1])
-        for base in range(bounds[0], last, width):
+        for batch in range(bounds[0], last, width):
             mine = int(-1)
-            if base + me < last:
-                mine = surfel_at(base + me, surfel_ids, order, overflow)
+            if batch + me < last:
+                mine = surfel_at(batch + me, surfel_ids, order, overflow)
                 if width > 1:
                     center = vec3()
                     if wp.static(low_pass):
@@ -382,7 +390,7 @@ def collect_backward_kernel(
                 next_lane = first_lane(left)
                 left = left & (left - 1)
                 i = from_lane(mine, next_lane)
-                k = base + next_lane
+                k = batch + next_lane
                 ra = load(records, i, 0)
                 rb = load(records, i, 1)
                 rn = load(records, i, 2)
@@ -409,15 +417,14 @@ def collect_backward_kernel(
                         share = weight * error
                         q = ga
                         gt = real(0.0)
-                        buffered = int(0)
+                        g = gn
                         for j in range(wp.static(max_hits)):
                             if i == slots[j]:
                                 q += gw[j]
                                 gt = gd[j]
-                                buffered = 1
-                        if buffered == 0:
-                            q += gn[0] * rc[0] + gn[1] * rc[1] + gn[2] * rc[2]
-                            g3 = vec4(gn[0] * weight, gn[1] * weight, gn[2] * weight, ZERO)
+                                g = gb
+                        q += g[0] * rc[0] + g[1] * rc[1] + g[2] * rc[2]
+                        g3 = vec4(g[0] * weight, g[1] * weight, g[2] * weight, ZERO)
                         rest -= q * weight
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
                         transmittance = transmittance * (ONE - alpha)

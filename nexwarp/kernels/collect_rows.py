@@ -99,6 +99,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         reaches: wp.array(dtype=vec2),
         # outputs
         plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
         depths: wp.array2d(dtype=real),
         weights: wp.array2d(dtype=real),
@@ -188,10 +189,13 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             if xy[0] + l < size[0]:
                 p = xy[1] * size[0] + xy[0] + l
                 plain[p] = vec3(red[l], green[l], blue[l])
+                kept = vec3()
                 for j in range(wp.static(max_hits)):
+                    kept += vec3(buffer_red[j, l], buffer_green[j, l], buffer_blue[j, l]) * buffer_weights[j, l]
                     ids[p, j] = wp.int32(buffer_ids[j, l])
                     depths[p, j] = buffer_depths[j, l]
                     weights[p, j] = buffer_weights[j, l]
+                base[p] = kept
                 alphas[p] = ONE - transmittance[l]
                 stops[p] = wp.int32(stop[l])
 
@@ -238,11 +242,13 @@ def collect_rows_backward_kernel(
         reaches: wp.array(dtype=vec2),
         rows: wp.array(dtype=wp.int32),
         plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
         weights: wp.array2d(dtype=real),
         alphas: wp.array(dtype=real),
         stops: wp.array(dtype=wp.int32),
         grad_plain: wp.array(dtype=vec3),
+        grad_base: wp.array(dtype=vec3),
         grad_depths: wp.array2d(dtype=real),
         grad_weights: wp.array2d(dtype=real),
         grad_alphas: wp.array(dtype=real),
@@ -263,6 +269,9 @@ def collect_rows_backward_kernel(
         grad_red = lane()
         grad_green = lane()
         grad_blue = lane()
+        base_red = lane()
+        base_green = lane()
+        base_blue = lane()
         grad_alpha_sum = lane()
         rest = lane()
         error = lane()
@@ -278,8 +287,12 @@ def collect_rows_backward_kernel(
                 grad_red[l] = gn[0]
                 grad_green[l] = gn[1]
                 grad_blue[l] = gn[2]
+                gb = grad_base[p]
+                base_red[l] = gb[0]
+                base_green[l] = gb[1]
+                base_blue[l] = gb[2]
                 grad_alpha_sum[l] = grad_alphas[p]
-                total = wp.dot(gn, plain[p]) + grad_alphas[p] * alphas[p]
+                total = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + grad_alphas[p] * alphas[p]
                 for j in range(wp.static(max_hits)):
                     slots[j, l] = integer(ids[p, j])
                     gw[j, l] = grad_weights[p, j]
@@ -321,8 +334,10 @@ def collect_rows_backward_kernel(
                 q += f.pick(same, gw[j], lane())
                 gt = f.pick(same, gd[j], gt)
                 buffered = f.either(buffered, same)
-            q += f.pick(buffered, lane(), grad_red * rc[0] + grad_green * rc[1] + grad_blue * rc[2])
-            bare = f.pick(buffered, lane(), weight)
+            red_ = f.pick(buffered, base_red, grad_red)
+            green_ = f.pick(buffered, base_green, grad_green)
+            blue_ = f.pick(buffered, base_blue, grad_blue)
+            q += red_ * rc[0] + green_ * rc[1] + blue_ * rc[2]
             rest -= wp.cw_mul(q, weight)
             grad_alpha = wp.cw_mul(transmittance, q) - wp.cw_div(rest, one - alpha)
             transmittance = wp.cw_mul(transmittance, one - alpha)
@@ -346,7 +361,7 @@ def collect_rows_backward_kernel(
             wp.atomic_add(grad_records, row, 0, g0)
             wp.atomic_add(grad_records, row, 1, g1)
             wp.atomic_add(grad_records, row, 2, g2)
-            colors = vec4(inner(grad_red, bare), inner(grad_green, bare), inner(grad_blue, bare), gm)
+            colors = vec4(inner(red_, weight), inner(green_, weight), inner(blue_, weight), gm)
             wp.atomic_add(grad_records, row, 3, colors)
             if wp.static(low_pass):
                 wp.atomic_add(grad_centers, row, gc)

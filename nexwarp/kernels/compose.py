@@ -1,6 +1,6 @@
-"""Composition (paper Eq. 5): image = plain + sum_k weight_k T_k + (1 - alpha) background.
+"""Composition (paper Eq. 5): image = plain + textured + (1 - alpha) background, textured = base + sum_k weight_k T_k.
 
-One thread a pixel; Warp's own adjoint.
+Without `base`, a null array, it is 0. One thread a pixel; Warp's own adjoint.
 """
 
 import functools
@@ -20,6 +20,7 @@ def compose_kernel(real: type) -> wp.Kernel:
     def compose(
         first: wp.int32,
         plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
         colors: wp.array2d(dtype=vec3),
         weights: wp.array2d(dtype=real),
         alphas: wp.array(dtype=real),
@@ -30,6 +31,8 @@ def compose_kernel(real: type) -> wp.Kernel:
     ):
         p = first + wp.tid()
         total = vec3()
+        if base:
+            total += base[p]
         for h in range(weights.shape[1]):
             total += colors[p, h] * weights[p, h]
         textured[p] = total

@@ -165,7 +165,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
 
 @functools.cache
 def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool) -> SimpleNamespace:
-    """Make the kernels of 0.5 + SH(ray direction); coefficients from the field are in rows coefficient * 3 + channel.
+    """Make the kernels of offset + SH(ray direction); coefficients from the field are in rows coefficient * 3 + channel.
 
     The backward kernel stores grad_coefficients times `scale[0]`, so that half precision holds them.
     """
@@ -175,8 +175,8 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
     vec = wp.types.vector(length=count, dtype=real)
 
     @wp.func
-    def color_of(coefficients: wp.array2d(dtype=storage), i: int, b: vec):
-        color = vec3(real(0.5), real(0.5), real(0.5))
+    def color_of(coefficients: wp.array2d(dtype=storage), i: int, b: vec, offset: real):
+        color = vec3(offset, offset, offset)
         for k in range(wp.static(count)):
             color[0] += real(coefficients[3 * k, i]) * b[k]
             color[1] += real(coefficients[3 * k + 1, i]) * b[k]
@@ -193,11 +193,12 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
         coefficients: wp.array2d(dtype=storage),
         directions: wp.array(dtype=vec3),
         hits: wp.int32,
+        offset: real,
         # outputs
         colors: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
-        color = color_of(coefficients, i, basis(directions[i // hits]))
+        color = color_of(coefficients, i, basis(directions[i // hits]), offset)
         if wp.static(clamp):
             color = wp.max(color, vec3())
         colors[i] = color
@@ -208,6 +209,7 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
         coefficients: wp.array2d(dtype=storage),
         directions: wp.array(dtype=vec3),
         hits: wp.int32,
+        offset: real,
         scale: wp.array(dtype=real),
         grad_colors: wp.array(dtype=vec3),
         # outputs
@@ -219,7 +221,7 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
         b = basis(direction)
         grad = grad_colors[i]
         if wp.static(clamp):
-            color = color_of(coefficients, i, b)
+            color = color_of(coefficients, i, b, offset)
             for c in range(3):
                 if not (color[c] > real(0.0)):
                     grad[c] = real(0.0)

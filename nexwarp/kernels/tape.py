@@ -55,6 +55,7 @@ class Hits(NamedTuple):
     """Buffers of the collection pass over the pixels P = height * width, see `nexwarp.ops.Hits`."""
 
     plain: wp.array
+    base: wp.array
     ids: wp.array
     depths: wp.array
     weights: wp.array
@@ -223,12 +224,13 @@ def collect(
     max_hits: int,
     low_pass: bool = False,
 ) -> Hits:
-    """Collection pass; plain, depths, weights and alphas differentiate to records and, with low_pass, centers."""
+    """Collection pass; plain, base, depths, weights and alphas differentiate to records and, with low_pass, centers."""
     real = _real(records)
     t = types(real)
     pixels, slots = image.size[0] * image.size[1], max(max_hits, 1)
     hits = Hits(
         plain=_new(records, pixels, t.vec3),
+        base=_new(records, pixels, t.vec3),
         ids=_new(records, (pixels, slots), wp.int32, requires_grad=False),
         depths=_new(records, (pixels, slots), real),
         weights=_new(records, (pixels, slots), real),
@@ -243,13 +245,13 @@ def collect(
     _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
 
     def backward() -> None:
-        found = [hits.plain, hits.ids, hits.weights, hits.alphas, hits.stops]
-        grads = [hits.plain.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
+        found = [hits.plain, hits.base, hits.ids, hits.weights, hits.alphas, hits.stops]
+        grads = [hits.plain.grad, hits.base.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
         kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
         outputs = [records.grad, centers.grad, None]
         _silent(kernel, threads, [*inputs, None, *found, *grads, None], outputs, BLOCK_DIM)
 
-    tape.record_func(backward, [records, centers, hits.plain, hits.depths, hits.weights, hits.alphas])
+    tape.record_func(backward, [records, centers, hits.plain, hits.base, hits.depths, hits.weights, hits.alphas])
     return hits
 
 
@@ -286,20 +288,25 @@ def hashgrid(
 
 
 def textured_colors(
-    tape: wp.Tape, coefficients: wp.array, directions: wp.array, degree: int, clamp: bool = False
+    tape: wp.Tape,
+    coefficients: wp.array,
+    directions: wp.array,
+    degree: int,
+    clamp: bool = False,
+    offset: float = 0.5,
 ) -> wp.array:
-    """Colours (n) vec3 of coefficients (3 (degree + 1)^2, n) along directions (P) vec3, n = P * K."""
+    """Colours offset + SH (n) vec3 of coefficients (3 (degree + 1)^2, n) along directions (P) vec3, n = P * K."""
     real, count = _real(coefficients), coefficients.shape[1]
     hits = count // max(len(directions), 1)
     kernels = textured_colors_kernels(real, real, degree, clamp)
     colors = _new(coefficients, count, directions.dtype)
-    _silent(kernels.forward, count, [coefficients, directions, hits], [colors])
+    _silent(kernels.forward, count, [coefficients, directions, hits, offset], [colors])
     one = wp.ones(1, dtype=real, device=coefficients.device)
 
     def backward() -> None:
         points = _new(colors, count, directions.dtype, requires_grad=False)
         # The kernel stores the gradient of the coefficients, which nothing else reads.
-        inputs = [coefficients, directions, hits, one, colors.grad]
+        inputs = [coefficients, directions, hits, offset, one, colors.grad]
         _silent(kernels.backward, count, inputs, [coefficients.grad, points])
         _silent(_add_runs, len(directions), [points, hits], [directions.grad])
 
@@ -308,10 +315,16 @@ def textured_colors(
 
 
 def compose(
-    tape: wp.Tape, plain: wp.array, colors: wp.array, weights: wp.array, alphas: wp.array, background: wp.array
+    tape: wp.Tape,
+    plain: wp.array,
+    colors: wp.array,
+    weights: wp.array,
+    alphas: wp.array,
+    background: wp.array,
+    base: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
-    """Image and textured, (P) vec3 each, of plain (P) vec3, colors (P, K) vec3, weights (P, K), alphas (P)."""
+    """Image and textured, (P) vec3 each, of plain and base (P) vec3, colors (P, K) vec3, weights (P, K), alphas (P)."""
     image, textured = _new(plain, plain.shape, plain.dtype), _new(plain, plain.shape, plain.dtype)
-    inputs = [plain, colors, weights, alphas, background]
+    inputs = [plain, base, colors, weights, alphas, background]
     _launch(tape, compose_kernel(_real(plain)), len(plain), inputs, [image, textured])
     return image, textured

@@ -1,4 +1,4 @@
-"""Collection pass: the K heaviest hits of every pixel and the plain colour of all others."""
+"""Collection pass: the K heaviest hits of every pixel, their plain colour, and that of all others."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -42,6 +42,7 @@ class Hits:
 
     Attributes:
         plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 4); differentiable.
+        base: (H, W, 3) the same sum over the hits in the buffer: their colour without a texture; differentiable.
         ids: (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots.
         depths: (H, W, K) z-depths in world units, 0 in empty slots; differentiable.
         weights: (H, W, K), 0 in empty slots; differentiable.
@@ -51,6 +52,7 @@ class Hits:
     """
 
     plain: torch.Tensor
+    base: torch.Tensor
     ids: torch.Tensor
     depths: torch.Tensor
     weights: torch.Tensor
@@ -183,13 +185,14 @@ class _Collect(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         real = real_of(records)
         shape = (camera.height, camera.width)
-        plain = records.new_empty(*shape, 3)
+        plain, base = (records.new_empty(*shape, 3) for _ in range(2))
         ids = torch.empty(*shape, max_hits, dtype=torch.int32, device=records.device)
         depths, weights = (records.new_empty(*shape, max_hits) for _ in range(2))
         alphas = records.new_empty(shape)
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
         outputs = [
             array(plain.view(-1, 3), types(real).vec3),
+            array(base.view(-1, 3), types(real).vec3),
             array(ids.view(-1, max_hits) if max_hits else ids.new_empty(1, 1), wp.int32),
             array(depths.view(-1, max_hits) if max_hits else depths.new_empty(1, 1), real),
             array(weights.view(-1, max_hits) if max_hits else weights.new_empty(1, 1), real),
@@ -202,23 +205,24 @@ class _Collect(torch.autograd.Function):
             _walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
         else:
             _walk(records, collect_kernel(real, max_hits, low_pass, tiles.tile_size), tiles, inputs, outputs)
-        ctx.save_for_backward(records, centers, limits, plain, ids, weights, alphas, stops)
+        ctx.save_for_backward(records, centers, limits, plain, base, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, watch)
-        return plain, ids, depths, weights, alphas, stops
+        return plain, base, ids, depths, weights, alphas, stops
 
     @staticmethod
     @once_differentiable
     def backward(
         ctx: Any,
         grad_plain: torch.Tensor,
+        grad_base: torch.Tensor,
         _ids: None,
         grad_depths: torch.Tensor,
         grad_weights: torch.Tensor,
         grad_alphas: torch.Tensor,
         _stops: None,
     ) -> tuple[torch.Tensor | None, ...]:
-        records, centers, limits, plain, ids, weights, alphas, stops = ctx.saved_tensors
+        records, centers, limits, plain, base, ids, weights, alphas, stops = ctx.saved_tensors
         tiles, camera, max_hits, low_pass, watch = ctx.rest
         real = real_of(records)
         t = types(real)
@@ -236,11 +240,13 @@ class _Collect(torch.autograd.Function):
             array(tiles.reaches, t.vec2),
             array(rows, wp.int32),
             array(plain.view(-1, 3), t.vec3),
+            array(base.view(-1, 3), t.vec3),
             buffer(ids, wp.int32),
             buffer(weights, real),
             array(alphas.view(-1), real),
             array(stops.view(-1), wp.int32),
             array(grad_plain.contiguous().view(-1, 3), t.vec3),
+            array(grad_base.contiguous().view(-1, 3), t.vec3),
             buffer(grad_depths, real),
             buffer(grad_weights, real),
             array(grad_alphas.contiguous().view(-1), real),

@@ -16,6 +16,7 @@ def compose(
     weights: torch.Tensor,
     alpha: torch.Tensor,
     background: torch.Tensor,
+    base: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Add up the passes (paper Eq. 5); differentiable in every argument.
 
@@ -25,16 +26,19 @@ def compose(
         weights: (H, W, K) their weights.
         alpha: (H, W).
         background: (3,).
+        base: (H, W, 3) what `colors` are added to, once blended; None where they stand alone.
 
     Returns:
-        (H, W, 3) image = plain + textured + (1 - alpha) background, and (H, W, 3) textured = sum_k weight_k colour_k.
+        (H, W, 3) image = plain + textured + (1 - alpha) background, and (H, W, 3) textured = base + sum_k weight_k
+        colour_k.
     """
-    return _Compose.apply(*(x.contiguous() for x in (plain, colors, weights, alpha, background)))
+    inputs = (plain, base, colors, weights, alpha, background)
+    return _Compose.apply(*(None if x is None else x.contiguous() for x in inputs))
 
 
 def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
     vec3 = types(real).vec3
-    plain, colors, weights, alpha, background = tensors
+    plain, base, colors, weights, alpha, background = tensors
 
     def flat(x: torch.Tensor | None, *shape: int) -> torch.Tensor | None:
         return None if x is None else x.reshape(-1, *shape) if x.numel() else x.view(x.shape[0] * x.shape[1], *shape)
@@ -42,6 +46,7 @@ def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
     hits = next((x.shape[2] for x in (weights, colors) if x is not None), 0)
     return [
         array(flat(plain, 3), vec3),
+        array(flat(base, 3), vec3),
         array(flat(colors, hits, 3), vec3),
         array(flat(weights, hits), real),
         array(flat(alpha), real),
@@ -51,7 +56,7 @@ def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
 
 class _Compose(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Any, *inputs: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
         plain = inputs[0]
         real = real_of(plain)
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
@@ -64,9 +69,9 @@ class _Compose(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_image: torch.Tensor, grad_textured: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        plain, alpha = inputs[0], inputs[3]
+        plain, alpha = inputs[0], inputs[4]
         real = real_of(plain)
-        grads = [grad_like(x, need) for x, need in zip(inputs[:4], ctx.needs_input_grad, strict=False)]
+        grads = [grad_like(x, need) for x, need in zip(inputs[:5], ctx.needs_input_grad, strict=False)]
         incoming = [array(x.contiguous().view(-1, 3), types(real).vec3) for x in (grad_image, grad_textured)]
         launch(
             plain,
@@ -77,5 +82,5 @@ class _Compose(torch.autograd.Function):
             adjoint=(_arrays(real, [*grads, None]), incoming),
         )
         # One colour for all pixels: torch's sum instead of every thread adding to one place.
-        background = (grad_image * (1 - alpha)[..., None]).sum((0, 1)) if ctx.needs_input_grad[4] else None
+        background = (grad_image * (1 - alpha)[..., None]).sum((0, 1)) if ctx.needs_input_grad[5] else None
         return (*grads, background)

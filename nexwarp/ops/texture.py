@@ -31,6 +31,7 @@ def texture(
     focal: torch.Tensor,
     *,
     directions: torch.Tensor | None = None,
+    offset: float = 0.5,
     clamp: bool = False,
     half: bool = False,
 ) -> torch.Tensor:
@@ -46,17 +47,18 @@ def texture(
         resolutions: (L,) cells per world unit.
         focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 2.
         directions: (P, 3) unit directions, world, where n = P * K and point i belongs to direction i // K.
+        offset: colour of coefficients of 0; 0 makes them residuals.
         clamp: limit colours to >= 0.
         half: keep features, activations and coefficients in half precision; gradients are scaled on the way
             and summed in float32.
 
     Returns:
-        (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours 0.5 + SH(direction).
+        (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours offset + SH(direction).
     """
     positions, depths = positions.contiguous(), depths.contiguous()
     if directions is not None:
         directions = directions.contiguous()
-    return _Texture.apply(positions, depths, directions, grid, resolutions, focal, clamp, half, *weights)
+    return _Texture.apply(positions, depths, directions, grid, resolutions, focal, offset, clamp, half, *weights)
 
 
 class _Texture(torch.autograd.Function):
@@ -69,6 +71,7 @@ class _Texture(torch.autograd.Function):
         grid: torch.Tensor,
         resolutions: torch.Tensor,
         focal: torch.Tensor,
+        offset: float,
         clamp: bool,
         half: bool,
         *weights: torch.Tensor,
@@ -93,7 +96,7 @@ class _Texture(torch.autograd.Function):
         for matrix in matrices[:-1]:
             layers.append(torch.relu_(matrix @ layers[-1]))
         coefficients = matrices[-1] @ layers[-1]
-        ctx.clamp = clamp
+        ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         ctx.save_for_backward(
             positions, depths, directions, resolutions, focal, table, coefficients, *layers, *matrices
@@ -101,7 +104,7 @@ class _Texture(torch.autograd.Function):
         if directions is None:
             return coefficients[:, :count].to(grid.dtype)
         colors = torch.empty_like(positions)
-        kernels, arguments = _colors(coefficients, directions, len(positions), clamp)
+        kernels, arguments = _colors(coefficients, directions, len(positions), offset, clamp)
         launch(
             positions,
             kernels.forward,
@@ -124,7 +127,7 @@ class _Texture(torch.autograd.Function):
             signal[:, : grad.shape[1]] = grad * scale
         else:
             signal, grad_directions = _colors_backward(
-                coefficients, directions, grad.contiguous(), scale, ctx.clamp, need_directions
+                coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
             )
         unscale = scale.reciprocal()
         grad_matrices = []
@@ -141,7 +144,7 @@ class _Texture(torch.autograd.Function):
             grad_depths if need_depths else None,
             grad_directions,
             grad_grid if need_grid else None,
-            *(None,) * 4,
+            *(None,) * 5,
             *grad_matrices,
         )
 
@@ -230,12 +233,14 @@ def _lookup_backward(
     return grad_grid, points[:, :3], points[:, 3]
 
 
-def _colors(coefficients: torch.Tensor, directions: torch.Tensor, count: int, clamp: bool) -> tuple[Any, list[Any]]:
+def _colors(
+    coefficients: torch.Tensor, directions: torch.Tensor, count: int, offset: float, clamp: bool
+) -> tuple[Any, list[Any]]:
     real, storage = real_of(directions), STORAGES[coefficients.dtype]
     degree = round((coefficients.shape[0] // 3) ** 0.5) - 1
     kernels = textured_colors_kernels(real, storage, degree, clamp)
     hits = count // max(len(directions), 1)
-    return kernels, [array(coefficients, storage), array(directions, types(real).vec3), hits]
+    return kernels, [array(coefficients, storage), array(directions, types(real).vec3), hits, offset]
 
 
 def _colors_backward(
@@ -243,6 +248,7 @@ def _colors_backward(
     directions: torch.Tensor,
     grad_colors: torch.Tensor,
     scale: torch.Tensor,
+    offset: float,
     clamp: bool,
     need_directions: bool,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -253,7 +259,7 @@ def _colors_backward(
     if signal.shape[1] > count:
         signal[:, count:] = 0
     slots = directions.new_zeros(count if need_directions else 0, 3)
-    kernels, arguments = _colors(coefficients, directions, count, clamp)
+    kernels, arguments = _colors(coefficients, directions, count, offset, clamp)
     arguments += [array(scale, real), array(grad_colors, vec3)]
     launch(
         directions,

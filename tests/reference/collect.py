@@ -15,6 +15,7 @@ class Hits:
 
     Attributes:
         plain: (H, W, 3) blended colour of the hits that are not in the buffer.
+        base: (H, W, 3) blended colour of those that are.
         ids: (H, W, K) int64, surfels in the buffer, heaviest first, -1 where empty.
         depths: (H, W, K) z-depths of the hits, 0 where empty.
         weights: (H, W, K) blending weights, 0 where empty.
@@ -22,6 +23,7 @@ class Hits:
     """
 
     plain: torch.Tensor
+    base: torch.Tensor
     ids: torch.Tensor
     depths: torch.Tensor
     weights: torch.Tensor
@@ -149,6 +151,7 @@ def collect(
     filled = weights.detach().gather(-1, heaviest) > 0
     kept = torch.zeros_like(weights, dtype=torch.bool).scatter(-1, heaviest, filled)
     plain = torch.where(kept, 0.0, weights) @ colors[order]
+    base = torch.where(kept, weights, 0.0) @ colors[order]
 
     def slots(values: torch.Tensor, empty: float) -> torch.Tensor:
         values = torch.where(filled, values, empty)
@@ -157,6 +160,7 @@ def collect(
 
     return Hits(
         plain=plain.reshape(height, width, 3),
+        base=base.reshape(height, width, 3),
         ids=slots(order[heaviest], -1),
         depths=slots(t.gather(-1, heaviest), 0.0),
         weights=slots(weights.gather(-1, heaviest), 0.0),

@@ -31,11 +31,13 @@ class Texture:
         grid: (L, T, F).
         resolutions: (L,), cells per world unit.
         mlp: weight matrices (out, in), first layer first, ReLU between them.
+        residual: colours are added to the plain ones.
     """
 
     grid: torch.Tensor
     resolutions: torch.Tensor
     mlp: Sequence[torch.Tensor]
+    residual: bool = False
 
 
 def field(texture: Texture, positions: torch.Tensor, depths: torch.Tensor, focal: float) -> torch.Tensor:
@@ -87,7 +89,8 @@ def render(
         depths = hits.depths[filled]
         coefficients = field(texture, position + depths[:, None] * rays, depths, (fx * fy) ** 0.5)
         directions = rays / rays.norm(dim=-1, keepdim=True)
-        values = 0.5 + evaluate(coefficients, directions, sh_degree)
+        values = evaluate(coefficients, directions, sh_degree)
+        values = values + (colors[hits.ids[filled]] if texture.residual else 0.5)
         texels = texels.index_put((filled,), values.clamp_min(0) if clamp_texture else values)
 
     textured = (hits.weights[..., None] * texels).sum(dim=-2)

@@ -1,0 +1,427 @@
+"""Quality on real scenes: nexwarp beside gsplat's 3DGS-MCMC, the paper's ablations, and what each change of ours is worth.
+
+    python -m benchmarks.quality train --tables peers,hits --data DIR --out results.jsonl
+    python -m benchmarks.quality table results.jsonl --out quality.md
+
+`train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
+several machines too. `table` makes Markdown of them, means and spreads over seeds; nothing is trained twice for two
+tables. Metrics are those of `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be
+had. Speed and memory of a training count when it ran alone (`--jobs 1`).
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.timing import ROOT
+from nexwarp.camera import Camera
+from nexwarp.checkpoint import save_model
+from nexwarp.config import preset, with_settings
+from nexwarp.data import Scene, View, load_scene
+from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
+from nexwarp.pictures import error_map, save_png, side_by_side
+from nexwarp.render import render
+from nexwarp.trainer import Trainer
+
+SCENES = ("fox", "saharov", "kitchen25")
+METRICS = ("psnr", "ssim", "flip", "lpips")
+UNITS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS"}
+DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4}
+GSPLAT = "gsplat MCMC"
+ARC = 8  # held-out cameras in a row
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of training.
+
+    Attributes:
+        name: as the tables print it.
+        preset: of nexwarp, or None for gsplat.
+        settings: what differs from the preset.
+    """
+
+    name: str
+    preset: str | None = "default"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        scene: folder below the data.
+        variant: "" or one of `VARIANTS`.
+        row: name of a `Row`.
+        size: budget of primitives.
+        seed: of all random choices.
+        iterations: training steps.
+    """
+
+    scene: str
+    variant: str
+    row: str
+    size: int
+    seed: int
+    iterations: int
+
+
+PAPER = Row("paper", "paper")
+DEFAULT = Row("default")
+PEER = Row(GSPLAT, None)
+# The paper's ablation (its Sec. "Ablations").
+REMOVALS = (
+    Row("no texture", settings={"max_hits": 0}),
+    Row("no gamma", settings={"rates.gammas": 0.0}),
+    Row("no higher SH of surfels", settings={"sh_degree": 0, "texture.sh_degree": 3}),
+    Row("no down-weighting", settings={"texture.down_weighting": False}),
+)
+HITS = tuple(Row(f"K = {k}", settings={"max_hits": k}) for k in (0, 1, 3, 4))
+# Each undoes one change of the default preset against the paper.
+CHANGES = (
+    Row("replacing texture", settings={"texture.residual": False}),
+    Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
+    Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),
+    Row("all points", settings={"filter_points": False}),
+    Row("random rotations", settings={"orient_points": False}),
+    Row("clamped image", settings={"clamp_image": True}),
+    Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
+    Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
+)
+ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES)}
+TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames")
+CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
+
+
+def jobs_of(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations: int, size: int) -> Iterator[Job]:
+    """Yield the trainings that a table is made of."""
+    seeds = tuple(seeds)
+
+    def each(rows: Iterable[Row], sizes: Iterable[int], variants: Iterable[str] = ("",), of: Iterable[str] = ()):
+        for scene in of or scenes:
+            for count in sizes:
+                for variant in variants:
+                    for row in rows:
+                        for seed in seeds:
+                            yield Job(scene, variant, row.name, count, seed, iterations)
+
+    if table == "peers":
+        yield from each((DEFAULT, PEER), (size, size // 4))
+    elif table == "curve":
+        yield from each((DEFAULT, PEER), CURVE, of=("fox",))
+    elif table == "paper":
+        yield from each((DEFAULT, PAPER), (size,))
+    elif table == "ablation":
+        yield from each((DEFAULT, *REMOVALS), (size,))
+    elif table == "hits":
+        yield from each((DEFAULT, *HITS), (size,))
+    elif table == "changes":
+        yield from each((DEFAULT, *CHANGES), (size,))
+    elif table == "arc":
+        yield from each((DEFAULT, PAPER), (size,), ("arc",), of=("fox",))
+    elif table == "frames":
+        yield from each((DEFAULT,), (size,), ("", "x100", "moved"), of=("fox",))
+    else:
+        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
+
+
+# Scenes
+
+
+def arc(scene: Scene) -> Scene:
+    """Hold out a run of neighbouring cameras from the middle of the capture instead of every 8th."""
+    views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
+    first = (len(views) - ARC) // 2
+    test = views[first : first + ARC]
+    return dataclasses.replace(scene, train=views[:first] + views[first + ARC :], test=test)
+
+
+def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
+    """Map world points x to factor x + shift."""
+    offset = torch.tensor(shift, dtype=torch.float64)
+
+    def view(v: View) -> View:
+        viewmat = v.camera.viewmat.double().clone()
+        viewmat[:3, 3] = factor * viewmat[:3, 3] - viewmat[:3, :3] @ offset
+        c = v.camera
+        camera = Camera(viewmat.float(), c.K, c.width, c.height, c.near * factor)
+        return dataclasses.replace(v, camera=camera)
+
+    return dataclasses.replace(
+        scene,
+        train=[view(v) for v in scene.train],
+        test=[view(v) for v in scene.test],
+        points=(factor * scene.points.double() + offset).float(),
+        scale=factor * scene.scale,
+    )
+
+
+VARIANTS = {
+    "arc": arc,
+    "x100": lambda scene: moved(scene, factor=100.0),
+    "moved": lambda scene: moved(scene, shift=(1000.0, 0.0, 0.0)),
+}
+
+
+@lru_cache(maxsize=1)
+def _scene(path: Path, variant: str) -> Scene:
+    scene = load_scene(path)
+    return VARIANTS[variant](scene) if variant else scene
+
+
+# One training
+
+
+def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path | None) -> dict[str, Any]:
+    """Train, render the test views and compare; see `Result` in the module's tables."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    scene = _scene(data / job.scene, job.variant)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    if row.preset is None:
+        pictured, facts = _train_gsplat(job, scene, device)
+    else:
+        pictured, facts = _train_nexwarp(job, row, scene, device, models)
+    if device.type == "cuda":
+        facts["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
+    views = {}
+    for view, image in pictured:
+        photo = to_uint8(view.image)
+        views[view.name] = {
+            "psnr": psnr(image, photo),
+            "ssim": ssim(image, photo),
+            "flip": flip(image, photo),
+            "lpips": lpips_vgg(image.to(device), photo.to(device)),
+        }
+        if pictures is not None:
+            name = f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}-{Path(view.name).stem}".replace(" ", "_")
+            strip = [photo, image, error_map(image, photo)]
+            captions = ["photo", f"{job.row}, {views[view.name]['psnr']:.2f} dB", "error (0 to 0.25)"]
+            save_png(pictures / f"{name}.png", side_by_side(strip, captions=captions))
+    return {
+        **asdict(job),
+        "settings": row.settings,
+        **{key: _mean(v[key] for v in views.values()) for key in METRICS},
+        **facts,
+        "views": views,
+        "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
+        "date": time.strftime("%Y-%m-%d"),
+        "commit": _commit(),
+    }
+
+
+def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None) -> tuple[Any, dict]:
+    config = with_settings(preset(row.preset), row.settings)
+    config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
+    trainer = Trainer(scene, config, device)
+    trainer.run()
+    model = trainer.model()
+    folder = ROOT / ".quality" if models is None else models
+    folder = folder / f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}".replace(" ", "_")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = save_model(folder, model)
+    megabytes = path.stat().st_size / 1e6
+    if models is None:
+        path.unlink()
+        folder.rmdir()
+    facts = {
+        "primitives": len(trainer.surfels),
+        "megabytes": megabytes,
+        "seconds": trainer.seconds,
+        "train_psnr": _train_psnr(trainer),
+    }
+    with torch.no_grad():
+        pictured = [(view, to_uint8(_image(trainer, view.camera, device)).cpu()) for view in scene.test]
+    return pictured, facts
+
+
+def _image(trainer: Trainer, camera: Camera, device: torch.device) -> torch.Tensor:
+    return render(trainer.surfels, trainer.texture, camera.to(device), **trainer.render_options()).image
+
+
+@torch.no_grad()
+def _train_psnr(trainer: Trainer) -> float:
+    """Of every 8th training view."""
+    views = trainer.scene.train[::8]
+    return statistics.fmean(
+        psnr(to_uint8(_image(trainer, view.camera, trainer.device)).cpu(), to_uint8(view.image)) for view in views
+    )
+
+
+def _train_gsplat(job: Job, scene: Scene, device: torch.device) -> tuple[Any, dict]:
+    from benchmarks import peer_gsplat
+
+    start = time.perf_counter()
+    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device)
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    seconds = time.perf_counter() - start
+    with torch.no_grad():
+        pictured = [(view, to_uint8(gaussians.render(view.camera.to(device))[0]).cpu()) for view in scene.test]
+    count = len(gaussians.splats["means"])
+    return pictured, {"primitives": count, "megabytes": gaussians.megabytes, "seconds": seconds}
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    values = [x for x in values if x is not None]
+    return statistics.fmean(values) if values else None
+
+
+@lru_cache
+def _commit() -> str:
+    """Of this checkout; NEXWARP_COMMIT names it where the files are there without their history."""
+    if name := os.environ.get("NEXWARP_COMMIT"):
+        return name
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+# Results
+
+
+def read_results(paths: Iterable[Path]) -> dict[Job, dict[str, Any]]:
+    """Results by job; of two for one job the later counts."""
+    names = [f.name for f in dataclasses.fields(Job)]
+    found = {}
+    for path in paths:
+        if path.exists():
+            for line in path.read_text().splitlines():
+                result = json.loads(line)
+                found[Job(**{name: result[name] for name in names})] = result
+    return found
+
+
+def train(given: argparse.Namespace) -> int:
+    """Do what is missing."""
+    rows = dict(ROWS)
+    wanted: dict[Job, None] = {}
+    seeds = [int(x) for x in given.seeds.split(",")]
+    scenes = given.scenes.split(",")
+    for table in filter(None, (given.tables or "").split(",")):
+        for job in jobs_of(table, scenes, seeds, given.iterations, given.size):
+            wanted[job] = None
+    for text in given.row or ():
+        # NAME:PRESET:SETTINGS, for trying things out.
+        name, base, settings = text.split(":", 2)
+        rows[name] = Row(name, base or "default", json.loads(settings or "{}")) if base != "gsplat" else Row(name, None)
+        for scene in scenes:
+            for seed in seeds:
+                wanted[Job(scene, given.variant, name, given.size, seed, given.iterations)] = None
+    have = read_results([given.out])
+    jobs = [job for job in wanted if job not in have]
+    print(f"{len(jobs)} of {len(wanted)} trainings to do")
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+        arguments = (given.data, given.pictures, given.models)
+        futures = {pool.submit(_worker, job, rows[job.row], *arguments): job for job in jobs}
+        failed = 0
+        for future in as_completed(futures):
+            job = futures[future]
+            try:
+                result = future.result() | {"jobs": given.jobs}
+            except Exception as error:  # one failure must not lose the others' results
+                failed += 1
+                print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
+                continue
+            with given.out.open("a") as file:
+                file.write(json.dumps(result) + "\n")
+            shown = ", ".join(f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None)
+            facts = f"train {result.get('train_psnr', float('nan')):.2f} dB, {result['seconds']:.0f} s"
+            print(f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {shown}, {facts}", flush=True)
+    return 1 if failed else 0
+
+
+def _worker(job: Job, row: Row, data: Path, pictures: Path | None, models: Path | None) -> dict[str, Any]:
+    return run_job(job, data, row, pictures, models)
+
+
+# Tables
+
+
+def table(given: argparse.Namespace) -> int:
+    """Write Markdown."""
+    text = markdown(read_results(given.results))
+    if given.out:
+        given.out.write_text(text)
+    else:
+        print(text)
+    return 0
+
+
+def markdown(results: dict[Job, dict[str, Any]]) -> str:
+    """All results, one table for each scene, variant, size and length, seeds together; best PSNR first."""
+    lines = ["# Quality", "", CONVENTION, ""]
+    groups: dict[tuple, dict[str, list[dict]]] = {}
+    for job, result in results.items():
+        key = (job.scene, job.variant, job.size, job.iterations)
+        groups.setdefault(key, {}).setdefault(job.row, []).append(result)
+    for (scene, variant, size, iterations), rows in sorted(groups.items()):
+        title = f"{scene}{', ' + variant if variant else ''}, {size:,} primitives, {iterations:,} iterations"
+        lines += [f"## {title}", "", "| | " + " | ".join(UNITS[m] for m in METRICS) + " | MB | s | MiB | seeds |"]
+        lines += ["|---" * (len(METRICS) + 5) + "|"]
+        for name, found in sorted(rows.items(), key=lambda item: -_mean(r["psnr"] for r in item[1])):
+            cells = [_cell([r[m] for r in found], DIGITS[m]) for m in METRICS]
+            alone = [r for r in found if r.get("jobs") == 1]
+            cells.append(_cell([r["megabytes"] for r in found], 1))
+            cells.append(_cell([r["seconds"] for r in alone], 0))
+            cells.append(_cell([r.get("peak_mib") for r in alone], 0))
+            lines.append(f"| {name} | " + " | ".join(cells) + f" | {len(found)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _cell(values: list[float | None], digits: int) -> str:
+    values = [x for x in values if x is not None]
+    if not values:
+        return ""
+    spread = f" +- {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):.{digits}f}{spread}"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(required=True)
+    training = commands.add_parser("train", help="do the trainings of some tables that are not there yet")
+    training.set_defaults(run=train)
+    training.add_argument("--tables", help=f"comma-separated: {', '.join(TABLES)}")
+    training.add_argument("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
+    training.add_argument("--variant", default="", choices=("", *VARIANTS), help="of the scene, for --row")
+    training.add_argument("--scenes", default=",".join(SCENES), help="default: %(default)s")
+    training.add_argument("--seeds", default="0,1", help="default: %(default)s")
+    training.add_argument("--size", type=int, default=40_000, help="budget of primitives (default: %(default)s)")
+    training.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
+    training.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
+    training.add_argument("--out", type=Path, default=Path("quality.jsonl"), help="default: %(default)s")
+    training.add_argument("--jobs", type=int, default=1, help="trainings at once (default: %(default)s)")
+    training.add_argument("--pictures", type=Path, help="folder for photo, render and error of each test view")
+    training.add_argument("--models", type=Path, help="folder to keep the models in")
+    tables = commands.add_parser("table", help="make Markdown of results")
+    tables.set_defaults(run=table)
+    tables.add_argument("results", type=Path, nargs="+")
+    tables.add_argument("--out", type=Path, help="file to write; default: the screen")
+    given = parser.parse_args(arguments)
+    return given.run(given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
