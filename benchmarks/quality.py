@@ -1,4 +1,4 @@
-"""Quality on real scenes: nexwarp beside gsplat's 3DGS-MCMC, the paper's ablations, and what each change of ours is worth.
+"""Quality on real scenes: nexwarp beside gsplat's 3DGS-MCMC, the paper's ablations, the worth of each change of ours.
 
     python -m benchmarks.quality train --tables peers,hits --data DIR --out results.jsonl
     python -m benchmarks.quality table results.jsonl --out quality.md
@@ -171,8 +171,17 @@ def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] =
     )
 
 
+def nearer(scene: Scene, fraction: float) -> Scene:
+    def view(v: View) -> View:
+        c = v.camera
+        return dataclasses.replace(v, camera=Camera(c.viewmat, c.K, c.width, c.height, fraction * scene.scale))
+
+    return dataclasses.replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test])
+
+
 VARIANTS = {
     "arc": arc,
+    "near": lambda scene: nearer(scene, 0.15),
     "x100": lambda scene: moved(scene, factor=100.0),
     "moved": lambda scene: moved(scene, shift=(1000.0, 0.0, 0.0)),
 }

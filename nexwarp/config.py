@@ -52,6 +52,8 @@ class TextureConfig:
     """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
     max_resolution: float | None = None
     """Of the finest level; None derives it from the footprint of the training pixels."""
+    pixels: float = 1.0
+    """Cells of the finest level a pixel, where max_resolution is derived."""
     width: int = 64
     """Of the hidden layers."""
     hidden_layers: int = 2
@@ -86,6 +88,8 @@ class Config:
     """Colour behind everything; None takes the mean colour of the training photos."""
     random_hits: bool = False
     """Draw K anew for each step, from 0 to max_hits."""
+    dropout: float = 0.0
+    """Share of the surfels that each step leaves out, at random."""
     border: float = 0.0
     """Share of the frame's size by which some steps look beyond it, where the photo's edge goes on; 0 never does."""
     border_every: int = 4

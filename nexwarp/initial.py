@@ -76,9 +76,10 @@ def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
     if shape["sh_degree"] is None:
         shape["sh_degree"] = config.sh_degree
     if shape["max_resolution"] is None:
-        shape["max_resolution"] = _pixel_resolution(scene)
+        shape["max_resolution"] = _pixel_resolution(scene) * shape["pixels"]
     if shape["min_resolution"] is None:
         shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
+    del shape["pixels"]
     return shape
 
 

@@ -30,9 +30,12 @@ class LossWeights:
     grid: float = 0.01
     """Squared values of the hash grid, each level over its resolution cubed."""
 
+    depth: float = 0.0
+    """Relative error of the depth at the points of the cloud that a photo sees."""
+
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid"):
+        for name in ("alpha", "texture", "opacity", "grid", "depth"):
             check_range(name, getattr(self, name), 0.0)
 
 

@@ -72,6 +72,8 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.views = _Views(scene.train, self.device)
+        if config.losses.depth > 0:
+            self.seen = [scene.points[view.seen.long()].to(self.device) for view in scene.train]
         self.background = mean_colour(scene.train) if config.background is None else config.background
 
     def run(self, observe: Callable[[Progress], None] | None = None) -> None:
@@ -90,13 +92,19 @@ class Trainer:
         self.iteration += 1
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
-        camera, target = self.views.get(self._next_view(), 2 if coarse else 1)
+        index = self._next_view()
+        camera, target = self.views.get(index, 2 if coarse else 1)
         self._schedule_rates()
         inside = None
         if config.border > 0 and self.iteration % config.border_every == 0:
             camera, target, inside = self._beyond_the_frame(camera, target)
-        out = render(self.surfels, self.texture if config.max_hits else None, camera, **self._training_options())
+        surfels = self.surfels
+        if config.dropout > 0:
+            surfels = surfels.thinned((torch.rand(len(surfels), device=self.device) >= config.dropout).float())
+        out = render(surfels, self.texture if config.max_hits else None, camera, **self._training_options())
         losses = self._losses(out, target, inside)
+        if config.losses.depth > 0 and config.max_hits:
+            losses["depth"] = config.losses.depth * self._depth_loss(index, camera, out)
         watch = None
         if self.densifier.active(self.iteration):
             errors = (out.image.detach() - target).abs().mean(dim=-1)
@@ -144,6 +152,18 @@ class Trainer:
         inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))[None]
         target = photo[rows.clamp(0, sizes[0] - 1)][:, columns.clamp(0, sizes[1] - 1)]
         return camera.crop(left, top, camera.width, camera.height), target, inside
+
+    def _depth_loss(self, index: int, camera: Camera, out: Rendering) -> torch.Tensor:
+        points = self.seen[index]
+        x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        depth = x[:, 2]
+        column = (camera.fx * x[:, 0] / depth + camera.cx).floor().long()
+        row = (camera.fy * x[:, 1] / depth + camera.cy).floor().long()
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (depth > camera.near)
+        row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+        weights = out.weights[row, column]
+        found = (weights * out.depths[row, column]).sum(-1) / (weights.sum(-1) + 1e-6)
+        return ((found / depth - 1).abs() * inside).mean()
 
     def model(self) -> Model:
         """Return the model as it is now."""

@@ -291,7 +291,7 @@ def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
     with_it, without = (draw(scene, make_texture(device=device, residual=flag)) for flag in (True, False))
     shift = draw(scene).textured - 0.5 * without.weights.sum(-1, keepdim=True)
     assert_close(with_it.textured, without.textured + shift, kind="value", name="textured")
-    with pytest.raises(ValueError, match="^clamp_texture: expected False with a residual texture, got True$"):
+    with pytest.raises(ValueError, match=r"^clamp_texture: expected False with a residual texture, got True$"):
         draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
 
 

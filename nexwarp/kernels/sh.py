@@ -165,7 +165,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
 
 @functools.cache
 def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool) -> SimpleNamespace:
-    """Make the kernels of offset + SH(ray direction); coefficients from the field are in rows coefficient * 3 + channel.
+    """Make the kernels of offset + SH(ray direction); the field's coefficients are in rows coefficient * 3 + channel.
 
     The backward kernel stores grad_coefficients times `scale[0]`, so that half precision holds them.
     """
