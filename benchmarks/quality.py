@@ -171,17 +171,8 @@ def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] =
     )
 
 
-def nearer(scene: Scene, fraction: float) -> Scene:
-    def view(v: View) -> View:
-        c = v.camera
-        return dataclasses.replace(v, camera=Camera(c.viewmat, c.K, c.width, c.height, fraction * scene.scale))
-
-    return dataclasses.replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test])
-
-
 VARIANTS = {
     "arc": arc,
-    "near": lambda scene: nearer(scene, 0.15),
     "x100": lambda scene: moved(scene, factor=100.0),
     "moved": lambda scene: moved(scene, shift=(1000.0, 0.0, 0.0)),
 }

@@ -72,6 +72,13 @@ class Camera:
         """(3,) centre of projection in the world frame, differentiable with respect to `viewmat`."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), those behind included."""
+        x = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depths = x[:, 2]
+        pixels = torch.stack([self.fx * x[:, 0], self.fy * x[:, 1]], dim=-1) / depths[:, None]
+        return pixels + pixels.new_tensor([self.cx, self.cy]), depths
+
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
         """Return the camera of a window of this one's image, in pixels; the window may reach beyond the image."""
         shift = self.K.new_zeros(3, 3)

@@ -52,8 +52,6 @@ class TextureConfig:
     """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
     max_resolution: float | None = None
     """Of the finest level; None derives it from the footprint of the training pixels."""
-    pixels: float = 1.0
-    """Cells of the finest level a pixel, where max_resolution is derived."""
     width: int = 64
     """Of the hidden layers."""
     hidden_layers: int = 2
@@ -84,18 +82,12 @@ class Config:
     """Iterations, of a run of 30,000, between those."""
     coarse: float = 0.0
     """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
-    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] | None = None
     """Colour behind everything; None takes the mean colour of the training photos."""
-    random_hits: bool = False
-    """Draw K anew for each step, from 0 to max_hits."""
-    dropout: float = 0.0
-    """Share of the surfels that each step leaves out, at random."""
-    border: float = 0.0
-    """Share of the frame's size by which some steps look beyond it, where the photo's edge goes on; 0 never does."""
+    border: float = 0.08
+    """Largest shift, in shares of the frame, of steps that look beyond it, where the photo's edge goes on; 0: none."""
     border_every: int = 4
     """Every how many steps that is."""
-    border_weight: float = 0.1
-    """Factor of the loss there."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     clamp_texture: bool = False
@@ -124,6 +116,8 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
+        check_range("border", self.border, 0.0, 0.5)
+        check_range("border_every", self.border_every, 1)
 
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""
@@ -179,11 +173,14 @@ PRESETS: dict[str, Config] = {
     "default": Config(),
     "paper": Config(
         preset="paper",
+        background=(0.0, 0.0, 0.0),
+        border=0.0,
         clamp_image=True,
         filter_points=False,
         orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
         texture=TextureConfig(min_resolution=16.0, max_resolution=256.0, residual=False),
+        losses=LossWeights(depth=0.0),
         densify=DensifyConfig(prune_at_cap=False),
     ),
 }

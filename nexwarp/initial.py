@@ -76,10 +76,9 @@ def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
     if shape["sh_degree"] is None:
         shape["sh_degree"] = config.sh_degree
     if shape["max_resolution"] is None:
-        shape["max_resolution"] = _pixel_resolution(scene) * shape["pixels"]
+        shape["max_resolution"] = _pixel_resolution(scene)
     if shape["min_resolution"] is None:
         shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
-    del shape["pixels"]
     return shape
 
 
@@ -88,10 +87,7 @@ def _pixel_resolution(scene: Scene) -> float:
     densities = []
     for view in scene.train:
         camera = view.camera
-        x = scene.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = x[:, 2]
-        pixel = x[:, :2] / depth[:, None] * torch.tensor([camera.fx, camera.fy])
-        pixel = pixel + torch.tensor([camera.cx, camera.cy])
+        pixel, depth = camera.project(scene.points)
         size = torch.tensor([camera.width, camera.height])
         seen = (depth > camera.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
         densities.append(camera.focal / depth[seen])

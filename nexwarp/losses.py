@@ -30,12 +30,14 @@ class LossWeights:
     grid: float = 0.01
     """Squared values of the hash grid, each level over its resolution cubed."""
 
-    depth: float = 0.0
-    """Relative error of the depth at the points of the cloud that a photo sees."""
+    depth: float = 0.1
+    """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
+    border: float = 0.1
+    """Image loss beyond the frame, where the photo's edge goes on."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "depth"):
+        for name in ("alpha", "texture", "opacity", "grid", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -143,6 +145,43 @@ def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Te
 def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
     """L_alpha: mean over the pixels of 1 - sum_k W, for (H, W, K) weights."""
     return photometric_terms(None, None, weights, None, alpha=1.0)[2]
+
+
+def border_loss(image: torch.Tensor, target: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
+    """Sum over the pixels that are not `inside` (H, W) of the L1 of (H, W, 3) images, over the number of all pixels."""
+    shape = ("H", "W", 3)
+    check_tensors({"image": (image, shape), "target": (target, shape), "inside": (inside, image.shape[:2])})
+    return ((image - target).abs().mean(-1) * ~inside).mean()
+
+
+def depth_loss(
+    depths: torch.Tensor, weights: torch.Tensor, pixels: torch.Tensor, expected: torch.Tensor
+) -> torch.Tensor:
+    """Mean over points of |expected depth of their pixel's hits / their depth - 1|; those outside the image give 0.
+
+    Args:
+        depths: (H, W, K) z-depths of the textured hits, world units.
+        weights: (H, W, K), W.
+        pixels: (M, 2) pixel coordinates of the points, x and y.
+        expected: (M,) their z-depths, those <= 0 being behind the camera.
+    """
+    check_tensors(
+        {
+            "depths": (depths, ("H", "W", "K")),
+            "weights": (weights, depths.shape),
+            "pixels": (pixels, ("M", 2)),
+            "expected": (expected, pixels.shape[:1]),
+        }
+    )
+    height, width = depths.shape[:2]
+    size = pixels.new_tensor([width, height])
+    counts = (expected > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+    # Points behind the camera have coordinates of any size, or none.
+    column, row = torch.where(counts[:, None], pixels, 0.0).long().unbind(-1)
+    shares = weights[row, column]
+    found = (shares * depths[row, column]).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
+    errors = found / torch.where(counts, expected, 1.0) - 1
+    return torch.where(counts, errors.abs(), 0.0).mean()
 
 
 def opacity_loss(opacities: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,5 @@
 """The surfels: what is learned of the geometry and of the plain (untextured) appearance (paper Sec. 3.1)."""
 
-from copy import copy
 from typing import NamedTuple
 
 import torch
@@ -59,8 +58,6 @@ class Surfels(nn.Module):
         check_coefficients("shN", raw["shN"].shape[1] + 1)
         for name in shapes:
             self.register_parameter(name, nn.Parameter(raw[name]))
-
-    _kept: torch.Tensor | None = None
 
     @classmethod
     def from_activated(
@@ -126,14 +123,7 @@ class Surfels(nn.Module):
     def activated(self) -> Activated:
         """Return what the properties of the same names do, to rounding, in one kernel."""
         raw = (self.raw_quats, self.log_scales, self.logit_opacities, self.raw_gammas)
-        shape = Activated(self.means, *ops.activate(*raw))
-        return shape if self._kept is None else shape._replace(opacities=shape.opacities * self._kept)
-
-    def thinned(self, kept: torch.Tensor) -> "Surfels":
-        """Return the same surfels, to be rendered without those that `kept` (N,), 0 or 1, leaves out."""
-        surfels = copy(self)
-        surfels._kept = kept
-        return surfels
+        return Activated(self.means, *ops.activate(*raw))
 
     @property
     def quats(self) -> torch.Tensor:

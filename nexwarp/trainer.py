@@ -19,7 +19,7 @@ from nexwarp.config import Config
 from nexwarp.data import Scene, View
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.initial import initial_surfels, texture_shape
-from nexwarp.losses import training_losses
+from nexwarp.losses import border_loss, depth_loss, training_losses
 from nexwarp.render import Rendering, render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
@@ -71,9 +71,8 @@ class Trainer:
         self.iteration = 0
         self.seconds = 0.0
         self.order: list[int] = []
+        self.points: dict[int, torch.Tensor] = {}
         self.views = _Views(scene.train, self.device)
-        if config.losses.depth > 0:
-            self.seen = [scene.points[view.seen.long()].to(self.device) for view in scene.train]
         self.background = mean_colour(scene.train) if config.background is None else config.background
 
     def run(self, observe: Callable[[Progress], None] | None = None) -> None:
@@ -98,13 +97,11 @@ class Trainer:
         inside = None
         if config.border > 0 and self.iteration % config.border_every == 0:
             camera, target, inside = self._beyond_the_frame(camera, target)
-        surfels = self.surfels
-        if config.dropout > 0:
-            surfels = surfels.thinned((torch.rand(len(surfels), device=self.device) >= config.dropout).float())
-        out = render(surfels, self.texture if config.max_hits else None, camera, **self._training_options())
+        out = render(self.surfels, self.texture if config.max_hits else None, camera, **self.render_options())
         losses = self._losses(out, target, inside)
-        if config.losses.depth > 0 and config.max_hits:
-            losses["depth"] = config.losses.depth * self._depth_loss(index, camera, out)
+        points = self._points(index)
+        if points is not None:
+            losses["depth"] = config.losses.depth * depth_loss(out.depths, out.weights, *camera.project(points))
         watch = None
         if self.densifier.active(self.iteration):
             errors = (out.image.detach() - target).abs().mean(dim=-1)
@@ -130,14 +127,10 @@ class Trainer:
             "clamp_texture": config.clamp_texture,
         }
 
-    def _training_options(self) -> dict[str, Any]:
-        options = self.render_options()
-        if self.config.random_hits:
-            options["max_hits"] = int(torch.randint(self.config.max_hits + 1, (), generator=self.generator))
-        return options
-
     def _beyond_the_frame(self, camera: Camera, photo: torch.Tensor) -> tuple[Camera, torch.Tensor, torch.Tensor]:
         """Shift the window at random; where it leaves the photo, the photo's edge goes on.
+
+        What no photo shows would otherwise be left to chance, and every test view shows some of it at its edges.
 
         Returns:
             Camera, target and where it is the photo's own (H, W).
@@ -153,17 +146,14 @@ class Trainer:
         target = photo[rows.clamp(0, sizes[0] - 1)][:, columns.clamp(0, sizes[1] - 1)]
         return camera.crop(left, top, camera.width, camera.height), target, inside
 
-    def _depth_loss(self, index: int, camera: Camera, out: Rendering) -> torch.Tensor:
-        points = self.seen[index]
-        x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = x[:, 2]
-        column = (camera.fx * x[:, 0] / depth + camera.cx).floor().long()
-        row = (camera.fy * x[:, 1] / depth + camera.cy).floor().long()
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (depth > camera.near)
-        row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-        weights = out.weights[row, column]
-        found = (weights * out.depths[row, column]).sum(-1) / (weights.sum(-1) + 1e-6)
-        return ((found / depth - 1).abs() * inside).mean()
+    def _points(self, index: int) -> torch.Tensor | None:
+        """Points (M, 3) that a view's depths are compared with; None when there are none, or nobody asks."""
+        seen = getattr(self.scene.train[index], "seen", None)
+        if self.config.losses.depth == 0 or self.config.max_hits == 0 or seen is None or len(seen) == 0:
+            return None
+        if index not in self.points:
+            self.points[index] = self.scene.points[seen.long()].to(self.device)
+        return self.points[index]
 
     def model(self) -> Model:
         """Return the model as it is now."""
@@ -261,10 +251,8 @@ class Trainer:
             loss_weights=self.config.losses,
             mask=inside,
         )
-        if inside is not None:
-            outside = ~inside
-            error = (out.image - target).abs().mean(-1) + self.config.losses.alpha * (1 - out.alpha)
-            losses["border"] = self.config.border_weight * (error * outside).mean()
+        if inside is not None and self.config.losses.border > 0:
+            losses["border"] = self.config.losses.border * border_loss(out.image, target, inside)
         return losses
 
     def _schedule_rates(self) -> None:

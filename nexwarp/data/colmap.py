@@ -24,7 +24,6 @@ class Photo:
         K: (3, 3) float64, intrinsics in pixels of a width x height image, pixel centres at +0.5.
         width: width of the COLMAP camera in pixels.
         height: height of the COLMAP camera in pixels.
-        seen: (M,) int32, places of the points that were triangulated from the photo, ascending.
     """
 
     name: str
@@ -32,7 +31,6 @@ class Photo:
     K: np.ndarray
     width: int
     height: int
-    seen: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -114,8 +112,7 @@ def read_model(path: Path) -> ColmapModel:
     images = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
     if not images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
-    rank = {index: place for place, index in enumerate(sorted(reconstruction.points3D))}
-    photos = sorted((_photo(image, folder, rank) for image in images), key=lambda photo: photo.name)
+    photos = sorted((_photo(image, folder) for image in images), key=lambda photo: photo.name)
     return ColmapModel(folder, photos, *_points(reconstruction, folder))
 
 
@@ -126,7 +123,7 @@ def _check_cameras_size(path: Path, cameras: Any) -> None:
         raise ValueError(f"{path}: truncated, expected {expected} bytes, got {path.stat().st_size}")
 
 
-def _photo(image: Any, folder: Path, rank: dict[int, int]) -> Photo:
+def _photo(image: Any, folder: Path) -> Photo:
     name, camera = image.name, image.camera
     if not name or any(".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name))):
         raise ValueError(f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it")
@@ -138,9 +135,7 @@ def _photo(image: Any, folder: Path, rank: dict[int, int]) -> Photo:
         )
     viewmat = np.eye(4)
     viewmat[:3] = image.cam_from_world().matrix()
-    observed = {point.point3D_id for point in image.points2D if point.has_point3D()}
-    seen = np.array([rank[index] for index in sorted(observed) if index in rank], dtype=np.int32)
-    return Photo(name, viewmat, np.array(camera.calibration_matrix()), int(camera.width), int(camera.height), seen)
+    return Photo(name, viewmat, np.array(camera.calibration_matrix()), int(camera.width), int(camera.height))
 
 
 def _points(reconstruction: Any, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -26,14 +26,12 @@ class View:
         image: (H, W, 3) uint8 sRGB on the CPU.
         mask: (H, W) bool, True where the photo counts; None when all of it does.
         name: name of the photo below the images folder.
-        seen: (M,) int32, the scene's points that were triangulated from it; None when unknown.
     """
 
     camera: Camera
     image: torch.Tensor
     mask: torch.Tensor | None
     name: str
-    seen: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -170,4 +168,4 @@ def _view(photo: Photo, path: Path, downscale: int, near: float) -> View:
         )
     except ValueError as error:
         raise ValueError(f"{path}: the COLMAP camera of this image is not usable: {error}") from error
-    return View(camera, image, None, photo.name, torch.from_numpy(photo.seen))
+    return View(camera, image, None, photo.name)
