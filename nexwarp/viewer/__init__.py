@@ -1,0 +1,5 @@
+"""The viewer: a trained scene, or one in training, in the browser (extra `viewer`)."""
+
+from nexwarp.viewer.viewer import Viewer
+
+__all__ = ["Viewer"]
