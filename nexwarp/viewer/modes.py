@@ -1,6 +1,6 @@
 """What the viewer shows of a rendering: every buffer as a picture, and a legend that says how to read it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -23,12 +23,13 @@ MODES = {
     "weights": "Blending weight of the hit.",
     "normal": "Normal of the hit's surfel, turned towards the camera; world x, y, z as red, green, blue.",
     "alpha": "1 - transmittance left behind the last surfel.",
-    "hit count": f"How many of K = {MAX_HITS} slots a pixel fills: surfels that its ray meets, up to {MAX_HITS}.",
+    "hit count": f"How many of a pixel's {MAX_HITS} heaviest hits weigh 1/255 or more, enough to be seen.",
 }
 TEXTURED = ("image", "textured")
 """Modes that need the neural texture."""
 BY_SLOT = ("ids", "depth", "weights", "normal")
 """Modes that show one of the K hits."""
+SEEN = 1.0 / 255.0
 QUANTILE_SAMPLES = 100_000
 
 
@@ -41,12 +42,14 @@ class Settings:
         max_hits: K, 0 to 8.
         sh_degree: 0 to 3.
         slot: which hit to show in the modes of `BY_SLOT`, 1 (heaviest) to 8.
+        as_trained: weight the texture's levels as at the photos' resolution where the picture's is finer.
     """
 
     mode: str = "image"
     max_hits: int = 2
     sh_degree: int = 3
     slot: int = 1
+    as_trained: bool = True
 
     def changed(self, **values: Any) -> "Settings":
         """Return these settings with other values, which may be anything; ValueError for what cannot be meant."""
@@ -58,6 +61,8 @@ class Settings:
             if isinstance(values[name], bool) or not isinstance(values[name], int):
                 raise ValueError(f"{name}: expected an integer, got {values[name]!r}")
             values[name] = min(max(values[name], low), high)
+        if not isinstance(values.get("as_trained", True), bool):
+            raise ValueError(f"as_trained: expected True or False, got {values['as_trained']!r}")
         return replace(self, **values)
 
 
@@ -76,16 +81,22 @@ class Picture:
 
 @torch.no_grad()
 def draw(
-    surfels: Surfels, texture: NeuralTexture | None, camera: Camera, settings: Settings, options: Mapping[str, Any]
-) -> Picture:
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    bands: Iterable[Camera],
+    settings: Settings,
+    options: Mapping[str, Any],
+    stale: Callable[[], bool] = lambda: False,
+) -> Picture | None:
     """Render one view the way the settings say.
 
     Args:
         surfels: of the model.
         texture: of the model; None where it has none.
-        camera: on the surfels' device.
+        bands: cameras of the picture's bands of rows from top to bottom, or of the whole, on the surfels' device.
         settings: what to show; its K and SH degree replace those of `options`, the degree up to that of `options`.
         options: keyword arguments of `nexwarp.render` that the model was trained with.
+        stale: asked before each band but the first; True gives the picture up, and returns None.
     """
     hits = settings.max_hits
     if settings.mode in BY_SLOT:
@@ -93,38 +104,48 @@ def draw(
     elif settings.mode == "hit count":
         hits = MAX_HITS
     chosen = {**options, "max_hits": hits, "sh_degree": min(settings.sh_degree, options["sh_degree"])}
-    out = render(surfels, texture if settings.mode in TEXTURED else None, camera, **chosen)
-    colours, span = _colours(out, surfels, camera, settings)
+    parts: list[torch.Tensor] = []
+    for camera in bands:
+        if parts and stale():
+            return None
+        out = render(surfels, texture if settings.mode in TEXTURED else None, camera, **chosen)
+        parts.append(_values(out, surfels, camera, settings))
+    colours, span = _colours(torch.cat(parts), settings.mode)
     pixels = (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
     return Picture(pixels.cpu().numpy(), span)
 
 
-def _colours(
-    out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
-) -> tuple[torch.Tensor, tuple[float, float] | None]:
-    """(H, W, 3) colours in [0, 1], black where there is nothing to tell; and the span of a scale."""
-    mode = settings.mode
-    if mode in ("image", "plain", "textured"):
-        return getattr(out, mode), None
-    if mode == "alpha":
-        return _scale(out.alpha, 0.0, 1.0), (0.0, 1.0)
+def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
+    """What a mode shows: (H, W, 3) colours, or (H, W) numbers, NaN where there is nothing to tell."""
+    mode, slot = settings.mode, settings.slot - 1
+    if mode in ("image", "plain", "textured", "alpha"):
+        return getattr(out, mode)
     if mode == "hit count":
-        count = (out.ids >= 0).sum(dim=2)
-        return _scale(count.float(), 0.0, MAX_HITS) * (count > 0)[..., None], (0.0, float(MAX_HITS))
-    slot = settings.slot - 1
+        count = (out.weights >= SEEN).sum(dim=2).to(out.weights)
+        return _where_any(count > 0, count)
     ids = out.ids[..., slot].long()
-    there = (ids >= 0)[..., None]
-    if mode == "ids":
-        return _id_colours(ids) * there, None
     if mode == "weights":
-        return _scale(out.weights[..., slot], 0.0, 1.0) * there, (0.0, 1.0)
+        return _where_any(ids >= 0, out.weights[..., slot])
     if mode == "depth":
-        low, high = _span(out.depths[..., slot][there[..., 0]])
-        return _scale(out.depths[..., slot], low, high) * there, (low, high)
-    if len(surfels) == 0:
-        return torch.zeros_like(out.image), None
+        return _where_any(ids >= 0, out.depths[..., slot])
+    if mode == "ids" or len(surfels) == 0:
+        return _id_colours(ids) * (ids >= 0)[..., None]
     normals = _normals(surfels, camera.position)[ids.clamp_min(0)]
-    return (normals * 0.5 + 0.5) * there, None
+    return (normals * 0.5 + 0.5) * (ids >= 0)[..., None]
+
+
+def _where_any(there: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    return torch.where(there, values, values.new_tensor(torch.nan))
+
+
+def _colours(values: torch.Tensor, mode: str) -> tuple[torch.Tensor, tuple[float, float] | None]:
+    """(H, W, 3) colours in [0, 1], black where there is nothing to tell; and the span of a scale."""
+    if values.ndim == 3:
+        return values, None
+    span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
+    if mode == "depth":
+        span = _span(values[~values.isnan()])
+    return _scale(values, *span) * ~values.isnan()[..., None], span
 
 
 def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:

@@ -6,6 +6,7 @@ STEP = math.sqrt(0.5)
 SMALLEST = 32  # pixels along the shorter side
 MOVING_SECONDS = 0.08
 TRAINING_SECONDS = 0.4
+BAND_SECONDS = 0.2
 LONGEST_WAIT = 1.0
 STILL_AFTER = 0.2
 
@@ -27,6 +28,10 @@ class Pace:
     def seconds(self, kind: object, pixels: float) -> float:
         """Predicted time of a picture; 0 for a kind not seen yet."""
         return self.seconds_per_pixel.get(kind, 0.0) * pixels
+
+    def bands(self, kind: object, pixels: float) -> int:
+        """How many parts to draw a picture in, so that each leaves room to look whether it is still wanted."""
+        return max(math.ceil(self.seconds(kind, pixels) / BAND_SECONDS), 1)
 
     def scale(self, kind: object, width: int, height: int, limit: float) -> float:
         """Largest scale 1, 0.71, 0.5, ... of a window at which a picture takes at most `limit` seconds.

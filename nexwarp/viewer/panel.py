@@ -80,6 +80,7 @@ class Panel:
             self._cameras(cameras)
         with tabs.add_tab("Record"):
             self._record(size)
+        gui.add_divider(order=15.0)
         gui.add_markdown(HELP, order=20.0)
 
     def _look(self, fov: float) -> None:
@@ -95,9 +96,14 @@ class Panel:
         self.sh_degree = gui.add_slider(
             "SH degree", 0, 3, 1, settings.sh_degree, hint="How much colours may change with the direction of view"
         )
-        self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, _within(fov, FOV_DEGREES), hint="Vertical")
+        self.as_trained = gui.add_checkbox(
+            "Photo detail",
+            settings.as_trained,
+            hint="Where pixels are finer than the photos', leave out texture detail that no photo has shown",
+        )
+        self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, _within(round(fov), FOV_DEGREES), hint="Vertical")
         self.status = gui.add_html("")
-        for name in ("mode", "slot", "max_hits", "sh_degree"):
+        for name in ("mode", "slot", "max_hits", "sh_degree", "as_trained"):
             self._on(getattr(self, name), lambda value, name=name: self._change(**{name: value}))
         self._on(self.fov, lambda value: self.actions.look(_within(value, FOV_DEGREES)))
         self.show(None, None)
@@ -128,13 +134,15 @@ class Panel:
         gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
         self.keyframes = gui.add_html("")
         gui.add_button("Add this view", icon="plus").on_click(lambda _: self.actions.add_keyframe())
-        gui.add_button("Remove the last", icon="backspace").on_click(lambda _: self.actions.remove_keyframe())
+        gui.add_button("Remove the last", icon="backspace", color="gray").on_click(
+            lambda _: self.actions.remove_keyframe()
+        )
         seconds = gui.add_number("Seconds", 6.0, min=0.1, max=600.0, step=0.1)
-        fps = gui.add_number("Frames a second", 30, min=1, max=120, step=1)
+        fps = gui.add_number("Frames/s", 30, min=1, max=120, step=1)
         width = gui.add_number("Width", size[0], min=16, max=8192, step=2)
         rows = gui.add_number("Height ", size[1], min=16, max=8192, step=2)
         closed = gui.add_checkbox("Closed", False, hint="Return to the first view")
-        self.play = gui.add_button("Play", icon="player-play")
+        self.play = gui.add_button("Play", icon="player-play", color="gray")
         self.play.on_click(lambda _: self.actions.play(_within(seconds.value, (0.1, 600.0)), bool(closed.value)))
         save = gui.add_button("Save path", icon="download")
         save.on_click(

@@ -1,6 +1,8 @@
 """The web server: viser, on one address and no other, for pages of its own and messages that it asked for."""
 
+import contextlib
 import errno
+import io
 import logging
 import socket
 from typing import TYPE_CHECKING, Any
@@ -35,7 +37,8 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     _check_address(host, port)
     # A page that breaks off or sends rubbish is its own affair: no traceback.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    server = viser.ViserServer(host=host, port=port, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # its banner
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     if port and server.get_port() != port:  # taken since the check; viser moves on to the next
         server.stop()
         raise _in_use(host, port)

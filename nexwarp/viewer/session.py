@@ -17,7 +17,7 @@ from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 if TYPE_CHECKING:
     import viser
 
-FRUSTUM_SIZE = 0.25  # browser units; the cameras lie within 3
+FRUSTUM_SIZE = 0.16  # browser units; the cameras lie within 3
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 PATH_COLOUR = (230, 70, 120)
 PLAY_FPS = 20
@@ -60,10 +60,8 @@ class Session:
         self.playing = threading.Event()
         self.frustums: dict[str, viser.CameraFrustumHandle] = {}
         self.frustum_shape = (True, 1.0)
-        first = next(iter(cameras.values()), None)
-        size = (first.width // 2 * 2, first.height // 2 * 2) if first is not None else (0, 0)
-        fov = float(np.rad2deg(home.fov))
-        self.panel = Panel(client.gui, self, list(cameras), fov, size if min(size) >= 480 else (1280, 720))
+        size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs want even ones
+        self.panel = Panel(client.gui, self, list(cameras), float(np.rad2deg(home.fov)), size)
         self._add_frustums()
         client.camera.on_update(self.moved)
         self.look_from(client.camera)

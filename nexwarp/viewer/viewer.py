@@ -1,6 +1,7 @@
 """The viewer: draws for every browser that looks, by itself or between the steps of a training."""
 
 import io
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.kernels.types import MAX_HITS
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 from nexwarp.viewer import pacing
@@ -65,6 +67,7 @@ class Viewer:
         self.photos, self.save_path = photos, save_path
         self.world = World.around(list(self.cameras.values()), model()[0].means)
         self.home = self._home()
+        self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
         self.pace, self.share = pacing.Pace(), pacing.Share(SHARE)
         self.sessions: dict[int, Session] = {}
         self.thumbnails: dict[str, np.ndarray] = {}
@@ -91,6 +94,9 @@ class Viewer:
 
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Draw for whoever looks, until `stop()` or Ctrl-C."""
+        if not self.pace.seconds_per_pixel:  # what the first picture compiles or loads is there when somebody comes
+            for _ in range(2):
+                self._picture(self.home, pacing.SMALLEST / min(self.home.width, self.home.height), self._settings())
         while not stop():
             self._draw_or_wait()
 
@@ -161,16 +167,17 @@ class Viewer:
             return finest if session.drawn_step != self.step and still > pacing.STILL_AFTER else 0.0
         if session.drawn_scale >= 1.0 and session.drawn_step == self.step:
             return 0.0
-        # A picture cannot be broken off: the longer the next one takes, the surer it must be that nobody moves.
-        finer = min(2.0 * session.drawn_scale, 1.0)
-        takes = self.pace.seconds(kind, finer**2 * here.width * here.height)
-        return finer if still > max(pacing.STILL_AFTER, min(takes, pacing.LONGEST_WAIT)) else 0.0
+        return min(2.0 * session.drawn_scale, 1.0) if still > pacing.STILL_AFTER else 0.0
 
     def _draw(self, session: Session, scale: float) -> None:
         # Taken first: what changes while it is drawn makes it stale.
         version, settings, here = session.version, session.settings, session.viewpoint
         session.drawn_at = time.perf_counter()
-        picture, seconds = self._picture(here, scale, settings)
+        start = time.perf_counter()
+        picture = self._picture(here, scale, settings, lambda: session.version != version or session.closed.is_set())
+        seconds = time.perf_counter() - start
+        if picture is None:
+            return
         height, width = picture.pixels.shape[:2]
         quality = 90 if scale >= 1.0 else 75
         session.client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality)
@@ -178,16 +185,21 @@ class Viewer:
         text = f"{width} x {height}, {1e3 * seconds:.0f} ms"
         session.panel.show(picture, text if scale >= 1.0 else f"{text} (window: {here.width} x {here.height})")
 
-    def _picture(self, here: Viewpoint, scale: float, settings: Settings) -> tuple[Picture, float]:
-        """A picture and the seconds it took."""
+    def _picture(
+        self, here: Viewpoint, scale: float, settings: Settings, stale: Callable[[], bool] = lambda: False
+    ) -> Picture | None:
+        """A picture; None when it was given up because it had become stale."""
         surfels, texture, options = self.model()
+        kind, pixels = _kind(settings), here.width * here.height * scale**2
+        limit = self.focal_limit if settings.as_trained else math.inf
+        bands = here.bands(scale, self.near, surfels.means, self.pace.bands(kind, pixels), limit)
         if surfels.device.type == "cuda":
             torch.cuda.synchronize(surfels.device)  # what training has queued is not the picture's cost
         start = time.perf_counter()
-        picture = draw(surfels, texture, here.camera(scale, self.near, surfels.means), settings, options)
-        seconds = time.perf_counter() - start
-        self.pace.observe(_kind(settings), picture.pixels.size // 3, seconds)
-        return picture, seconds
+        picture = draw(surfels, texture, bands, settings, options, stale)
+        if picture is not None:
+            self.pace.observe(kind, picture.pixels.size // 3, time.perf_counter() - start)
+        return picture
 
     def _screenshot(self, session: Session, height: int) -> None:
         from PIL import Image
@@ -195,7 +207,7 @@ class Viewer:
         here, settings = session.viewpoint, session.settings
         if here is None:
             return
-        picture, _ = self._picture(here, height / here.height, settings)
+        picture = self._picture(here, height / here.height, settings)
         file = io.BytesIO()
         Image.fromarray(picture.pixels).save(file, format="PNG")
         name = f"{self.title}_{settings.mode}.png".replace(" ", "_")
@@ -211,7 +223,7 @@ class Viewer:
         camera = self.cameras[name]
         here = Viewpoint(camera_to_world(camera), vertical_fov(camera), camera.width, camera.height)
         surfels, texture, options = self.model()
-        small = here.camera(min(THUMBNAIL / max(camera.width, camera.height), 1.0), self.near, surfels.means)
+        small = here.bands(min(THUMBNAIL / max(camera.width, camera.height), 1.0), self.near, surfels.means)
         pixels = draw(surfels, texture, small, Settings(max_hits=options["max_hits"]), options).pixels
         with self._lock:
             self.thumbnails[name] = pixels
@@ -279,12 +291,9 @@ class Viewer:
         self._told = (now, step)
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
-        _, texture, options = self.model()
-        hits = options["max_hits"] if texture is not None else max(options["max_hits"], 1)
-        settings = Settings(max_hits=hits)
         if self.photos is not None and not self.thumbnails:
             self.thumbnails = {name: _thumbnail(photo()) for name, photo in self.photos.items()}
-        session = Session(client, self.world, self.cameras, settings, self.home, self._news.set, self.save_path)
+        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set, self.save_path)
         with self._lock:
             if client.client_id not in self.server.get_clients():  # gone already
                 return
@@ -292,6 +301,10 @@ class Viewer:
             for name, pixels in self.thumbnails.items():
                 session.show_thumbnail(name, pixels)
         self._news.set()
+
+    def _settings(self) -> Settings:
+        """What clients see first: the picture, as it was trained."""
+        return Settings(max_hits=self.model()[2]["max_hits"])
 
     def _goodbye(self, client: "viser.ClientHandle") -> None:
         with self._lock:
@@ -302,7 +315,7 @@ class Viewer:
 
 def _kind(settings: Settings) -> tuple[bool, int]:
     """What the cost of a pixel depends on."""
-    return settings.mode in TEXTURED, settings.max_hits
+    return settings.mode in TEXTURED, MAX_HITS if settings.mode == "hit count" else settings.max_hits
 
 
 def _thumbnail(photo: torch.Tensor) -> np.ndarray:

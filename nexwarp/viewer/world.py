@@ -14,6 +14,7 @@ from nexwarp.paths import focus
 # The browser flies two units a second: with the cameras three units around, a scene is crossed in three seconds.
 RADIUS = 3.0
 MAX_SIDE = 8192
+BAND_ROWS = 16  # a tile's
 
 
 @dataclass(frozen=True)
@@ -97,13 +98,40 @@ class Viewpoint:
         pose[:3, 3] = world.to_scene(values[4:7])
         return Viewpoint(pose, float(fov), int(width), int(height))
 
-    def camera(self, scale: float, near: float, like: torch.Tensor) -> Camera:
-        """Camera of a picture `scale` times the canvas, of the dtype and on the device of a tensor."""
+    def bands(
+        self, scale: float, near: float, like: torch.Tensor, count: int = 1, focal_limit: float = math.inf
+    ) -> list[Camera]:
+        """Cameras of a picture `scale` times the canvas, in at most `count` bands of rows from top to bottom.
+
+        Args:
+            scale: of the canvas.
+            near: near depth, world units.
+            like: a tensor of the dtype and on the device to use.
+            count: how many bands; each but the last is a multiple of 16 rows high.
+            focal_limit: of `Camera.focal`, pixels: textures look as they do at that resolution.
+        """
         width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
         focal = 0.5 * height / math.tan(0.5 * self.fov)
-        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        viewmat = torch.from_numpy(np.linalg.inv(self.pose))
-        return Camera(viewmat, K.double(), width, height, near).to(like)
+        viewmat = torch.from_numpy(np.linalg.inv(self.pose)).to(like)
+        rows = -(-height // (BAND_ROWS * count)) * BAND_ROWS
+        cameras = []
+        for top in range(0, height, rows):
+            K = like.new_tensor([[focal, 0, width / 2], [0, focal, height / 2 - top], [0, 0, 1]])
+            camera = _Band(viewmat, K, width, min(rows, height - top), near)
+            object.__setattr__(camera, "focal_limit", focal_limit)
+            cameras.append(camera)
+        return cameras
+
+
+class _Band(Camera):
+    """A camera that tells the texture of no finer pixels than those it has learned from."""
+
+    focal_limit = math.inf
+
+    @property
+    def focal(self) -> float:
+        """Focal length that the texture's levels are weighted by, pixels."""
+        return min((self.fx * self.fy) ** 0.5, self.focal_limit)
 
 
 def camera_to_world(camera: Camera) -> np.ndarray:
