@@ -112,6 +112,10 @@ class Train:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run)
+        if self.view:
+            from nexwarp.viewer import check_server
+
+            check_server(self.host, self.port)
         if self.downscale < 1:
             raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
         console.print(f"{source.name} on {_name(device)}, preset {config.preset}")
@@ -274,7 +278,7 @@ class View:
         with Viewer(
             lambda: (model.surfels, model.texture if config.max_hits else None, model.render_options),
             load_cameras(self.run / CAMERAS_FILE),
-            near=model.meta["near"],
+            near=float(model.meta.get("near", 0.01)),
             title=source.name,
             host=self.host,
             port=self.port,

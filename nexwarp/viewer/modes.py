@@ -23,13 +23,13 @@ MODES = {
     "weights": "Blending weight of the hit.",
     "normal": "Normal of the hit's surfel, turned towards the camera; world x, y, z as red, green, blue.",
     "alpha": "1 - transmittance left behind the last surfel.",
-    "hit count": f"How many of a pixel's {MAX_HITS} heaviest hits weigh 1/255 or more, enough to be seen.",
+    "hit count": f"How many of a pixel's {MAX_HITS} heaviest hits weigh at least 2 %.",
 }
 TEXTURED = ("image", "textured")
 """Modes that need the neural texture."""
 BY_SLOT = ("ids", "depth", "weights", "normal")
 """Modes that show one of the K hits."""
-SEEN = 1.0 / 255.0
+COUNTED = 0.02  # a hit's weight from which "hit count" counts it; nearly all pixels have more than 8 in all
 QUANTILE_SAMPLES = 100_000
 
 
@@ -121,7 +121,7 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
     if mode in ("image", "plain", "textured", "alpha"):
         return getattr(out, mode)
     if mode == "hit count":
-        count = (out.weights >= SEEN).sum(dim=2).to(out.weights)
+        count = (out.weights >= COUNTED).sum(dim=2).to(out.weights)
         return _where_any(count > 0, count)
     ids = out.ids[..., slot].long()
     if mode == "weights":

@@ -154,6 +154,7 @@ class Panel:
                 bool(closed.value),
             )
         )
+        self.saved = gui.add_markdown("")
         self.count_keyframes(0)
 
     def count_keyframes(self, count: int) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import importlib.util
 import io
 import logging
 import socket
@@ -28,13 +29,9 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     Raises:
         ValueError: viser is not installed, or nothing can listen there, with the reason.
     """
-    try:
-        import viser
-    except ImportError:
-        raise ValueError(
-            "the viewer needs the package viser, which is not installed: pip install 'nexwarp[viewer]'"
-        ) from None
-    _check_address(host, port)
+    check_server(host, port)
+    import viser
+
     # A page that breaks off or sends rubbish is its own affair: no traceback.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
@@ -46,8 +43,10 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     return server
 
 
-def _check_address(host: str, port: int) -> None:
-    """Raise ValueError unless a server could listen; viser itself would try other ports, and for ever."""
+def check_server(host: str, port: int) -> None:
+    """Raise ValueError unless `start_server` can be expected to succeed; viser would try other ports, and for ever."""
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError("the viewer needs the package viser, found none; pip install 'nexwarp[viewer]'")
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: expected 0 to 65535, got {port}")
     try:

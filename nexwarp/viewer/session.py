@@ -207,7 +207,7 @@ class Session:
             "/path/views",
             points=self.world.to_browser(np.stack(points)).astype(np.float32),
             colors=PATH_COLOUR,
-            point_size=0.05,
+            point_size=0.03,
             point_shape="circle",
         )
         if len(self.keyframes) > 1:
@@ -233,6 +233,7 @@ class Session:
             return
         self.playing.set()
         self.panel.play.label = "Stop"
+        self.client.scene.remove_by_name("/path")  # would be in the way
         start = time.perf_counter()
         for i, key in enumerate(way):
             self.go(key.pose, key.fov)
@@ -241,6 +242,7 @@ class Session:
                 break
         self.playing.clear()
         self.panel.play.label = "Play"
+        self._show_path()
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
         """Send the path to the browser as a file, and keep it in the run."""
@@ -254,7 +256,7 @@ class Session:
             self.tell("The path was not saved", str(error))
             return
         self.client.send_file_download("camera_path.json", content, save_immediately=True)
-        self.tell("Path saved", where or "as a download, for nexwarp render RUN --path FILE")
+        self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
 
     def tell(self, title: str, text: str) -> None:
         """Show a note in the browser."""

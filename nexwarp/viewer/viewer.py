@@ -1,5 +1,6 @@
 """The viewer: draws for every browser that looks, by itself or between the steps of a training."""
 
+import contextlib
 import io
 import math
 import threading
@@ -90,7 +91,8 @@ class Viewer:
         """Let all browsers go and stop to listen."""
         for session in list(self.sessions.values()):
             session.closed.set()
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+            self.server.stop()
 
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Draw for whoever looks, until `stop()` or Ctrl-C."""
@@ -159,15 +161,17 @@ class Viewer:
         if here is None:
             return 0.0
         kind, size = _kind(session.settings), (here.width, here.height)
-        finest = 1.0 if longest is None else self.pace.scale(kind, *size, longest)
+        finest = min(1.0, math.sqrt(pacing.MOST_PIXELS / (here.width * here.height)))
+        if longest is not None:
+            finest = min(finest, self.pace.scale(kind, *size, longest))
         if session.version != session.drawn_version:
             return min(self.pace.scale(kind, *size, pacing.MOVING_SECONDS), finest)
         still = now - session.changed_at
         if longest is not None:
             return finest if session.drawn_step != self.step and still > pacing.STILL_AFTER else 0.0
-        if session.drawn_scale >= 1.0 and session.drawn_step == self.step:
+        if session.drawn_scale >= finest and session.drawn_step == self.step:
             return 0.0
-        return min(2.0 * session.drawn_scale, 1.0) if still > pacing.STILL_AFTER else 0.0
+        return min(2.0 * session.drawn_scale, finest) if still > pacing.STILL_AFTER else 0.0
 
     def _draw(self, session: Session, scale: float) -> None:
         # Taken first: what changes while it is drawn makes it stale.
@@ -249,7 +253,6 @@ class Viewer:
         distance = max(float((self.world.focus - position) @ forward), 0.1 * self.world.unit)
         start.position = self.world.to_browser(position)
         start.look_at = self.world.to_browser(position + forward * distance)
-        start.up = -self.home.pose[:3, 1]
         start.fov = self.home.fov
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         server.gui.set_panel_label(f"nexwarp · {self.title}")
