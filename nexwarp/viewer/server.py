@@ -6,6 +6,7 @@ import importlib.util
 import io
 import logging
 import socket
+import warnings
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -34,6 +35,7 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
 
     # A page that breaks off or sends rubbish is its own affair: no traceback.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab may close at any time
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         server = viser.ViserServer(host=host, port=port, verbose=False)
     if port and server.get_port() != port:  # taken since the check; viser moves on to the next

@@ -86,8 +86,10 @@ class Session:
 
     def change(self, **values: Any) -> None:
         """Change what is shown."""
-        self.settings = self.settings.changed(**values)
-        self._changed()
+        settings = self.settings.changed(**values)
+        if settings != self.settings:
+            self.settings = settings
+            self._changed()
 
     def _changed(self) -> None:
         self.version += 1

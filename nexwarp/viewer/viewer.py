@@ -74,7 +74,7 @@ class Viewer:
         self.thumbnails: dict[str, np.ndarray] = {}
         self.step = 0
         self.paused = False
-        self._told = (-pacing.LONGEST_WAIT, 0)
+        self._told: tuple[float, int] | None = None
         self._news = threading.Event()
         self._lock = threading.Lock()
         self.server = start_server(host, port)
@@ -284,13 +284,13 @@ class Viewer:
         self._news.set()
 
     def _tell(self, step: int, describe: Callable[[], str], now: float, force: bool = False) -> None:
-        at, before = self._told
-        if not force and now - at < TELL_SECONDS:
+        if not force and self._told is not None and now - self._told[0] < TELL_SECONDS:
             return
-        rate = (step - before) / (now - at)
-        pace = "paused" if self.paused else f"{rate:.1f} it/s"
+        how = "paused" if self.paused else "training"
+        if self._told is not None and not self.paused and now > self._told[0]:
+            how = f"{(step - self._told[1]) / (now - self._told[0]):.1f} it/s"
         self.progress.value = 100.0 * step / max(self.total or 1, 1)
-        self.status.content = f"**{step:,}** of {self.total:,} · {pace}  \n{describe()}"
+        self.status.content = f"**{step:,}** of {self.total:,} · {how}  \n{describe()}"
         self._told = (now, step)
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
