@@ -137,6 +137,20 @@ def test_bands_make_the_same_picture(model, camera, mode):
     assert (abs(one - many) <= 1).mean() > 0.995 and one.std() > 1
 
 
+def test_every_mode_looks_the_same_everywhere(camera, device):
+    here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 64, 48)
+    for mode in MODES:
+        one, other = (
+            draw(
+                surfels, make_texture(device=d), here.bands(1.0, 0.01, surfels.means, count=2), Settings(mode), OPTIONS
+            )
+            for d in (torch.device("cpu"), device)
+            for surfels in [make_surfels(random_scene(60, width=64, height=48, device=d))]
+        )
+        assert (np.abs(one.pixels.astype(int) - other.pixels) <= 2).mean() > 0.99, mode
+        assert one.span is None or np.allclose(one.span, other.span, rtol=1e-4)
+
+
 def test_a_stale_picture_is_given_up(model, camera):
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 64, 48)
     bands, asked = here.bands(1.0, 0.01, model[0].means, count=3), []
@@ -381,7 +395,9 @@ class Client:
 
         protocol = f"viser-v{viser.__version__}"
         url = viewer.url.replace("http", "ws")
-        self.socket = connect(url, subprotocols=[protocol], compression=None, max_size=None, **arguments)
+        self.socket = connect(
+            url, subprotocols=[protocol], compression=None, max_size=None, max_queue=None, **arguments
+        )
 
     def __enter__(self) -> "Client":
         return self
