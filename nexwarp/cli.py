@@ -1,14 +1,15 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `info`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `view`, `info`, `warmup`."""
 
 import dataclasses
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 import tyro
@@ -31,6 +32,7 @@ from nexwarp.runs import (
     METRICS_FILE,
     SceneSource,
     create_run,
+    keep_camera_path,
     keep_freed_memory,
     pick_device,
     prepare_run,
@@ -38,6 +40,9 @@ from nexwarp.runs import (
     read_run,
 )
 from nexwarp.trainer import Trainer
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
 
 # The demo is small enough for two CPU cores: a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, Any] = {
@@ -91,6 +96,12 @@ class Train:
     """Continue the run in --run."""
     overwrite: bool = False
     """Replace the run in --run."""
+    view: bool = False
+    """Show the training in the browser (extra `viewer`); afterwards the result, until Ctrl-C."""
+    host: str = "127.0.0.1"
+    """Where --view listens; 0.0.0.0 lets other machines look."""
+    port: int = 8080
+    """Of --view; 0 for any free one."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -101,6 +112,10 @@ class Train:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run)
+        if self.view:
+            from nexwarp.viewer import check_server
+
+            check_server(self.host, self.port)
         if self.downscale < 1:
             raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
         console.print(f"{source.name} on {_name(device)}, preset {config.preset}")
@@ -116,10 +131,35 @@ class Train:
         if self.resume:
             trainer.restore(run)
             console.print(f"resumed at iteration {trainer.iteration:,}")
-        else:
-            create_run(run, source, config, device.type)
-        _train(trainer, run, console)
-        _finish(trainer, scene, run, device, console)
+        with self._viewer(trainer, run, source.name, console) as viewer:
+            if not self.resume:
+                create_run(run, source, config, device.type)
+            _train(trainer, run, console, viewer)
+            _finish(trainer, scene, run, device, console)
+            if viewer is not None:
+                viewer.finish(f"{trainer.iteration:,} iterations done")
+                _show(viewer, console)
+
+    def _viewer(self, trainer: Trainer, run: Path, title: str, console: Console) -> Any:
+        """A context with the viewer of a training, or with None."""
+        if not self.view:
+            return nullcontext()
+        from nexwarp.viewer import Viewer
+
+        sets = {"train": trainer.scene.train, "test": trainer.scene.test}
+        viewer = Viewer(
+            lambda: (trainer.surfels, trainer.texture if trainer.config.max_hits else None, trainer.render_options()),
+            {group: {view.name: view.camera for view in views} for group, views in sets.items()},
+            near=trainer.scene.train[0].camera.near,
+            title=title,
+            host=self.host,
+            port=self.port,
+            photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
+            total=trainer.config.iterations,
+            save_path=partial(keep_camera_path, run),
+        )
+        console.print(f"viewer: {viewer.url}")
+        return viewer
 
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
         """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
@@ -217,6 +257,37 @@ class Render:
 
 
 @dataclass
+class View:
+    """Show a run in the browser: every pass, from anywhere, and camera paths for render (extra `viewer`)."""
+
+    run: Run_
+    """Run folder."""
+    host: str = "127.0.0.1"
+    """Where to listen; 0.0.0.0 lets other machines look."""
+    port: int = 8080
+    """To listen on; 0 for any free one."""
+    device: str | None = None
+    """`cuda` or `cpu`; CUDA where present by default."""
+
+    def __call__(self, console: Console) -> None:
+        """Listen until Ctrl-C."""
+        from nexwarp.viewer import Viewer
+
+        source, config, _ = read_run(self.run)
+        model = load(self.run).to(pick_device(self.device))
+        with Viewer(
+            lambda: (model.surfels, model.texture if config.max_hits else None, model.render_options),
+            load_cameras(self.run / CAMERAS_FILE),
+            near=float(model.meta.get("near", 0.01)),
+            title=source.name,
+            host=self.host,
+            port=self.port,
+            save_path=partial(keep_camera_path, self.run),
+        ) as viewer:
+            _show(viewer, console)
+
+
+@dataclass
 class Info:
     """Tell what a run holds."""
 
@@ -297,7 +368,14 @@ def _check_max_hits(max_hits: int | None) -> None:
         raise ValueError(f"--max-hits: expected 0 to {MAX_HITS}, got {max_hits}")
 
 
-def _train(trainer: Trainer, run: Path, console: Console) -> None:
+def _show(viewer: "Viewer", console: Console) -> None:
+    """Show a model that no longer changes."""
+    console.print(f"viewer: {viewer.url} (Ctrl-C ends it)")
+    with suppress(KeyboardInterrupt):
+        viewer.show()
+
+
+def _train(trainer: Trainer, run: Path, console: Console, viewer: "Viewer | None" = None) -> None:
     """Run the loop with its display; keep checkpoints on the way and when interrupted."""
     total = trainer.config.iterations
     every = max(total // CHECKPOINTS, 1)
@@ -306,12 +384,18 @@ def _train(trainer: Trainer, run: Path, console: Console) -> None:
 
         def observe(step: Any) -> None:
             shown(step)
+            if viewer is not None:
+                viewer.between_steps(step.iteration, partial(_describe, step), interrupted)
             if step.iteration % every == 0 or step.iteration == total or interrupted():
                 trainer.save(run)
             if interrupted():
                 raise KeyboardInterrupt
 
         trainer.run(observe)
+
+
+def _describe(step: Any) -> str:
+    return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"
 
 
 @contextmanager
@@ -389,7 +473,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
     wp.config.log_level = wp.LOG_ERROR
-    commands = {"train": Train, "eval": Eval, "render": Render, "info": Info, "warmup": Warmup}
+    commands = {"train": Train, "eval": Eval, "render": Render, "view": View, "info": Info, "warmup": Warmup}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments
     )

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from nexwarp.checkpoint import write_json
+from nexwarp.checkpoint import write_atomically, write_json
 from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
 
@@ -107,6 +107,15 @@ def read_metrics(run: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text())) if path.is_file() else {}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
+
+
+def keep_camera_path(run: Path, content: bytes) -> str:
+    """Write a camera path (JSON) into a run under the next free name, and tell how to render it."""
+    number = 1
+    while (path := run / f"camera_path_{number}.json").exists():
+        number += 1
+    write_atomically(path, content)
+    return f"nexwarp render {run} --path {path}"
 
 
 def pick_device(name: str | None) -> torch.device:

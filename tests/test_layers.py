@@ -13,7 +13,7 @@ LAYERS = [
     {"ops", "camera"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures"},
-    {"densify", "checkpoint", "evaluate"},
+    {"densify", "checkpoint", "evaluate", "viewer"},
     {"config"},
     {"initial"},
     {"trainer"},

@@ -1,0 +1,265 @@
+"""One browser tab: what it looks at, what it asks for and what it has been shown."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nexwarp.camera import Camera
+from nexwarp.viewer.camera_path import Keyframe, interpolate, path_json
+from nexwarp.viewer.modes import Settings
+from nexwarp.viewer.panel import Panel
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
+
+if TYPE_CHECKING:
+    import viser
+
+FRUSTUM_SIZE = 0.16  # browser units; the cameras lie within 3
+COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
+PATH_COLOUR = (230, 70, 120)
+PLAY_FPS = 20
+MOST_FRUSTUMS = 500
+
+
+class Session:
+    """The state of a client; its methods are called by viser's threads, its picture is drawn by another."""
+
+    def __init__(
+        self,
+        client: "viser.ClientHandle",
+        world: World,
+        cameras: Mapping[str, Camera],
+        settings: Settings,
+        home: Viewpoint,
+        wake: Callable[[], None],
+        save: Callable[[bytes], str] | None,
+    ) -> None:
+        """Make the panel and the frustums of a client.
+
+        Args:
+            client: that has connected.
+            world: the browser's frame.
+            cameras: the scene's, by name, "train/..." or "test/...".
+            settings: to start with.
+            home: where it starts.
+            wake: called when there is something new to draw.
+            save: writes a camera path into the run and tells where; None only sends it to the browser.
+        """
+        self.client, self.world, self.cameras, self.home = client, world, cameras, home
+        self.settings, self.wake, self.save = settings, wake, save
+        self.viewpoint: Viewpoint | None = None
+        self.version = 0
+        self.changed_at = time.perf_counter()
+        self.drawn_version, self.drawn_step, self.drawn_scale, self.drawn_at = -1, -1, 0.0, 0.0
+        self.screenshots: list[int] = []
+        self.keyframes: list[Keyframe] = []
+        self.closed = threading.Event()
+        self.playing = threading.Event()
+        self.frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self.frustum_shape = (True, 1.0)
+        size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs want even ones
+        self.panel = Panel(client.gui, self, list(cameras), float(np.rad2deg(home.fov)), size)
+        self._add_frustums()
+        client.camera.on_update(self.moved)
+        self.look_from(client.camera)
+
+    # What the browser tells
+
+    async def moved(self, camera: "viser.CameraHandle") -> None:
+        """Follow the browser's camera."""
+        self.look_from(camera)
+
+    def look_from(self, camera: "viser.CameraHandle") -> None:
+        """Take over a camera; one that cannot be meant is ignored."""
+        try:
+            here = Viewpoint.of(
+                camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height, self.world
+            )
+        except (TypeError, ValueError):
+            return
+        self.viewpoint = here
+        self._changed()
+        self._hide_near()
+
+    def change(self, **values: Any) -> None:
+        """Change what is shown."""
+        settings = self.settings.changed(**values)
+        if settings != self.settings:
+            self.settings = settings
+            self._changed()
+
+    def _changed(self) -> None:
+        self.version += 1
+        self.changed_at = time.perf_counter()
+        self.wake()
+
+    # Where it stands
+
+    def look(self, degrees: float) -> None:
+        """Set the vertical field of view."""
+        self.client.camera.fov = float(np.deg2rad(degrees))
+
+    def jump(self, name: str) -> None:
+        """Go to a camera of the scene; an unknown name is ignored."""
+        if name in self.cameras:
+            camera = self.cameras[name]
+            self.go(camera_to_world(camera), vertical_fov(camera))
+
+    def reset(self) -> None:
+        """Go to where the client started."""
+        self.go(self.home.pose, self.home.fov)
+
+    def go(self, pose: np.ndarray, fov: float) -> None:
+        """Stand at a (4, 4) camera-to-world pose of the scene's frame, to turn about what lies before it."""
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        position, forward = self.world.to_browser(pose[:3, 3]), pose[:3, 2]
+        distance = max(float((self.world.to_browser(self.world.focus) - position) @ forward), 0.5)
+        camera = self.client.camera
+        try:
+            with self.client.atomic():
+                camera.position = position
+                camera.wxyz = np.array([w, x, y, z])
+                camera.look_at = position + forward * distance
+                camera.fov = fov
+        except ValueError:  # the browser's last camera was none
+            return
+        self.panel.fov.value = round(float(np.rad2deg(fov)))
+
+    # Frustums
+
+    def _add_frustums(self) -> None:
+        names = list(self.cameras)
+        chosen = names[:: -(-len(names) // MOST_FRUSTUMS) or 1]
+        self.group = self.client.scene.add_frame("/cameras", show_axes=False)
+        for name in chosen:
+            camera = self.cameras[name]
+            pose = camera_to_world(camera)
+            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            frustum = self.client.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov=vertical_fov(camera),
+                aspect=camera.width / camera.height * camera.fy / camera.fx,
+                scale=FRUSTUM_SIZE,
+                thickness=1.5,
+                thickness_units="screen",
+                color=COLOURS.get(name.partition("/")[0], (160, 160, 160)),
+                wxyz=(w, x, y, z),
+                position=self.world.to_browser(pose[:3, 3]),
+                format="jpeg",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            frustum.on_click(lambda _, name=name: self.jump(name))
+            self.frustums[name] = frustum
+
+    def show_thumbnail(self, name: str, pixels: np.ndarray) -> None:
+        """Put an (h, w, 3) uint8 picture on a frustum."""
+        if name in self.frustums:
+            self.frustums[name].image = pixels
+
+    def show_cameras(self, visible: bool, size: float) -> None:
+        """Show or hide the frustums; `size` is relative to `FRUSTUM_SIZE`."""
+        self.group.visible = visible
+        if size != self.frustum_shape[1]:
+            for frustum in self.frustums.values():
+                frustum.scale = FRUSTUM_SIZE * size
+        self.frustum_shape = (visible, size)
+        self._hide_near()
+
+    def _hide_near(self) -> None:
+        """Hide frustums that the eye is inside of: they would only be in the way."""
+        if self.viewpoint is None:
+            return
+        eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
+        reach = 1.5 * FRUSTUM_SIZE * self.frustum_shape[1]
+        for frustum in list(self.frustums.values()):
+            far = bool(np.linalg.norm(frustum.position - eye) > reach)
+            if frustum.visible != far:
+                frustum.visible = far
+
+    # Screenshot and path
+
+    def take_screenshot(self, height: int) -> None:
+        """Ask for a picture of this height."""
+        self.screenshots.append(height)
+        self.wake()
+
+    def add_keyframe(self) -> None:
+        """Add the present view to the path."""
+        if self.viewpoint is not None:
+            self.keyframes.append(Keyframe(self.viewpoint.pose, self.viewpoint.fov))
+            self._show_path()
+
+    def remove_keyframe(self) -> None:
+        """Remove the path's last keyframe."""
+        if self.keyframes:
+            self.keyframes.pop()
+            self._show_path()
+
+    def _show_path(self) -> None:
+        self.panel.count_keyframes(len(self.keyframes))
+        self.client.scene.remove_by_name("/path")
+        if not self.keyframes:
+            return
+        points = [key.pose[:3, 3] for key in self.keyframes]
+        self.client.scene.add_point_cloud(
+            "/path/views",
+            points=self.world.to_browser(np.stack(points)).astype(np.float32),
+            colors=PATH_COLOUR,
+            point_size=0.03,
+            point_shape="circle",
+        )
+        if len(self.keyframes) > 1:
+            way = interpolate(self.keyframes, 24 * len(self.keyframes))
+            line = self.world.to_browser(np.stack([key.pose[:3, 3] for key in way])).astype(np.float32)
+            self.client.scene.add_line_segments(
+                "/path/way",
+                points=np.stack([line[:-1], line[1:]], axis=1),
+                colors=PATH_COLOUR,
+                thickness=2.0,
+                thickness_units="screen",
+            )
+
+    def play(self, seconds: float, closed: bool) -> None:
+        """Move along the path, once; stop when it is on its way."""
+        if self.playing.is_set():
+            self.playing.clear()
+            return
+        try:
+            way = interpolate(self.keyframes, max(round(seconds * PLAY_FPS), 2), closed)
+        except ValueError:
+            self.tell("Add at least two views first", "")
+            return
+        self.playing.set()
+        self.panel.play.label = "Stop"
+        self.client.scene.remove_by_name("/path")  # would be in the way
+        start = time.perf_counter()
+        for i, key in enumerate(way):
+            self.go(key.pose, key.fov)
+            left = max(start + (i + 1) / PLAY_FPS - time.perf_counter(), 0.0)
+            if self.closed.wait(left) or not self.playing.is_set():
+                break
+        self.playing.clear()
+        self.panel.play.label = "Play"
+        self._show_path()
+
+    def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
+        """Send the path to the browser as a file, and keep it in the run."""
+        if len(self.keyframes) < 2:
+            self.tell("Add at least two views first", "")
+            return
+        try:
+            content = path_json(self.keyframes, width, height, fps, seconds, closed)
+            where = self.save(content) if self.save is not None else None
+        except (OSError, ValueError) as error:
+            self.tell("The path was not saved", str(error))
+            return
+        self.client.send_file_download("camera_path.json", content, save_immediately=True)
+        self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
+
+    def tell(self, title: str, text: str) -> None:
+        """Show a note in the browser."""
+        self.client.add_notification(title, text, auto_close_seconds=10.0)

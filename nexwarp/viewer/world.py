@@ -1,0 +1,144 @@
+"""From the scene's frame to the browser's and back, and what a browser's camera sees."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from nexwarp.camera import Camera
+from nexwarp.paths import focus
+
+# The browser flies two units a second: with the cameras three units around, a scene is crossed in three seconds.
+RADIUS = 3.0
+MAX_SIDE = 8192
+BAND_ROWS = 16  # a tile's
+
+
+@dataclass(frozen=True)
+class World:
+    """The browser's frame: the scene's, moved and scaled so that its cameras lie within `RADIUS` of the origin.
+
+    Attributes:
+        centre: (3,) float64, scene position of the origin.
+        unit: scene units a browser unit.
+        up: (3,) float64 unit vector, up in the scene.
+        focus: (3,) float64, scene position that the first camera turns about.
+    """
+
+    centre: np.ndarray
+    unit: float
+    up: np.ndarray
+    focus: np.ndarray
+
+    @staticmethod
+    def around(cameras: Sequence[Camera], means: torch.Tensor) -> "World":
+        """Choose a frame for cameras, or, without any, for the (N, 3) means of the surfels."""
+        points = means.detach().double().cpu().numpy()
+        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        if not cameras:
+            spread = np.median(np.linalg.norm(points - middle, axis=1)) if len(points) else 1.0
+            return World(middle, float(spread) or 1.0, np.array([0.0, -1.0, 0.0]), middle)
+        poses = np.stack([camera_to_world(camera) for camera in cameras])
+        centres, axes = poses[:, :3, 3], poses[:, :3, 2]
+        centre = centres.mean(axis=0)
+        radius = np.linalg.norm(centres - centre, axis=1).max()
+        radius = radius if radius > 1e-6 * np.linalg.norm(middle - centre) else np.linalg.norm(middle - centre)
+        up = -poses[:, :3, 1].mean(axis=0)
+        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, -1.0, 0.0])
+        try:
+            target = focus(cameras).numpy()
+        except ValueError:  # parallel axes
+            target = centres[0]
+        if (target - centres[0]) @ axes[0] < 0.1 * radius:
+            target = centres[0] + axes[0] * radius
+        return World(centre, float(radius) / RADIUS or 1.0, up, target)
+
+    def to_browser(self, points: np.ndarray) -> np.ndarray:
+        """Browser positions (..., 3) of scene positions."""
+        return (points - self.centre) / self.unit
+
+    def to_scene(self, points: np.ndarray) -> np.ndarray:
+        """Scene positions (..., 3) of browser positions."""
+        return points * self.unit + self.centre
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """What a browser's canvas shows.
+
+    Attributes:
+        pose: (4, 4) float64 camera to world in the scene's frame, x right, y down, z forward.
+        fov: vertical field of view, radians.
+        width: of the canvas, pixels.
+        height: of the canvas, pixels.
+    """
+
+    pose: np.ndarray
+    fov: float
+    width: int
+    height: int
+
+    @staticmethod
+    def of(
+        wxyz: Sequence[float], position: Sequence[float], fov: float, width: int, height: int, world: World
+    ) -> "Viewpoint":
+        """Check what a browser sent; ValueError unless it is a camera."""
+        values = np.array([*wxyz, *position, fov, width, height], dtype=np.float64)
+        if values.shape != (10,) or not np.isfinite(values).all():
+            raise ValueError(f"camera: expected 10 finite numbers, got {values.tolist()}")
+        if not 1e-3 < fov < math.pi - 1e-3 or np.abs(values[:4]).max() < 1e-6 or np.abs(values[4:7]).max() > 1e9:
+            raise ValueError(f"camera: expected a rotation, a position and a field of view, got {values.tolist()}")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise ValueError(f"camera: expected a canvas of 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
+        pose[:3, 3] = world.to_scene(values[4:7])
+        return Viewpoint(pose, float(fov), int(width), int(height))
+
+    def bands(
+        self, scale: float, near: float, like: torch.Tensor, count: int = 1, focal_limit: float = math.inf
+    ) -> list[Camera]:
+        """Cameras of a picture `scale` times the canvas, in at most `count` bands of rows from top to bottom.
+
+        Args:
+            scale: of the canvas.
+            near: near depth, world units.
+            like: a tensor of the dtype and on the device to use.
+            count: how many bands; each but the last is a multiple of 16 rows high.
+            focal_limit: of `Camera.focal`, pixels: textures look as they do at that resolution.
+        """
+        width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
+        focal = 0.5 * height / math.tan(0.5 * self.fov)
+        viewmat = torch.from_numpy(np.linalg.inv(self.pose)).to(like)
+        rows = -(-height // (BAND_ROWS * count)) * BAND_ROWS
+        cameras = []
+        for top in range(0, height, rows):
+            K = like.new_tensor([[focal, 0, width / 2], [0, focal, height / 2 - top], [0, 0, 1]])
+            camera = _Band(viewmat, K, width, min(rows, height - top), near)
+            object.__setattr__(camera, "focal_limit", focal_limit)
+            cameras.append(camera)
+        return cameras
+
+
+class _Band(Camera):
+    """A camera that tells the texture of no finer pixels than those it has learned from."""
+
+    focal_limit = math.inf
+
+    @property
+    def focal(self) -> float:
+        """Focal length that the texture's levels are weighted by, pixels."""
+        return min((self.fx * self.fy) ** 0.5, self.focal_limit)
+
+
+def camera_to_world(camera: Camera) -> np.ndarray:
+    """(4, 4) float64 pose of a camera."""
+    return np.linalg.inv(camera.viewmat.detach().double().cpu().numpy())
+
+
+def vertical_fov(camera: Camera) -> float:
+    """Field of view in radians of a picture as high as the camera's, the principal point in its middle."""
+    return 2.0 * math.atan(0.5 * camera.height / camera.fy)
