@@ -289,14 +289,14 @@ class Sfm:
     """Folder of the photos (JPEG, PNG, TIFF, BMP); subfolders count."""
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder to write: images/, sparse/0/ and sfm.json, the report."""
-    options: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
+    settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
     overwrite: bool = False
     """Replace SCENE if nexwarp sfm made it."""
 
     def __call__(self, console: Console) -> None:
         """Reconstruct."""
         with display.stages(console) as observe:
-            report = reconstruct(self.photos, self.scene, self.options, overwrite=self.overwrite, observe=observe)
+            report = reconstruct(self.photos, self.scene, self.settings, overwrite=self.overwrite, observe=observe)
         console.print(display.results_table(report.rows(), str(self.scene)))
         for line in report.lines():
             console.print(line, soft_wrap=True, markup=False, highlight=False)

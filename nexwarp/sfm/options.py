@@ -14,11 +14,7 @@ EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two core
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How photos are turned into cameras and points.
-
-    Raises:
-        ValueError: a value is out of range or unknown; the message names the option.
-    """
+    """How photos are turned into cameras and points."""
 
     cameras: Cameras = "auto"
     """Which photos share a camera: those of one size and one EXIF lens and focal length (auto), all of them (single),
@@ -41,7 +37,8 @@ class SfmOptions:
     seed: int = 0
     """Of every random choice."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError, naming the option, when a value is out of range or unknown."""
         for name, choices in (("cameras", Cameras), ("camera_model", CameraModel), ("matching", Matching)):
             if getattr(self, name) not in get_args(choices):
                 expected = ", ".join(get_args(choices))

@@ -56,10 +56,11 @@ def reconstruct(
     Raises:
         FileNotFoundError: no folder `photos`.
         FileExistsError: `scene` exists and may not be replaced.
-        ValueError: too few photos, one that cannot be decoded, sizes that differ within a camera, or no model could be
+        ValueError: an option out of range, too few photos, one that cannot be decoded, sizes that differ within a camera, or no model could be
             made of them; then the message says what to do.
     """
     photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
+    options.check()
     names = list_photos(photos)
     _check_target(photos, scene, overwrite)
     with (
