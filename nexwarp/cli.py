@@ -1,4 +1,4 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `view`, `info`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `view`, `info`, `sfm`, `warmup`."""
 
 import dataclasses
 import signal
@@ -39,6 +39,7 @@ from nexwarp.runs import (
     read_metrics,
     read_run,
 )
+from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -351,6 +352,28 @@ class Warmup:
         )
 
 
+@dataclass
+class Sfm:
+    """Find the cameras of bare photos, and write a scene to train on: undistorted photos and a COLMAP model."""
+
+    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
+    """Folder of the photos (JPEG, PNG, TIFF, BMP); subfolders count."""
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Folder to write: images/, sparse/0/ and sfm.json, the report."""
+    settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
+    overwrite: bool = False
+    """Replace SCENE if nexwarp sfm made it."""
+
+    def __call__(self, console: Console) -> None:
+        """Reconstruct."""
+        with display.stages(console) as observe:
+            report = reconstruct(self.photos, self.scene, self.settings, overwrite=self.overwrite, observe=observe)
+        console.print(display.results_table(report.rows(), str(self.scene)))
+        for line in report.lines():
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
+        console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
+
+
 def pass_buffers(out: Rendering) -> dict[str, torch.Tensor]:
     """Name every pass of a rendering, for an OpenEXR file: (H, W), (H, W, 3) float or (H, W) int32 each."""
     parts = {name: getattr(out, name) for name in ("image", "plain", "textured", "alpha")}
@@ -473,7 +496,15 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
     wp.config.log_level = wp.LOG_ERROR
-    commands = {"train": Train, "eval": Eval, "render": Render, "view": View, "info": Info, "warmup": Warmup}
+    commands = {
+        "train": Train,
+        "eval": Eval,
+        "render": Render,
+        "view": View,
+        "info": Info,
+        "sfm": Sfm,
+        "warmup": Warmup,
+    }
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments
     )

@@ -17,7 +17,7 @@ LAYERS = [
     {"config"},
     {"initial"},
     {"trainer"},
-    {"runs", "console", "warmup"},
+    {"runs", "console", "warmup", "sfm"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

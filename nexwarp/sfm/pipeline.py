@@ -1,0 +1,361 @@
+"""Photos to a scene, stage by stage."""
+
+import dataclasses
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from nexwarp.checkpoint import write_json
+from nexwarp.data.colmap import pycolmap_module
+from nexwarp.sfm.colmap_scene import move_scene
+from nexwarp.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
+from nexwarp.sfm.pairs import exhaustive_pairs, sequential_pairs
+from nexwarp.sfm.photos import Photo, camera_groups, camera_model, list_photos, read_photos
+from nexwarp.sfm.report import Overlaps, SfmReport, advise, left_out
+from nexwarp.sfm.work import Count, open_database, quiet, run_stage
+
+REPORT_FILE = "sfm.json"
+JPEG_QUALITY = 95  # of undistorted photos; those in other formats stay lossless
+MATCH_BLOCK = 16  # pairs between two looks at an interruption
+MIN_MODEL = 3  # photos
+
+Observer = Callable[[str, int, int], None]
+
+
+def reconstruct(
+    photos: str | os.PathLike,
+    scene: str | os.PathLike,
+    options: SfmOptions | None = None,
+    *,
+    overwrite: bool = False,
+    observe: Observer = lambda stage, done, total: None,
+) -> SfmReport:
+    """Find cameras and points of photos, and write a COLMAP scene that `load_scene` reads.
+
+    The scene holds images/ (undistorted, names as given), sparse/0 (PINHOLE cameras) and sfm.json (the report and the
+    options). It is made in a temporary folder beside `scene` and renamed at the end; nothing stays after a failure or
+    an interruption.
+
+    Args:
+        photos: folder of the photos; subfolders count, hidden files do not.
+        scene: folder to write; must not exist, or be empty.
+        options: settings; the defaults when None.
+        overwrite: replace `scene` when it is one that this function wrote.
+        observe: called with a stage's name, what is done and of how many, now and then.
+
+    Returns:
+        What became of the photos.
+
+    Raises:
+        FileNotFoundError: no folder `photos`.
+        FileExistsError: `scene` exists and may not be replaced.
+        ValueError: an option out of range, too few photos, one that cannot be decoded, sizes that differ within a
+            camera, or no model could be made of them; then the message says what to do.
+    """
+    photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
+    options.check()
+    names = list_photos(photos)
+    _check_target(photos, scene, overwrite)
+    with (
+        _parents(scene),
+        tempfile.TemporaryDirectory(
+            dir=scene.parent, prefix=f".{scene.name}-", ignore_cleanup_errors=True
+        ) as temporary,
+        quiet(),
+    ):
+        work = _Work(photos, Path(temporary), options, observe)
+        report = work.run(names)
+        made = work.folder / "scene"
+        write_json(made / REPORT_FILE, dataclasses.asdict(report) | {"options": dataclasses.asdict(options)})
+        _publish(made, scene, work.folder / "replaced")
+    return report
+
+
+@dataclass
+class _Work:
+    """The stages, with what they hand on to each other: COLMAP's database in a temporary folder."""
+
+    photos: Path
+    folder: Path
+    options: SfmOptions
+    observe: Observer
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+    @property
+    def threads(self) -> int:
+        return self.options.threads or -1
+
+    def run(self, names: Sequence[str]) -> SfmReport:
+        with self._stage("reading", len(names)) as done:
+            photos = read_photos(self.photos, names, done)
+            groups = camera_groups(self.photos, photos, self.options.cameras)
+        with self._stage("features", len(names)) as done:
+            self._import(groups)
+            self._extract(names, done)
+        sequential = self.options.matching == "sequential" or (
+            self.options.matching == "auto" and len(names) > EXHAUSTIVE_UP_TO
+        )
+        count = len(names)
+        pairs = sequential_pairs(count, self.options.overlap) if sequential else exhaustive_pairs(count)
+        with self._stage("matching", len(pairs)) as done:
+            self._match(names, pairs, done)
+            overlaps = self._overlaps(len(pairs), sequential)
+        with self._stage("mapping", len(names)) as done:
+            models = self._map(overlaps, done)
+        registered = _names(models[0])
+        with self._stage("undistorting", len(registered)) as done:
+            sizes = self._undistort(models[0], done)
+        return SfmReport(
+            photos=len(names),
+            registered=[name for name in names if name in set(registered)],
+            left_out=left_out(overlaps, registered, [_names(model) for model in models]),
+            points=models[0].num_points3D(),
+            mean_track_length=models[0].compute_mean_track_length(),
+            mean_reprojection_error=models[0].compute_mean_reprojection_error(),
+            models=[model.num_reg_images() for model in models],
+            cameras=_cameras(models[0], {photo.name: photo for photo in photos}),
+            sizes=sizes,
+            pairs=len(pairs),
+            matched_pairs=len(overlaps.inliers),
+            matching="sequential" if sequential else "exhaustive",
+            seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
+            advice=advise(overlaps, len(registered)),
+        )
+
+    @contextmanager
+    def _stage(self, title: str, total: int) -> Iterator[Callable[[int], None]]:
+        start = time.perf_counter()
+        self.observe(title, 0, total)
+        yield lambda done: self.observe(title, min(done, total), total)
+        self.observe(title, total, total)
+        self.seconds[title] = time.perf_counter() - start
+
+    def _import(self, groups: Sequence[Sequence[Photo]]) -> None:
+        """Enter photos and cameras in the database, in one order always: the mapper's result depends on it."""
+        pycolmap = pycolmap_module()
+        with open_database(self.database):  # makes it
+            pass
+        for group in groups:
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = camera_model(group, self.options)
+            names = [photo.name for photo in group]
+            run_stage(
+                "features",
+                lambda _, names=names, reader=reader: pycolmap.import_images(
+                    self.database, self.photos, pycolmap.CameraMode.SINGLE, names, reader
+                ),
+                lambda: None,
+            )
+        by_name = {photo.name: group for group in groups for photo in group}
+        with open_database(self.database) as database:
+            camera_of = {image.camera_id: by_name[image.name] for image in database.read_all_images()}
+            for camera in database.read_all_cameras():
+                focals = [photo.focal for photo in camera_of[camera.camera_id] if photo.focal]
+                if focals:  # COLMAP looks at the first photo alone
+                    for index in camera.focal_length_idxs():
+                        camera.params[index] = median(focals)
+                camera.has_prior_focal_length = bool(focals)
+                database.update_camera(camera)
+
+    def _extract(self, names: Sequence[str], done: Callable[[int], None]) -> None:
+        pycolmap = pycolmap_module()
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.num_threads = self.threads
+        extraction.max_image_size = self.options.max_image_size
+        extraction.sift.max_num_features = self.options.max_features
+        with open_database(self.database) as database:
+            images = {image.name: image.image_id for image in database.read_all_images()}
+            count = Count((images[name] for name in names), database.exists_descriptors)
+            run_stage(
+                "features",
+                lambda token: pycolmap.extract_features(
+                    self.database,
+                    self.photos,
+                    list(names),
+                    extraction_options=extraction,
+                    device=pycolmap.Device.cpu,
+                    cancellation_token=token,
+                ),
+                lambda: done(count()),
+            )
+
+    def _match(self, names: Sequence[str], pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> None:
+        pycolmap = pycolmap_module()
+        matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+        matching.num_threads = self.threads
+        verification.ransac.random_seed = self.options.seed
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.block_size = MATCH_BLOCK
+        pairing.match_list_path = self.folder / "pairs.txt"
+        # COLMAP splits the list at spaces, which names may hold.
+        Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
+        self._rename({name: str(index) for index, name in enumerate(names)})
+        with open_database(self.database) as database:
+            images = {int(image.name): image.image_id for image in database.read_all_images()}
+            count = Count(
+                ((images[i], images[j]) for i, j in pairs), lambda ids: database.exists_two_view_geometry(*ids)
+            )
+            run_stage(
+                "matching",
+                lambda token: pycolmap.match_image_pairs(
+                    self.database, matching, pairing, verification, device=pycolmap.Device.cpu, cancellation_token=token
+                ),
+                lambda: done(count()),
+            )
+        self._rename({str(index): name for index, name in enumerate(names)})
+
+    def _rename(self, new_names: dict[str, str]) -> None:
+        with open_database(self.database) as database:
+            for image in database.read_all_images():
+                image.name = new_names[image.name]
+                database.update_image(image)
+
+    def _overlaps(self, pairs: int, sequential: bool) -> Overlaps:
+        pycolmap = pycolmap_module()
+        with open_database(self.database) as database:
+            images = {image.image_id: image.name for image in database.read_all_images()}
+            features = {name: database.num_keypoints_for_image(index) for index, name in images.items()}
+            inliers = {}
+            for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+                if count:
+                    one, other = pycolmap.pair_id_to_image_pair(pair)
+                    inliers[images[one], images[other]] = count
+        return Overlaps(features, inliers, pairs, sequential)
+
+    def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list[Any]:
+        """All models, the one to keep first."""
+        pycolmap = pycolmap_module()
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = options.mapper.num_threads = self.threads
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.options.seed
+        options.min_model_size = MIN_MODEL
+        registered = 0
+
+        def count(value: Callable[[], int]) -> Callable[[], None]:
+            def callback() -> None:
+                nonlocal registered
+                registered = value()
+
+            return callback
+
+        (self.folder / "models").mkdir()
+        found = run_stage(
+            "mapping",
+            lambda token: pycolmap.incremental_mapping(
+                self.database,
+                self.photos,
+                self.folder / "models",
+                options,
+                initial_image_pair_callback=count(lambda: 2),
+                next_image_callback=count(lambda: registered + 1),
+                cancellation_token=token,
+            ),
+            lambda: done(registered),
+        )
+        models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+        if not models or models[0].num_reg_images() < MIN_MODEL or not models[0].num_points3D():
+            best = models[0].num_reg_images() if models else 0
+            advice = "; ".join(advise(overlaps, 0))
+            raise ValueError(
+                f"{self.photos}: no scene could be made: {best} of {len(overlaps.features)} photos registered, "
+                f"expected at least {MIN_MODEL}; {len(overlaps.inliers)} of {overlaps.pairs} pairs overlap; {advice}"
+            )
+        return models
+
+    def _undistort(self, model: Any, done: Callable[[int], None]) -> list[tuple[int, int]]:
+        """Write the scene; return the sizes of its photos."""
+        pycolmap = pycolmap_module()
+        chosen, output = self.folder / "model", self.folder / "undistorted"
+        chosen.mkdir()
+        model.write_binary(str(chosen))
+        run_stage(
+            "undistorting",
+            lambda token: pycolmap.undistort_images(
+                output,
+                chosen,
+                self.photos,
+                jpeg_quality=JPEG_QUALITY,
+                num_threads=self.threads,
+                cancellation_token=token,
+            ),
+            lambda: done(sum(len(files) for _, _, files in os.walk(output / "images"))),
+        )
+        return move_scene(output, self.folder / "scene")
+
+
+def _names(model: Any) -> list[str]:
+    return [model.image(index).name for index in model.reg_image_ids()]
+
+
+def _cameras(model: Any, photos: dict[str, Photo]) -> list[dict[str, Any]]:
+    """Describe the cameras of a model before undistortion."""
+    names: dict[int, list[str]] = {}
+    for index in model.reg_image_ids():
+        names.setdefault(model.image(index).camera_id, []).append(model.image(index).name)
+    return [
+        {
+            "model": model.camera(index).model.name,
+            "params": [float(value) for value in model.camera(index).params],
+            "width": model.camera(index).width,
+            "height": model.camera(index).height,
+            "photos": len(members),
+            "exif_focal": any(photos[name].focal for name in members),
+        }
+        for index, members in sorted(names.items())
+    ]
+
+
+def _check_target(photos: Path, scene: Path, overwrite: bool) -> None:
+    """Refuse to write where that would harm something, before any work."""
+    source, target = photos.resolve(), scene.resolve()
+    if source.is_relative_to(target) or target.is_relative_to(source):
+        raise ValueError(f"{scene}: expected a scene folder apart from the photos in {photos}")
+    if not scene.exists() or (scene.is_dir() and not any(scene.iterdir())):
+        return
+    if not overwrite:
+        raise FileExistsError(f"{scene}: expected a new folder, but it exists; give --overwrite or another one")
+    if not (scene / REPORT_FILE).is_file():
+        raise FileExistsError(
+            f"{scene}: expected a scene of nexwarp sfm to overwrite, but it holds no {REPORT_FILE}; not touching it"
+        )
+
+
+@contextmanager
+def _parents(scene: Path) -> Iterator[None]:
+    """Make the folders above `scene`; take those away again that stay empty because of an error."""
+    missing = [folder for folder in scene.absolute().parents if not folder.exists()]
+    scene.absolute().parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in missing:
+            try:
+                folder.rmdir()
+            except OSError:  # not empty: somebody else uses it
+                break
+        raise
+
+
+def _publish(made: Path, scene: Path, aside: Path) -> None:
+    """Rename `made` to `scene`; an old scene goes to `aside`, and back if that fails."""
+    if not scene.exists():
+        made.rename(scene)
+        return
+    scene.rename(aside)
+    try:
+        made.rename(scene)
+    except BaseException:
+        shutil.rmtree(scene, ignore_errors=True)
+        aside.rename(scene)
+        raise
