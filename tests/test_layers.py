@@ -10,10 +10,10 @@ import pytest
 
 LAYERS = [
     {"kernels"},
-    {"ops", "camera"},
+    {"ops", "camera", "files"},
     {"data", "surfels", "texture"},
-    {"render", "losses", "metrics", "paths", "pictures"},
-    {"densify", "checkpoint", "evaluate"},
+    {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
+    {"densify", "checkpoint", "evaluate", "passes", "export"},
     {"config"},
     {"initial"},
     {"trainer"},
