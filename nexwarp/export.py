@@ -169,7 +169,7 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
     try:
         kind, (element, name, count), *properties = lines
         if kind != ["format", "binary_little_endian", "1.0"]:
-            raise ValueError(f"expected binary_little_endian 1.0, got {' '.join(kind)}")
+            raise ValueError(f"expected binary_little_endian 1.0, got {' '.join(kind[1:])}")
         if (element, name) != ("element", "vertex"):
             raise ValueError(f"expected vertices, got {element} {name}")
         wrong = next((words for words in properties if words[0] != "property" or len(words) != 3), None)

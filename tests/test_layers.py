@@ -18,6 +18,7 @@ LAYERS = [
     {"initial"},
     {"trainer"},
     {"runs", "console", "warmup"},
+    {"outputs"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

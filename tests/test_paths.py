@@ -226,18 +226,18 @@ def nearest(path: list[Camera], target: Camera) -> float:
 
 def test_interpolation_passes_through_every_key_in_turn() -> None:
     cameras = ring(6)
-    path = interpolate(cameras, 20001, keys=6)
+    path = interpolate(cameras, 2001, keys=6)
     errors = [(torch.stack([each.viewmat for each in path]) - c.viewmat).abs().amax((1, 2)) for c in cameras]
-    assert all(error.min() < 2e-3 for error in errors)
+    assert all(error.min() < 2e-2 for error in errors)
     order = [error.argmin().item() for error in errors]
-    assert order == sorted(order) and order[0] == 0 and order[-1] == 20000
+    assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
     assert nearest(path[:1], cameras[0]) < 1e-9 and nearest(path[-1:], cameras[-1]) < 1e-9
 
 
 def test_interpolation_thins_many_cameras() -> None:
     cameras = ring(50)
-    path = interpolate(cameras, 2001, keys=3)
-    expected = interpolate([cameras[0], cameras[24], cameras[49]], 2001, keys=3)
+    path = interpolate(cameras, 101, keys=3)
+    expected = interpolate([cameras[0], cameras[24], cameras[49]], 101, keys=3)
     for mine, theirs in zip(path, expected, strict=True):
         assert mine.viewmat.equal(theirs.viewmat)
     assert len(interpolate(cameras, 1)) == 1
