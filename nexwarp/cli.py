@@ -216,8 +216,8 @@ class Render:
             scale=self.scale,
         )
         device = pick_device(self.device)
-        job = order.prepare(self.run)
         model = load(self.run).to(device)
+        job = order.prepare(self.run)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
         console.print(f"{len(job)} pictures in {self.run / 'renders'}", soft_wrap=True)

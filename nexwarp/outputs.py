@@ -93,6 +93,9 @@ class RenderOrder:
         buffers: also write passes: of the still views or, where there are none, of the frames.
         size: "WIDTHxHEIGHT", or None for that of the cameras.
         scale: factor on the size of the cameras.
+
+    Raises:
+        ValueError: naming the option that is not as expected, in `prepare` too.
     """
 
     path: str | None
@@ -104,12 +107,7 @@ class RenderOrder:
     size: str | None = None
     scale: float = 1.0
 
-    def prepare(self, run: Path) -> RenderJob:
-        """Check everything and choose the cameras; writes nothing.
-
-        Raises:
-            ValueError, FileNotFoundError: naming the option or file that is not as expected.
-        """
+    def __post_init__(self) -> None:
         if self.views not in SETS:
             raise ValueError(f"--set: expected test, train or all, got {self.views!r}")
         if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
@@ -122,9 +120,17 @@ class RenderOrder:
             raise ValueError("--frames: expected with --path or --video, got it with --set alone")
         if self.fps is not None and self.video is None:
             raise ValueError("--fps: expected with --video, got it without")
-        size = self._size()
+        self._size()
         if self.video is not None:
             _check_video(self.video, FPS if self.fps is None else self.fps)
+
+    def prepare(self, run: Path) -> RenderJob:
+        """Choose the cameras; writes nothing.
+
+        Raises:
+            ValueError, FileNotFoundError: naming the option or file that is not as expected.
+        """
+        size = self._size()
         read_run(run)
         cameras = load_cameras(run / CAMERAS_FILE)
         renders, pictures = run / "renders", []

@@ -43,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene["means"] = scene["means"] - scene["means"].mean(0) + torch.tensor([1.0, -2.0, 0.3])
     create_run(run, SceneSource(str(run.parent / "scene"), "images_2"), Config(), "cpu")
     save_model(run, Model(make_surfels(scene), make_texture(), dict(META)))
-    cameras = [each.to(torch.float32) for each in ring(6, height=0.6)]
+    cameras = [each.to(torch.float32) for each in ring(6)]
     sets = {"train": dict(zip(TRAIN, cameras[1:5], strict=True)), "test": dict(zip(TEST, cameras[::5], strict=True))}
     save_cameras(run / "cameras.json", sets)
     return run
@@ -159,7 +159,9 @@ def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None
     for i, mine in enumerate(decoded):
         frame = picture(run / "renders" / "ellipse" / f"{i:04d}.png")
         assert mine.shape == frame.shape == (96, 128, 3)
-        assert (mine.int() - frame.int()).abs().float().mean() < 4.0
+        # Of noise, 4:2:0 keeps the brightness alone.
+        error = (mine.float() - frame.float()) @ torch.tensor([0.2126, 0.7152, 0.0722])
+        assert error.abs().mean() < 2.0
 
 
 def test_video_takes_its_rate_from_the_file(run: Path, tmp_path: Path) -> None:
@@ -249,7 +251,6 @@ def refuses(run: Path, capsys: pytest.CaptureFixture) -> Callable[..., None]:
     [
         (["--path", "elipse"], ["--path: expected ellipse, interpolate, spiral or a file ending in .json", "'elipse'"]),
         (["--path", "no.json"], ["no.json: no such file"]),
-        (["--path", "spiral"], ["--path spiral: cameras: expected cameras that face one way"]),
         (["--set", "val"], ["--set: expected test, train or all, got 'val'"]),
         (["--path", "ellipse", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
         (["--video", "a.mp4", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
@@ -281,6 +282,14 @@ def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
     data["camera_path"][1]["camera_to_world"] = [0.0] * 15 + [1.0]
     path.write_text(json.dumps(data))
     refuses(["render", "--path", path], f"{path}: camera_path[1]: camera_to_world: expected an invertible pose")
+
+
+def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> None:
+    around = {str(i): each.to(torch.float32) for i, each in enumerate(ring(24, height=0.6))}
+    save_cameras(run / "cameras.json", {"train": around, "test": {}})
+    refuses(["render", "--path", "spiral"], "--path spiral: cameras: expected cameras that face one way")
+    save_cameras(run / "cameras.json", {"train": {"0": around["0"]}, "test": {"1": around["1"]}})
+    refuses(["render"], "--path ellipse: cameras: expected two or more", "--frames 0 renders the still views alone")
 
 
 def test_targets_that_cannot_be_written(refuses: Callable[..., None], run: Path) -> None:
