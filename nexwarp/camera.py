@@ -76,15 +76,16 @@ class Camera:
         """Return the pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), those behind included."""
         x = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         depths = x[:, 2]
-        pixels = torch.stack([self.fx * x[:, 0], self.fy * x[:, 1]], dim=-1) / depths[:, None]
-        return pixels + pixels.new_tensor([self.cx, self.cy]), depths
+        columns, rows = self.fx * x[:, 0] / depths + self.cx, self.fy * x[:, 1] / depths + self.cy
+        return torch.stack([columns, rows], dim=-1), depths
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
         """Return the camera of a window of this one's image, in pixels; the window may reach beyond the image."""
-        shift = self.K.new_zeros(3, 3)
-        shift[0, 2], shift[1, 2] = left, top
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
         camera = copy(self)  # checked already; checking again would wait for a GPU
-        changes = {"K": self.K - shift, "width": width, "height": height, "cx": self.cx - left, "cy": self.cy - top}
+        changes = {"K": K, "width": width, "height": height, "cx": self.cx - left, "cy": self.cy - top}
         for name, value in changes.items():
             object.__setattr__(camera, name, value)
         return camera

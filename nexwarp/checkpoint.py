@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.files import written_aside
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_finite, check_range
 from nexwarp.surfels import Surfels
@@ -206,9 +207,5 @@ def write_json(path: Path, data: Any) -> None:
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file under a temporary name and rename it, so that it is there whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with written_aside(path) as temporary:
         temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

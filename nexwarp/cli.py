@@ -1,4 +1,4 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `view`, `info`, `sfm`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `sfm`, `warmup`."""
 
 import dataclasses
 import signal
@@ -22,10 +22,7 @@ from nexwarp.config import Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene
 from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.metrics import to_uint8
-from nexwarp.paths import ellipse
-from nexwarp.pictures import save_exr, save_png
-from nexwarp.render import Rendering, render
+from nexwarp.outputs import RenderOrder, export_run
 from nexwarp.runs import (
     CAMERAS_FILE,
     DEMO,
@@ -218,43 +215,78 @@ class Eval:
 
 @dataclass
 class Render:
-    """Render a run without its photos: the test views and an ellipse around the scene, as PNG files in its renders/."""
+    """Render a run, without its photos, into its renders/: still views, a camera path, a video of it, all passes.
+
+    Without options: the test views and an ellipse of 120 frames. With --path or --video that path alone, with --set
+    those views alone, with both both. docs/outputs.md describes paths and files.
+    """
 
     run: Run_
     """Run folder."""
-    frames: int = 120
-    """Views on the ellipse; 0 for none."""
+    path: str | None = None
+    """`ellipse` (the default), `spiral`, `interpolate`, or FILE.json: nerfstudio's camera path or a transforms.json."""
+    video: Path | None = None
+    """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9); needs the extra `video`."""
+    frames: int | None = None
+    """Frames of the path (120; a FILE.json says it itself); 0 for no path."""
+    fps: float | None = None
+    """Frames a second of the video (30, or what FILE.json says)."""
+    set: str | None = None
+    """Still views to render: `test`, `train` or `all`."""
     buffers: bool = False
-    """Also write each test view's passes as a multi-part OpenEXR file."""
+    """Also write all passes of each still view, or where there is none of each frame, as one OpenEXR file."""
+    size: str | None = None
+    """WIDTHxHEIGHT in pixels, such as 1920x1080; what is seen from top to bottom stays (the photos' size)."""
+    scale: float = 1.0
+    """Factor on the size, instead of --size."""
     device: str | None = None
     """`cuda` or `cpu`; CUDA where present by default."""
 
-    @torch.no_grad()
     def __call__(self, console: Console) -> None:
         """Render."""
-        if self.frames < 0:
-            raise ValueError(f"--frames: expected at least 0, got {self.frames}")
+        # The default, both, is for someone who wants to see what there is.
+        both = self.set is None and self.path is None and self.video is None
+        order = RenderOrder(
+            path=(self.path or "ellipse") if both or self.path or self.video else None,
+            video=self.video,
+            frames=self.frames,
+            fps=self.fps,
+            views="test" if both else self.set,
+            buffers=self.buffers,
+            size=self.size,
+            scale=self.scale,
+        )
         device = pick_device(self.device)
         model = load(self.run).to(device)
-        cameras = load_cameras(self.run / CAMERAS_FILE)
-        renders = self.run / "renders"
-        jobs = {
-            renders / "test" / f"{Path(name).with_suffix('')}.png": c for name, c in cameras.get("test", {}).items()
-        }
-        if self.frames:
-            try:
-                path = ellipse(list(cameras.get("train", {}).values()), self.frames)
-            except ValueError as error:
-                raise ValueError(f"{error}; --frames 0 renders the test views alone") from None
-            jobs |= {renders / "ellipse" / f"{i:04d}.png": camera for i, camera in enumerate(path)}
-        with display.counting(console, "rendering", len(jobs)) as done:
-            for file, camera in jobs.items():
-                out = render(model.surfels, model.texture, camera.to(device), **model.render_options)
-                save_png(file, to_uint8(out.image).cpu())
-                if self.buffers and file.is_relative_to(renders / "test"):
-                    save_exr(file.with_suffix(".exr"), pass_buffers(out))
-                done()
-        console.print(f"{len(jobs)} pictures in {renders}")
+        job = order.prepare(self.run)
+        with display.counting(console, "rendering", len(job)) as done:
+            job.render(model, done)
+        console.print(f"{len(job)} pictures in {self.run / 'renders'}", soft_wrap=True)
+        if self.video is not None:
+            console.print(f"{job.seconds:.2f} s of video in {self.video}", soft_wrap=True)
+
+
+@dataclass
+class Export:
+    """Export a run for other programs. docs/outputs.md describes the files.
+
+    ply: surfels.ply, the surfels with all their properties, and splats.ply, their plain appearance (without texture) as
+    Gaussians, which the viewers of 3D Gaussian splatting open.
+
+    cameras: transforms.json, all cameras as nerfstudio takes them, and camera_path.json, the same as a path by name.
+    """
+
+    run: Run_
+    """Run folder."""
+    format: str = "ply"
+    """`ply` or `cameras`."""
+    out: Path | None = None
+    """Folder to write to (RUN/export)."""
+
+    def __call__(self, console: Console) -> None:
+        """Export."""
+        for file in export_run(self.run, self.format, self.out or self.run / "export"):
+            console.print(str(file), soft_wrap=True)
 
 
 @dataclass
@@ -372,14 +404,6 @@ class Sfm:
         for line in report.lines():
             console.print(line, soft_wrap=True, markup=False, highlight=False)
         console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
-
-
-def pass_buffers(out: Rendering) -> dict[str, torch.Tensor]:
-    """Name every pass of a rendering, for an OpenEXR file: (H, W), (H, W, 3) float or (H, W) int32 each."""
-    parts = {name: getattr(out, name) for name in ("image", "plain", "textured", "alpha")}
-    for k in range(out.ids.shape[2]):
-        parts |= {f"{name}.{k}": getattr(out, name)[..., k] for name in ("ids", "depths", "weights")}
-    return parts
 
 
 def _name(device: torch.device) -> str:
@@ -500,6 +524,7 @@ def main(arguments: list[str] | None = None) -> int:
         "train": Train,
         "eval": Eval,
         "render": Render,
+        "export": Export,
         "view": View,
         "info": Info,
         "sfm": Sfm,

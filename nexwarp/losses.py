@@ -174,8 +174,7 @@ def depth_loss(
         }
     )
     height, width = depths.shape[:2]
-    size = pixels.new_tensor([width, height])
-    counts = (expected > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+    counts = (expected > 0) & (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     # Points behind the camera have coordinates of any size, or none.
     column, row = torch.where(counts[:, None], pixels, 0.0).long().unbind(-1)
     shares = weights[row, column]

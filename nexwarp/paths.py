@@ -1,15 +1,19 @@
-"""Camera paths for videos."""
+"""Camera paths for videos: an ellipse around what the cameras see, a spiral before it, a flight from view to view."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from nexwarp.camera import Camera
 from nexwarp.ops.checks import check_range
 
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
+ONE_WAY = 0.5  # least length of the mean viewing direction for a spiral
+SPREAD = 0.9  # share of the cameras, along each axis, that a spiral spans
+FRAMES_PER_KEY = 10
 
 
 def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
@@ -37,6 +41,106 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     first = cameras[0]
     viewmats = [look_at(centre + offset, target, up).to(first.viewmat) for offset in offsets]
     return [replace(first, viewmat=viewmat) for viewmat in viewmats]
+
+
+def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[Camera]:
+    """Return `count` cameras on a closed spiral amid cameras that face one way.
+
+    Seen from the mean camera it winds `turns` times about the centre, once forward and back meanwhile; along each of
+    that camera's axes it reaches the distance within which 90 % of the cameras lie. Its cameras look at
+    `focus(cameras)` or, where the optical axes do not meet in front of all of them, along the mean direction; up is the
+    mean up direction. Intrinsics, size, near, dtype and device are those of the first camera. A rigid motion and
+    scaling of all cameras does the same to the path.
+
+    Raises:
+        ValueError: cameras that do not face one way, or all at one place; `count` or `turns` < 1.
+    """
+    check_range("count", count, 1)
+    check_range("turns", turns, 1)
+    viewmats, centres = _poses(cameras)
+    forward, down = viewmats[:, 2, :3].mean(0), viewmats[:, 1, :3].mean(0)
+    if forward.norm() < ONE_WAY:
+        raise ValueError(
+            f"cameras: expected cameras that face one way, got a mean direction of length {forward.norm().item():.2f} "
+            f"(at least {ONE_WAY}); an ellipse suits cameras all around"
+        )
+    centre = centres.mean(0)
+    axes = look_at(centre, centre + forward, -down)[:3, :3]
+    radii = torch.quantile(((centres - centre) @ axes.T).abs(), SPREAD, dim=0)
+    if radii.max() == 0.0:
+        raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
+    target = _common_target(cameras)
+    angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
+    rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
+    first, path = cameras[0], []
+    for position in centre + rounds * radii @ axes:
+        viewmat = look_at(position, position + forward if target is None else target, -down)
+        path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
+    return path
+
+
+def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
+    """Return `count` cameras on a smooth flight from the first of the given ones to the last.
+
+    The flight passes through key cameras: through all, or, where there are more than `keys`, through that many, evenly
+    spaced in the list, the first and last among them. Between two, it takes time in proportion to the way and the turn.
+    Centres follow a cubic spline, rotations one of continuous angular acceleration. Intrinsics, size, near, dtype and
+    device are those of the first camera. A rigid motion and scaling of all cameras does the same to the path.
+
+    Args:
+        cameras: in the order to fly by.
+        count: cameras to return; the first is at the first key, the last at the last.
+        keys: at most so many keys, at least 2; by default one for every 10 of `count`.
+
+    Raises:
+        ValueError: fewer than two distinct cameras; `count` < 1, `keys` < 2.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    check_range("count", count, 1)
+    keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
+    check_range("keys", keys, 2)
+    viewmats, centres = _poses(cameras)
+    if len(cameras) > keys:
+        chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()
+        viewmats, centres = viewmats[chosen], centres[chosen]
+    turned = Rotation.from_matrix(viewmats[:, :3, :3].mT.numpy())
+    ways = (centres[1:] - centres[:-1]).norm(dim=1).numpy()
+    turns = (turned[:-1].inv() * turned[1:]).magnitude() if len(ways) else ways
+    # Two views at one place, turned alike, are one key: they would be a halt.
+    spans = sum(x / x.mean() if x.sum() > 0.0 else 0.0 * x for x in (ways, turns)) if len(ways) else ways
+    distinct = np.concatenate([[True], spans > DEGENERATE])
+    if distinct.sum() < 2:
+        raise ValueError(f"cameras: expected at least two distinct ones, got {len(cameras)} that are the same")
+    times = np.concatenate([[0.0], spans.cumsum()])[distinct]
+    at = np.linspace(0.0, times[-1], count)
+    positions = CubicSpline(times, centres.numpy()[distinct], bc_type="natural")(at)
+    rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
+    first, path = cameras[0], []
+    for position, rotation in zip(torch.from_numpy(positions), torch.from_numpy(rotations), strict=True):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+        path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
+    return path
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera with another image size, in pixels, that sees what it did from top to bottom.
+
+    Pixels keep their shape: another aspect ratio shows more or less at the sides. The principal point keeps its
+    offset from the middle, relative to the height.
+    """
+    check_range("width", width, 1)
+    check_range("height", height, 1)
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    scale = height / camera.height
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = camera.fx * scale, camera.fy * scale
+    K[0, 2] = (camera.cx - camera.width / 2) * scale + width / 2
+    K[1, 2] = camera.cy * scale
+    return replace(camera, K=K, width=width, height=height)
 
 
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:
@@ -90,3 +194,13 @@ def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.T
         axes = axes * axes.new_tensor([[1.0], [-1.0]])
     low, high = torch.quantile((centres - mean) @ axes.T, axes.new_tensor([0.05, 0.95]), dim=0)
     return mean + (low + high) / 2.0 @ axes, axes, (high - low) / 2.0
+
+
+def _common_target(cameras: Sequence[Camera]) -> torch.Tensor | None:
+    """`focus(cameras)`, where it lies in front of all; None where it does not, or the axes are parallel."""
+    try:
+        target = focus(cameras)
+    except ValueError:
+        return None
+    viewmats, _ = _poses(cameras)
+    return target if bool(((viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0).all()) else None

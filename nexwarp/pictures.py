@@ -1,17 +1,21 @@
-"""Pictures for people: written whole or not at all, error maps, strips with captions."""
+"""Pictures: files written whole or not at all (PNG, OpenEXR), error maps, strips with captions."""
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from nexwarp.files import written_aside
 from nexwarp.ops.checks import check_range
 
 ERROR_SCALE = 0.25
 CAPTION_HEIGHT = 16
+METADATA = "nexwarp"
 
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
@@ -21,43 +25,89 @@ def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
     """
     from PIL import Image
 
-    path, pixels = Path(path), _to_uint8("image", image).numpy()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    pixels = _to_uint8("image", image).numpy()
+    with written_aside(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def save_exr(path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor]) -> None:
+def save_exr(
+    path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, Any] | None = None
+) -> None:
     """Write tensors as the named parts of one OpenEXR file, exactly: float32 as FLOAT, int32 as UINT.
 
     Args:
         path: where to; written aside, then renamed.
         parts: name -> (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (channel Y; -1
             becomes 4294967295).
+        metadata: what JSON can hold, kept as the text attribute `nexwarp` of the first part; `parts` is added to it.
+
+    Raises:
+        TypeError, ValueError: no parts, or one whose shape or dtype does not fit; OSError: `path` cannot be written.
+    """
+    import OpenEXR
+
+    if not parts:
+        raise ValueError("parts: expected at least one, got none")
+    files = []
+    for name, tensor in parts.items():
+        if tensor.dtype not in (torch.float32, torch.int32):
+            raise TypeError(f"parts[{name!r}]: expected float32 or int32, got {tensor.dtype}")
+        if not (tensor.ndim == 2 or (tensor.ndim == 3 and tensor.shape[2] == 3)):
+            raise ValueError(f"parts[{name!r}]: expected shape (H, W) or (H, W, 3), got {tuple(tensor.shape)}")
+        values = tensor.detach().cpu().numpy()
+        if values.dtype == np.int32:
+            values = np.ascontiguousarray(values).view(np.uint32)
+        planes = [values[..., i] for i in range(3)] if values.ndim == 3 else [values]
+        channels = {c: np.ascontiguousarray(x) for c, x in zip("RGB" if len(planes) == 3 else "Y", planes, strict=True)}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        if not files:
+            header[METADATA] = json.dumps({"parts": list(parts), **(metadata or {})})
+        files.append(OpenEXR.Part(header, channels, name))
+    with written_aside(path) as temporary:
+        temporary.touch()  # an error of the operating system says more than OpenEXR's
+        OpenEXR.File(files).write(str(temporary))
+
+
+def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read what `save_exr` wrote, bit for bit.
+
+    Returns:
+        The parts by name, on the CPU, and the metadata, with the list `parts` of their names.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is no OpenEXR file, it is damaged, or its channels are not those of `save_exr`.
     """
     import OpenEXR
 
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.exr")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    files = []
-    for name, tensor in parts.items():
-        values = np.ascontiguousarray(tensor.detach().cpu().numpy())
-        if values.dtype == np.int32:
-            values = values.view(np.uint32)
-        planes = {"R": 0, "G": 1, "B": 2} if values.ndim == 3 else {"Y": None}
-        channels = {c: np.ascontiguousarray(values if i is None else values[..., i]) for c, i in planes.items()}
-        files.append(OpenEXR.Part(dict(header), channels, name))
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file, expected an OpenEXR file")
+    parts, text = {}, ""
     try:
-        OpenEXR.File(files).write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts:
+                text = part.header.get(METADATA, text)
+                planes = {name: channel.pixels for name, channel in part.channels.items()}
+                parts[part.name()] = (set(planes), [planes[name] for name in "RGBY" if name in planes])
+    except Exception as error:  # OpenEXR raises bare RuntimeErrors, and others
+        raise ValueError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({error})") from None
+    try:
+        metadata = dict(json.loads(text)) if text else {"parts": list(parts)}
+        names = list(metadata["parts"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({error})") from None
+    # OpenEXR leaves out, with no more than a message, the parts that it cannot read.
+    if not parts or names != list(parts):
+        raise ValueError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
+    tensors = {}
+    for name, (names, planes) in parts.items():
+        if names not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
+            kinds = ", ".join(sorted(names))
+            raise ValueError(f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {kinds} in part {name!r}")
+        planes = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
+        tensors[name] = torch.stack(planes, dim=-1) if len(planes) == 3 else planes[0]
+    return tensors, metadata
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -101,7 +151,6 @@ def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequenc
 
 def _caption(text: str, width: int) -> torch.Tensor:
     """(CAPTION_HEIGHT, width, 3) uint8, black text on white, cut off at the right."""
-    import numpy as np
     from PIL import Image, ImageDraw, ImageFont
 
     band = Image.new("RGB", (width, CAPTION_HEIGHT), "white")

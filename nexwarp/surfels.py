@@ -36,8 +36,8 @@ class Surfels(nn.Module):
     Parameters (raw): `means` (N, 3) world units; `raw_quats` (N, 4) wxyz, any length but zero; `log_scales` (N, 2);
     `logit_opacities` (N,); `raw_gammas` (N, 2), gamma = 1 + exp(raw); `sh0` (N, 1, 3); `shN` (N, C - 1, 3).
 
-    Activated properties, which carry the graph to them: `means`, `quats` (N, 4) wxyz unit, surfel to world, `scales`
-    (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
+    Activated properties, which carry the graph to them: `means`, `quats` (N, 4) wxyz unit, surfel to world, `normals`
+    (N, 3) their z axes, `scales` (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
     """
 
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
@@ -129,6 +129,12 @@ class Surfels(nn.Module):
     def quats(self) -> torch.Tensor:
         """(N, 4) unit rotations surfel to world, wxyz."""
         return nn.functional.normalize(self.raw_quats, dim=-1)
+
+    @property
+    def normals(self) -> torch.Tensor:
+        """(N, 3) unit normals, world frame: the surfel's z axis. Either side may face the camera."""
+        w, x, y, z = self.quats.unbind(-1)
+        return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
 
     @property
     def scales(self) -> torch.Tensor:

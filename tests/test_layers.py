@@ -10,14 +10,15 @@ import pytest
 
 LAYERS = [
     {"kernels"},
-    {"ops", "camera"},
+    {"ops", "camera", "files"},
     {"data", "surfels", "texture"},
-    {"render", "losses", "metrics", "paths", "pictures"},
-    {"densify", "checkpoint", "evaluate", "viewer"},
+    {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
+    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer"},
     {"config"},
     {"initial"},
     {"trainer"},
     {"runs", "console", "warmup", "sfm"},
+    {"outputs"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

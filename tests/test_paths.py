@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.paths import ellipse, focus, look_at
+from nexwarp.paths import ellipse, focus, interpolate, look_at, resized, spiral
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -158,3 +158,148 @@ def test_degenerate_cameras_are_refused() -> None:
         ellipse(ring(), 0)
     with pytest.raises(ValueError, match="up: expected a direction across the line"):
         look_at(UP, 3 * UP, UP)
+
+
+def row(count: int = 15, bend: float = 0.3) -> list[Camera]:
+    """Cameras on a noisy patch of the x-z plane that face +y and look, more or less, at (0, 6, 0)."""
+    target = torch.tensor([0.0, 6.0, 0.0])
+    places = torch.randn(count, 3, dtype=torch.float64) * torch.tensor([1.0, 0.1, 0.5])
+    return [camera(place, target + (1 - bend) * place) for place in places]
+
+
+# Spiral
+
+
+def test_spiral_winds_within_the_cameras() -> None:
+    cameras = row(200)
+    path = spiral(cameras, 240)
+    given, mine = positions(cameras), positions(path)
+    offsets = mine - given.mean(0)
+    reach = torch.quantile((given - given.mean(0)).abs(), 0.9, dim=0)
+    assert torch.allclose(offsets.abs().amax(0), reach, rtol=0.1, atol=0.02)
+    # Twice around the viewing direction, evenly, always the same way, and closed.
+    scaled = offsets / reach
+    angles = torch.atan2(scaled[:, 2], scaled[:, 0])
+    steps = (angles.roll(-1) - angles + math.pi) % (2 * math.pi) - math.pi
+    assert abs(abs(steps.sum().item()) - 4 * math.pi) < 1e-6
+    assert (steps.abs() - 4 * math.pi / 240).abs().max() < 0.02
+    assert (mine - mine.roll(1, 0)).norm(dim=1).max() < 0.2
+
+
+def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
+    cameras = row()
+    for each in spiral(cameras, 12):
+        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
+        assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
+    for bend in (0.0, -0.5):  # parallel axes, axes that part
+        cameras = row(bend=bend)
+        forward = torch.stack([each.viewmat[2, :3] for each in cameras]).mean(0)
+        for each in spiral(cameras, 12):
+            assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
+
+
+@pytest.mark.parametrize("make", [spiral, interpolate])
+@pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
+def test_the_other_paths_move_and_scale_with_the_cameras(make, scale: float) -> None:
+    cameras, motion = row(), similarity(scale)
+    expected = [moved(each, motion) for each in make(cameras, 23)]
+    actual = make([moved(each, motion) for each in cameras], 23)
+    for mine, theirs in zip(actual, expected, strict=True):
+        assert (mine.viewmat - theirs.viewmat).abs().max() < 1e-7 * max(scale, 1.0)
+
+
+@pytest.mark.parametrize("make", [spiral, interpolate])
+def test_the_other_paths_take_the_rest_from_the_first_camera(make, device: torch.device) -> None:
+    path = make([each.to(device, torch.float32) for each in row()], 5)
+    assert len(path) == 5
+    for each in path:
+        assert each.viewmat.dtype == torch.float32 and each.device == device
+        assert each.K.equal(INTRINSICS.float().to(device)) and (each.width, each.height, each.near) == (64, 48, 0.2)
+
+
+# Interpolation
+
+
+def nearest(path: list[Camera], target: Camera) -> float:
+    return min((each.viewmat - target.viewmat).abs().max().item() for each in path)
+
+
+def test_interpolation_passes_through_every_key_in_turn() -> None:
+    cameras = ring(6)
+    path = interpolate(cameras, 2001, keys=6)
+    errors = [(torch.stack([each.viewmat for each in path]) - c.viewmat).abs().amax((1, 2)) for c in cameras]
+    assert all(error.min() < 2e-2 for error in errors)
+    order = [error.argmin().item() for error in errors]
+    assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
+    assert nearest(path[:1], cameras[0]) < 1e-9 and nearest(path[-1:], cameras[-1]) < 1e-9
+
+
+def test_interpolation_thins_many_cameras() -> None:
+    cameras = ring(50)
+    path = interpolate(cameras, 101, keys=3)
+    expected = interpolate([cameras[0], cameras[24], cameras[49]], 101, keys=3)
+    for mine, theirs in zip(path, expected, strict=True):
+        assert mine.viewmat.equal(theirs.viewmat)
+    assert len(interpolate(cameras, 1)) == 1
+
+
+def test_interpolation_is_smooth() -> None:
+    """Neither the way nor the direction jumps from one frame to the next, at the keys included."""
+    path = torch.stack([each.viewmat for each in interpolate(ring(8), 2000, keys=8)])
+    first = path.diff(dim=0).flatten(1).norm(dim=1)
+    second = path.diff(n=2, dim=0).flatten(1).norm(dim=1)
+    assert first.max() < 8 * first.mean() and second.max() < 0.05 * first.mean()
+    rotations = path[:, :3, :3]
+    assert (rotations @ rotations.mT - torch.eye(3)).abs().max() < 1e-12
+
+
+def test_interpolation_of_two_is_a_straight_even_flight() -> None:
+    target = torch.tensor([0.0, 5.0, 0.0])
+    ends = [camera(torch.tensor([x, 0.0, 0.0]), target + torch.tensor([x, 0.0, 0.0])) for x in (-1.0, 3.0)]
+    path = positions(interpolate(ends, 5))
+    expected = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]).double()
+    assert_close(path, expected, kind="value", name="positions")
+
+
+def test_interpolation_turns_at_one_place_and_skips_repeated_views() -> None:
+    origin = torch.zeros(3)
+    views = [camera(origin, torch.tensor([math.sin(a), math.cos(a), 0.0])) for a in (0.0, 0.0, 0.5, 1.0)]
+    path = interpolate(views, 3, keys=4)
+    assert positions(path).abs().max() < 1e-12
+    angles = [math.atan2(each.viewmat[2, 0], each.viewmat[2, 1]) for each in path]
+    assert angles == pytest.approx([0.0, 0.5, 1.0])
+
+
+def test_the_other_paths_refuse_degenerate_cameras() -> None:
+    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    with pytest.raises(ValueError, match=r"expected cameras that face one way, .* an ellipse suits"):
+        spiral(ring(height=0.6))
+    for cameras in ([one], [one, one, one]):
+        with pytest.raises(ValueError, match="cameras: expected at least two distinct"):
+            spiral(cameras)
+        with pytest.raises(ValueError, match="cameras: expected at least two distinct ones, got"):
+            interpolate(cameras)
+    for make in (spiral, interpolate):
+        with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+            make([])
+        with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
+            make(row(), 0)
+    with pytest.raises(ValueError, match="keys: expected at least 2, got 1"):
+        interpolate(row(), 5, keys=1)
+
+
+# Sizes
+
+
+def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
+    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))  # 64 x 48, fx 90, fy 95, cx 33, cy 20
+    wide = resized(one, 256, 96)
+    assert (wide.width, wide.height, wide.fx, wide.fy) == (256, 96, 180.0, 190.0)
+    assert wide.viewmat.equal(one.viewmat) and wide.near == one.near
+    for y in (0.0, 48.0):
+        assert (y * 2 - wide.cy) / wide.fy == pytest.approx((y - one.cy) / one.fy)
+    # The rays in the middle third of the wide picture are those of the old one.
+    assert (128 - 64 - wide.cx) / wide.fx == pytest.approx((0 - one.cx) / one.fx)
+    assert resized(one, 64, 48) is one
+    with pytest.raises(ValueError, match="height: expected at least 1, got 0"):
+        resized(one, 64, 0)

@@ -1,0 +1,243 @@
+"""What a finished run gives: still views, camera paths, videos, passes, files for other programs."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.checkpoint import Model, load, load_cameras
+from nexwarp.export import save_splats_ply, save_surfels_ply
+from nexwarp.metrics import to_uint8
+from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
+from nexwarp.passes import render_buffers, save_buffers
+from nexwarp.paths import ellipse, interpolate, resized, spiral
+from nexwarp.pictures import save_png
+from nexwarp.render import render
+from nexwarp.runs import CAMERAS_FILE, read_run
+from nexwarp.video import check_video, video_writer
+
+FRAMES, FPS = 120, 30.0
+PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
+SETS = {"test": ("test",), "train": ("train",), "all": ("train", "test"), None: ()}
+FORMATS = ("ply", "cameras")
+LARGEST_SIDE = 16384
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture to render: its PNG file, its camera, whether it is a frame of the path, whether its passes go too."""
+
+    file: Path
+    camera: Camera
+    is_frame: bool
+    buffers: bool
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Pictures to render, in order, and the video that their frames make."""
+
+    pictures: list[Picture]
+    video: Path | None
+    fps: float
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the path."""
+        return sum(picture.is_frame for picture in self.pictures) / self.fps
+
+    @torch.no_grad()
+    def render(self, model: Model, done: Callable[[], Any] = lambda: None) -> None:
+        """Render and write everything; `done` is called after each picture. A broken-off video leaves nothing."""
+        frames = [picture for picture in self.pictures if picture.is_frame]
+        with ExitStack() as stack:
+            append = None
+            if self.video is not None:  # before the work: where it cannot be written, nothing is
+                size = (frames[0].camera.width, frames[0].camera.height)
+                append = stack.enter_context(video_writer(self.video, *size, self.fps))
+            for picture in self.pictures:
+                camera = picture.camera.to(model.surfels.device)
+                if picture.buffers:
+                    out = render_buffers(model.surfels, model.texture, camera, **model.render_options)
+                    save_buffers(picture.file.with_suffix(".exr"), out)
+                else:
+                    out = render(model.surfels, model.texture, camera, **model.render_options)
+                pixels = to_uint8(out.image).cpu()
+                save_png(picture.file, pixels)
+                if append is not None and picture.is_frame:
+                    append(pixels)
+                done()
+        if frames:
+            _remove_frames(frames[0].file.parent, len(frames))
+
+
+@dataclass(frozen=True)
+class RenderOrder:
+    """What `nexwarp render` is asked for, in the terms of its options.
+
+    Attributes:
+        path: "ellipse", "interpolate", "spiral" or a JSON file; None for no path.
+        video: file to write the path's frames to.
+        frames: of the path; None for 120, or as many as the file has.
+        fps: of the video; None for 30, or what the file says.
+        views: "test", "train", "all", or None for no still views.
+        buffers: also write passes: of the still views or, where there are none, of the frames.
+        size: "WIDTHxHEIGHT", or None for that of the cameras.
+        scale: factor on the size of the cameras.
+
+    Raises:
+        ValueError: naming the option that is not as expected, in `prepare` too.
+    """
+
+    path: str | None
+    video: Path | None = None
+    frames: int | None = None
+    fps: float | None = None
+    views: str | None = None
+    buffers: bool = False
+    size: str | None = None
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.views not in SETS:
+            raise ValueError(f"--set: expected test, train or all, got {self.views!r}")
+        if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
+            raise ValueError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
+        if self.frames is not None and self.frames < 0:
+            raise ValueError(f"--frames: expected at least 0, got {self.frames}")
+        if self.frames == 0 and (self.video is not None or self.views is None):
+            raise ValueError("--frames: expected at least 1 for a path or a video, got 0")
+        if self.path is None and self.frames:
+            raise ValueError("--frames: expected with --path or --video, got it with --set alone")
+        if self.fps is not None and self.video is None:
+            raise ValueError("--fps: expected with --video, got it without")
+        self._size()
+        if self.video is not None:
+            _check_video(self.video, FPS if self.fps is None else self.fps)
+
+    def prepare(self, run: Path) -> RenderJob:
+        """Choose the cameras; writes nothing.
+
+        Raises:
+            ValueError, FileNotFoundError: naming the option or file that is not as expected.
+        """
+        size = self._size()
+        read_run(run)
+        cameras = load_cameras(run / CAMERAS_FILE)
+        renders, pictures = run / "renders", []
+        for group in SETS[self.views]:
+            for name, camera in cameras.get(group, {}).items():
+                file = renders / group / f"{Path(name).with_suffix('')}.png"
+                pictures.append(Picture(file, size(camera), False, self.buffers))
+        fps = FPS
+        if self.path is not None and self.frames != 0:
+            folder, path, fps = self._path(cameras, renders)
+            first = size(path[0])
+            for i, camera in enumerate(path):
+                camera = resized(size(camera), first.width, first.height)
+                pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+        if not pictures:
+            raise ValueError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
+        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps)
+
+    def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
+        """Folder of the frames, cameras, frames a second."""
+        assert self.path is not None
+        near = next((c.near for group in cameras.values() for c in group.values()), 0.01)
+        if self.path not in PATHS:
+            file = Path(self.path)
+            if self.frames is not None:
+                raise ValueError(f"--frames: expected none with {file}, which says it itself, got {self.frames}")
+            path = load_camera_path(file, near)
+            return renders / f"path_{file.stem}", path.cameras, path.fps or FPS
+        count = FRAMES if self.frames is None else self.frames
+        known = cameras.get("train", {})
+        if self.path == "interpolate":
+            known = dict(sorted((known | cameras.get("test", {})).items()))
+        try:
+            return renders / self.path, PATHS[self.path](list(known.values()), count), FPS
+        except ValueError as error:
+            hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
+            raise ValueError(f"--path {self.path}: {error}{hint}") from None
+
+    def _size(self) -> Callable[[Camera], Camera]:
+        """Function that gives a camera the size asked for."""
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"--scale: expected a number above 0, got {self.scale:g}")
+        if self.size is None:
+            return self._scaled
+        if self.scale != 1.0:
+            raise ValueError("--size, --scale: expected at most one of them, got both")
+        match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
+        sides = tuple(int(side) for side in match.groups()) if match else ()
+        if not sides or not all(1 <= side <= LARGEST_SIDE for side in sides):
+            raise ValueError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
+        return lambda camera: resized(camera, sides[0], sides[1])
+
+    def _scaled(self, camera: Camera) -> Camera:
+        sides = [max(round(side * self.scale), 1) for side in (camera.width, camera.height)]
+        if max(sides) > LARGEST_SIDE:
+            raise ValueError(
+                f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {sides[0]}x{sides[1]} with {self.scale:g}"
+            )
+        return resized(camera, *sides)
+
+
+def export_run(run: Path, kind: str, folder: Path) -> Sequence[Path]:
+    """Write a run's files for other programs into a folder (see docs/outputs.md) and return them.
+
+    Args:
+        run: run folder.
+        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
+        folder: made if need be.
+
+    Raises:
+        ValueError, OSError: naming what is not as expected.
+    """
+    if kind not in FORMATS:
+        raise ValueError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+    source, _, _ = read_run(run)
+    if kind == "ply":
+        model = load(run)
+        files = [folder / "surfels.ply", folder / "splats.ply"]
+        save_surfels_ply(files[0], model.surfels)
+        save_splats_ply(files[1], model.surfels, model.meta["sh_degree"])
+        return files
+    sets = load_cameras(run / CAMERAS_FILE)
+    # Named as from the scene's folder: a transforms.json lies there.
+    named = {
+        group: {f"{source.images}/{name}": camera for name, camera in members.items()}
+        for group, members in sets.items()
+    }
+    cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
+    if not cameras:
+        raise ValueError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
+    files = [folder / "transforms.json", folder / "camera_path.json"]
+    save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
+    first = next(iter(cameras.values()))
+    save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
+    return files
+
+
+def _check_video(path: Path, fps: float) -> None:
+    try:
+        check_video(path, fps)
+    except ValueError as error:
+        option = "--fps" if str(error).startswith("fps: ") else "--video"
+        raise ValueError(f"{option}: {str(error).removeprefix('fps: ')}") from None
+
+
+def _remove_frames(folder: Path, count: int) -> None:
+    """Remove what a longer path left in its folder: frames numbered `count` and up."""
+    for file in folder.iterdir():
+        if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= count:
+            file.unlink()

@@ -1,0 +1,214 @@
+"""Exported surfels: bits that come back, files that an independent reader and an independent renderer understand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.export import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.metrics import psnr, to_uint8
+from nexwarp.paths import look_at
+from tests.reference.collect import rotations
+from tests.scenes import make_surfels, random_scene
+from tests.tolerances import assert_close
+
+
+def read(path: Path) -> dict[str, torch.Tensor]:
+    """The vertices, by property, as another program sees them."""
+    plyfile = pytest.importorskip("plyfile", reason="an independent reader of PLY (extra `dev`)")
+    data = plyfile.PlyData.read(str(path))
+    assert [element.name for element in data.elements] == ["vertex"] and data.byte_order == "<"
+    vertex = data["vertex"]
+    return {p.name: torch.from_numpy(np.array(vertex[p.name])) for p in vertex.properties}
+
+
+def stack(columns: dict[str, torch.Tensor], *names: str) -> torch.Tensor:
+    return torch.stack([columns[name] for name in names], dim=1)
+
+
+def numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{i}" for i in range(count)]
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_surfels_read_back_bit_for_bit(
+    tmp_path: Path, sh_degree: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    surfels = make_surfels(random_scene(sh_degree=sh_degree, dtype=dtype, device=device))
+    with torch.no_grad():
+        surfels.raw_quats.mul_(3.0)
+        surfels.means[0] = torch.tensor([-0.0, 1e-42, 3e38])
+    save_surfels_ply(tmp_path / "new" / "a.ply", surfels)
+    after = load_surfels_ply(tmp_path / "new" / "a.ply").state_dict()
+    for name, before in surfels.state_dict().items():
+        assert after[name].dtype == dtype and after[name].shape == before.shape, name
+        assert after[name].numpy().tobytes() == before.cpu().numpy().tobytes(), name
+    assert [f.name for f in (tmp_path / "new").iterdir()] == ["a.ply"]
+
+
+def test_no_surfels_read_back(tmp_path: Path) -> None:
+    empty = {name: x[:0] for name, x in make_surfels(random_scene(4)).state_dict().items()}
+    save_surfels_ply(tmp_path / "a.ply", nw.Surfels(empty))
+    assert len(load_surfels_ply(tmp_path / "a.ply")) == 0
+    save_splats_ply(tmp_path / "b.ply", nw.Surfels(empty))
+    assert len(read(tmp_path / "b.ply")["x"]) == 0
+
+
+def test_surfel_properties_as_another_program_sees_them(tmp_path: Path) -> None:
+    scene = random_scene(sh_degree=1)
+    save_surfels_ply(tmp_path / "a.ply", make_surfels(scene))
+    columns = read(tmp_path / "a.ply")
+    assert list(columns) == [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *numbered("f_dc", 3),
+        *numbered("f_rest", 9),
+        "opacity",
+        *numbered("scale", 2),
+        *numbered("rot", 4),
+        *numbered("gamma", 2),
+    ]
+    assert stack(columns, "x", "y", "z").equal(scene["means"])
+    assert_close(1 + stack(columns, "gamma_0", "gamma_1").exp(), scene["gammas"], kind="value", name="gamma")
+    assert_close(stack(columns, "scale_0", "scale_1").exp(), scene["scales"], kind="value", name="scale")
+    assert_close(columns["opacity"].sigmoid(), scene["opacities"], kind="value", name="opacity")
+    # All of red, then all of green, then all of blue.
+    assert stack(columns, *numbered("f_rest", 9)).view(-1, 3, 3).mT.equal(scene["sh"][:, 1:])
+    axes = rotations(stack(columns, *numbered("rot", 4)))
+    assert_close(stack(columns, "nx", "ny", "nz"), axes[..., 2], kind="value", name="normal")
+
+
+@pytest.mark.parametrize("given", [0, 1, 3])
+@pytest.mark.parametrize("kept", [0, 2, 3])
+def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> None:
+    scene = random_scene(sh_degree=given)
+    save_splats_ply(tmp_path / "a.ply", make_surfels(scene), kept)
+    columns = read(tmp_path / "a.ply")
+    assert list(columns) == [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *numbered("f_dc", 3),
+        *numbered("f_rest", 45),
+        "opacity",
+        *numbered("scale", 3),
+        *numbered("rot", 4),
+    ]
+    assert all(x.dtype == torch.float32 and x.isfinite().all() for x in columns.values())
+    scales = stack(columns, *numbered("scale", 3)).exp()
+    assert_close(scales[:, :2], scene["scales"], kind="value", name="scale")
+    assert_close(scales[:, 2], THINNESS * scene["scales"].amin(1), kind="value", name="scale_2")
+    quats = stack(columns, *numbered("rot", 4))
+    assert (quats.norm(dim=1) - 1).abs().max() < 1e-6
+    assert_close(rotations(quats), rotations(scene["quats"]), kind="value", name="rotation")
+    assert_close(columns["opacity"].sigmoid(), scene["opacities"], kind="value", name="opacity")
+    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT
+    count = (min(given, kept) + 1) ** 2
+    assert rest[:, : count - 1].equal(scene["sh"][:, 1:count]) and (rest[:, count - 1 :] == 0).all()
+    assert stack(columns, *numbered("f_dc", 3)).equal(scene["sh"][:, 0])
+
+
+# Another renderer
+
+
+def small_surfels(count: int, device: torch.device) -> nw.Surfels:
+    """A closed, bumpy shell of surfels that overlap, as small as those of a trained scene: some pixels wide."""
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    means = normals * (1 + 0.1 * torch.sin(7 * normals).prod(1, keepdim=True))
+    # Half-way from z to the normal; slightly tilted.
+    quats = torch.cat([1 + normals[:, 2:], -normals[:, 1:2], normals[:, :1], torch.zeros(count, 1)], dim=1)
+    quats = quats + 0.05 * torch.randn(count, 4, generator=generator)
+    spacing = (4 * torch.pi / count) ** 0.5
+    scales = spacing * (0.5 + torch.rand(count, 2, generator=generator))
+    sh = 0.1 * torch.randn(count, 16, 3, generator=generator)
+    sh[:, 0] = 1.2 * torch.sin(4 * means + torch.arange(3.0))
+    opacities = 0.2 + 0.75 * torch.rand(count, generator=generator)
+    gammas = torch.ones(count, 2)
+    values = (means, quats, scales, opacities, gammas, sh)
+    return nw.Surfels.from_activated(*(x.to(device) for x in values))
+
+
+@pytest.mark.cuda
+def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path) -> None:
+    """gsplat 1.5.3, its defaults (blur of 0.3 pixel^2 included), against our render without texture at gamma = 1."""
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    device = torch.device("cuda")
+    surfels = small_surfels(20_000, device)
+    save_splats_ply(tmp_path / "splats.ply", surfels)
+    columns = {name: x.to(device) for name, x in read(tmp_path / "splats.ply").items()}
+    sh = torch.cat(
+        [stack(columns, *numbered("f_dc", 3))[:, None], stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT],
+        dim=1,
+    )
+    size, background = 800, (0.2, 0.5, 0.8)
+    K = torch.tensor([[900.0, 0.0, size / 2], [0.0, 900.0, size / 2], [0.0, 0.0, 1.0]], device=device)
+    for position in ((0.0, -3.0, 0.5), (2.0, 2.0, 1.0)):
+        viewmat = look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])).to(device)
+        with torch.no_grad():
+            mine = nw.render(surfels, None, nw.Camera(viewmat, K, size, size), background=background).image
+            theirs = gsplat.rasterization(
+                stack(columns, "x", "y", "z"),
+                stack(columns, *numbered("rot", 4)),
+                stack(columns, *numbered("scale", 3)).exp(),
+                columns["opacity"].sigmoid(),
+                sh.contiguous(),
+                viewmat[None],
+                K[None],
+                size,
+                size,
+                sh_degree=3,
+                backgrounds=torch.tensor([background], device=device),
+            )[0][0]
+        assert mine.std() > 0.1
+        assert psnr(to_uint8(theirs), to_uint8(mine)) >= 35.0
+
+
+# Bad files
+
+
+def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene(4))
+    save_surfels_ply(tmp_path / "good.ply", surfels)
+    good = (tmp_path / "good.ply").read_bytes()
+    save_splats_ply(tmp_path / "splats.ply", surfels)
+    nan = good.index(b"end_header\n") + len(b"end_header\n")
+    bad = {
+        "empty": (b"", "expected a PLY file as nexwarp writes it"),
+        "text": (b"ply\nbut then something else", "expected a PLY file as nexwarp writes it"),
+        "short": (good[:-1], f"expected {len(good)} bytes, got {len(good) - 1}"),
+        "long": (good + b"x", "expected"),
+        "ascii": (good.replace(b"binary_little_endian", b"ascii"), r"expected binary_little_endian 1\.0, got ascii"),
+        "faces": (good.replace(b"element vertex", b"element face"), "expected vertices, got element face"),
+        "count": (good.replace(b"vertex 4", b"vertex -4"), "expected a number of vertices, got -4"),
+        "many": (good.replace(b"vertex 4", b"vertex 999999999999"), "expected a number of vertices"),
+        "mixed": (good.replace(b"float x", b"uchar x"), "expected properties of one floating type, got float, uchar"),
+        "list": (good.replace(b"float x", b"list uchar int x"), "expected one value a property"),
+        "twice": (good.replace(b"float y", b"float x"), "expected the header of nexwarp surfels"),
+        "other": (
+            (tmp_path / "splats.ply").read_bytes(),
+            "expected the properties of nexwarp surfels, found no gamma_0",
+        ),
+        "nan": (good[:nan] + b"\x00\x00\xc0\x7f" + good[nan + 4 :], r"means: expected finite values, got nan at index"),
+    }
+    for name, (content, message) in bad.items():
+        path = tmp_path / f"{name}.ply"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message) as caught:
+            load_surfels_ply(path)
+        assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value), name
+    with pytest.raises(FileNotFoundError, match=r"no\.ply: no such file, expected surfels as PLY"):
+        load_surfels_ply(tmp_path / "no.ply")
+
+
+def test_what_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene(4))
+    (tmp_path / "file").touch()
+    for save in (save_surfels_ply, save_splats_ply):
+        with pytest.raises(OSError, match="file"):
+            save(tmp_path / "file" / "a.ply", surfels)
+    with pytest.raises(ValueError, match="sh_degree: expected at least 0 and at most 3, got 4"):
+        save_splats_ply(tmp_path / "a.ply", surfels, 4)
+    assert [f.name for f in tmp_path.iterdir()] == ["file"]
