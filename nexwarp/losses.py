@@ -150,7 +150,8 @@ def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
 def border_loss(image: torch.Tensor, target: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
     """Sum over the pixels that are not `inside` (H, W) of the L1 of (H, W, 3) images, over the number of all pixels."""
     shape = ("H", "W", 3)
-    check_tensors({"image": (image, shape), "target": (target, shape), "inside": (inside, image.shape[:2])})
+    check_tensors({"image": (image, shape), "target": (target, shape)})
+    check_tensors({"inside": (inside, image.shape[:2])}, dtype=torch.bool, device=image.device)
     return ((image - target).abs().mean(-1) * ~inside).mean()
 
 
