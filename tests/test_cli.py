@@ -84,7 +84,8 @@ def test_a_run_holds_what_it_should(trained, scene):
     assert {f.name for f in trained.iterdir()} == RUN_FILES
     assert {f.name for f in (trained / "checkpoint").iterdir()} == {"tensors.safetensors", "state.json"}
     config = read(trained, "config.json")
-    assert config["scene"] == {"path": str(scene.resolve()), "images": "images", "downscale": 1}
+    given = {"path": str(scene.resolve()), "images": "images", "downscale": 1, "masks": "masks"}
+    assert config["scene"] == given | dict.fromkeys(("background", "points", "format"))
     assert config["device"] == "cpu" and config["config"]["preset"] == "default"
     settings = Config.from_dict(config["config"])
     assert (settings.iterations, settings.max_surfels, settings.texture) == (20, 100, SMALL.texture)
@@ -318,12 +319,14 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
 
 
 def test_missing_folder(tmp_path, refuses):
-    refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a COLMAP scene")
+    refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a scene")
 
 
 def test_folder_without_a_model(tmp_path, refuses):
     (tmp_path / "empty").mkdir()
-    refuses(tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no COLMAP model", "expected")
+    refuses(
+        tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "expected a COLMAP model", "transforms.json"
+    )
 
 
 def test_no_images_folder(tmp_path, refuses):
@@ -351,9 +354,10 @@ def test_truncated_photo(tmp_path, refuses):
     refuses(folder, [], str(photo), "expected a complete image file")
 
 
-def test_unsupported_camera_model(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene", model="OPENCV", params=(40.0, 40.0, 24.0, 18.0, 0.1, 0.0, 0.0, 0.0))
-    refuses(folder, [], "OPENCV", "expected PINHOLE or SIMPLE_PINHOLE", "undistort")
+def test_lens_that_is_no_number(tmp_path, refuses):
+    params = (40.0, 40.0, 24.0, 18.0, float("nan"), 0.0, 0.0, 0.0)
+    folder = make_scene(tmp_path / "scene", model="OPENCV", params=params)
+    refuses(folder, [], "00.png", "OPENCV", "expected finite parameters")
 
 
 def test_zero_points(tmp_path, refuses):
@@ -504,7 +508,10 @@ def test_python_dash_m(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(root)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=120)
     assert done.returncode == 2
-    assert done.stderr == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a COLMAP scene\n"
+    assert (
+        done.stderr
+        == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a scene: COLMAP, nerfstudio or Blender\n"
+    )
     assert os.listdir(tmp_path) == []
 
 
