@@ -49,7 +49,9 @@ def check_memory(path: Path, images: str, sizes: Sequence[tuple[int, int]], down
     if need <= limit:
         return free - need
     width, height = max(sizes)
-    fits = [k for k in range(downscale + 1, MAX_DOWNSCALE) if photos_bytes(sizes, k, channels) <= limit]
+    smallest = min(min(size) for size in sizes)
+    factors = range(downscale + 1, min(MAX_DOWNSCALE, smallest) + 1)
+    fits = [k for k in factors if photos_bytes(sizes, k, channels) <= limit]
     advice = "use fewer photos"
     if fits:
         advice = f"use downscale={fits[0]} ({photos_bytes(sizes, fits[0], channels) / GIB:.1f} GiB)"

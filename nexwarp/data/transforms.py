@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nexwarp.data.capture import Capture, Cloud, Photo, leaves_folder
-from nexwarp.data.images import image_size
+from nexwarp.data.images import image_size, read_image
 from nexwarp.data.lens import Lens
 from nexwarp.data.ply import read_ply
 
@@ -28,7 +28,8 @@ WHITE = (1.0, 1.0, 1.0)
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
 FISHEYE = ("k1", "k2", "k3", "k4")
-AGREEMENT = 2.0  # so many times better must points fit the cameras in another frame than in the one promised
+AGREEMENT = 2.0  # so many times better must points fit the photos in another frame than in the one promised
+JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
 
 
 def read_nerfstudio(path: Path, images: str) -> Capture:
@@ -335,19 +336,27 @@ def _points(file: Path, data: dict[str, Any], photos: list[Photo]) -> Cloud | No
     to_original = _inverse_applied(file, data)
     moved = positions @ to_original[:3, :3].T + to_original[:3, 3]
     # Some releases of nerfstudio left the points in the original world and moved only the cameras.
-    if not np.allclose(to_original, np.eye(4)) and _seen(positions, photos) > AGREEMENT * _seen(moved, photos):
-        warnings.warn(
-            f"{path}: its points fit the cameras only without applied_transform; left as they are", stacklevel=2
-        )
-        moved = positions
+    if not np.allclose(to_original, np.eye(4)):
+        as_promised, as_they_are = (_color_error(where, colors, photos) for where in (moved, positions))
+        if as_promised > AGREEMENT * as_they_are:
+            warnings.warn(
+                f"{path}: its points fit the photos only without applied_transform; left as they are", stacklevel=2
+            )
+            moved = positions
     return Cloud.of(moved, colors)
 
 
-def _seen(points: np.ndarray, photos: list[Photo]) -> float:
-    """Share of the points, up to 2,000 of them, that lie before a camera and within 45 degrees of its axis."""
-    sample = points[:: max(len(points) // 2000, 1)]
-    shares = []
-    for photo in photos[:: max(len(photos) // 20, 1)]:
-        local = sample @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3]
-        shares.append((np.linalg.norm(local[:, :2], axis=1) < local[:, 2]).mean())
-    return float(np.mean(shares))
+def _color_error(points: np.ndarray, colors: np.ndarray, photos: list[Photo]) -> float:
+    """Median difference, of 255, between points and the pixels that some photos show in their place."""
+    sample = np.linspace(0, len(points) - 1, min(len(points), JUDGED_POINTS)).astype(int)
+    errors = [np.zeros((0, 3))]
+    for photo in photos[:: -(-len(photos) // JUDGED_PHOTOS)]:
+        image = read_image(photo.file).numpy()
+        rotation, shift = photo.viewmat[:3, :3], photo.viewmat[:3, 3]
+        pixels = photo.lens.project(points[sample] @ rotation.T + shift) / [photo.lens.width, photo.lens.height]
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < 1)).all(axis=1)
+        column, row = (pixels[inside] * image.shape[1::-1]).astype(int).T
+        errors.append(np.abs(image[row, column].astype(float) - colors[sample][inside]))
+    error = np.concatenate(errors)
+    return float(np.median(error)) if len(error) else 255.0
