@@ -16,6 +16,7 @@ from PIL import Image
 
 from nexwarp.data import load_scene, write_demo
 from nexwarp.data.demo_room import LAMP, build_room
+from nexwarp.data.images import image_size
 from nexwarp.data.lens import Lens, pycolmap_module
 from nexwarp.data.raytrace import first_hits, shade
 
@@ -57,8 +58,7 @@ def write_distorted(demo: Path, folder: Path, lens: Lens, samples: int = 4) -> P
     camera.params = list(lens.params)
     camera.width, camera.height = lens.width, lens.height
     images = [model.image(index) for index in model.reg_image_ids()]
-    width = Image.open(demo / "images" / images[0].name).width
-    room = build_room(width)
+    room = build_room(image_size(demo / "images" / images[0].name)[0])
     viewmats = [np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images]
     (folder / "images").mkdir(parents=True)
     with ThreadPoolExecutor(2) as pool:

@@ -18,7 +18,7 @@ from nexwarp import console as display
 from nexwarp import warmup
 from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
 from nexwarp.config import Config, LearningRates, TextureConfig, preset
-from nexwarp.data import Scene, parse_color
+from nexwarp.data import Scene
 from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.metrics import to_uint8
@@ -79,10 +79,10 @@ class Train:
     """Reduce photos by this factor, by area."""
     images: str = "images"
     """Folder of the photos below SCENE, such as images_4."""
-    masks: str | None = "masks"
-    """Folder of the masks below SCENE, if it is there; `alpha` for the photos' own transparency; None."""
+    masks: str = "masks"
+    """Folder of the masks below SCENE, if it is there; `alpha` for the photos' own transparency; `none`."""
     background: str | None = None
-    """Behind transparent photos, and renderings: white (default of Blender scenes), black or R,G,B in [0, 1]."""
+    """Behind transparent photos and renderings: white (default of Blender scenes), black, R,G,B up to 1, or random."""
     points: str | None = None
     """PLY file of the points to start from, in place of the scene's own."""
     format: str | None = None
@@ -134,8 +134,6 @@ class Train:
 
     def _source(self) -> SceneSource:
         """The scene that the flags ask for."""
-        if self.background is not None:
-            parse_color(self.background)
         return SceneSource(
             self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
         )

@@ -38,10 +38,10 @@ class SceneSource:
     """Folder of the photos below it."""
     downscale: int = 1
     """Factor by which photos are reduced, by area."""
-    masks: str | None = "masks"
-    """Folder of the masks below it, "alpha", or None."""
+    masks: str = "masks"
+    """Folder of the masks below it, "alpha" or "none"."""
     background: str | None = None
-    """Colour that transparent photos are put on: white, black or R,G,B."""
+    """Colour that transparent photos are put on: white, black, R,G,B or random."""
     points: str | None = None
     """PLY file of the points to start from."""
     format: str | None = None

@@ -27,7 +27,8 @@ NEAR_FRACTION = 0.01  # near plane, in units of the scene scale
 SCALE_MARGIN = 1.1
 MAX_POINTS = 4_000_000  # to start from: more than any budget of surfels
 READERS = {"colmap": "a COLMAP model", "nerfstudio": NERFSTUDIO_FILE, "blender": BLENDER_FILES["train"]}
-MASKS, ALPHA = "masks", "alpha"
+MASKS, ALPHA, NONE = "masks", "alpha", "none"
+RANDOM = "random"
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 # Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
 READ_BYTES, UNDISTORT_BYTES = 24, 64
@@ -55,6 +56,8 @@ class Scene:
         path: the folder it was read from.
         background: colour, three numbers in [0, 1], that transparent photos were put on, and that should lie
             behind a rendering to compare with; None where no photo's transparency was looked at.
+        random_background: whether training was asked to put each photo on a colour of its own instead, which
+            `View.alpha` allows; `background` is white then, for comparisons.
     """
 
     train: list[View]
@@ -66,6 +69,7 @@ class Scene:
     scale: float
     path: Path
     background: tuple[float, float, float] | None = None
+    random_background: bool = False
 
 
 def load_scene(
@@ -94,9 +98,10 @@ def load_scene(
         masks: where the views' masks come from. A folder inside `path` with a mask for each photo that needs one,
             NAME.png beside NAME or of the same stem, white where the photo counts; "masks", the default, need not
             exist, and what transforms.json names as a frame's `mask_path` goes before it. "alpha": alpha of one half
-            and more counts. None: no masks.
+            and more counts. None or "none": no masks.
         background: colour that transparent photos are put on, "white", "black" or three numbers in [0, 1]; by
-            default white for a Blender scene, while for others alpha is dropped.
+            default white for a Blender scene, while for others alpha is dropped. "random" puts them on white and
+            marks the scene for training on random colours.
         points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
         format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
         progress: called with the number of photos read and their total, from one thread at a time.
@@ -121,11 +126,13 @@ def load_scene(
         raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
     path = Path(path)
     _check_downscale(downscale)
-    color = parse_color(background)
+    random = isinstance(background, str) and background == RANDOM
+    color = parse_color("white" if random else background)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
     with quiet_pillow():
-        return _load(path, images, downscale, masks, color, points, format, progress)
+        scene = _load(path, images, downscale, masks, color, points, format, progress)
+    return dataclasses.replace(scene, random_background=random)
 
 
 def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
@@ -143,7 +150,7 @@ def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, floa
     except (TypeError, ValueError):
         values = ()
     if len(values) != 3 or not all(0 <= x <= 1 for x in values):
-        raise ValueError(f"background: expected white, black or three numbers in [0, 1], got {color!r}")
+        raise ValueError(f"background: expected white, black, random or three numbers in [0, 1], got {color!r}")
     return values
 
 
@@ -251,7 +258,7 @@ def _check_folder(argument: str, path: Path, name: str) -> None:
 
 def _with_masks(path: Path, photos: list[Photo], masks: str | None) -> list[Photo]:
     """The photos with the mask that goes with each."""
-    if masks is None or masks == ALPHA:
+    if masks in (None, NONE, ALPHA):
         return [dataclasses.replace(photo, mask=None) for photo in photos]
     if masks == MASKS and (any(photo.mask for photo in photos) or not (path / masks).is_dir()):
         return photos
