@@ -150,3 +150,19 @@ def test_the_faces_of_a_panorama_show_their_directions():
 def test_bad_lenses(model, params, size, message):
     with pytest.raises(ValueError, match=message):
         Lens(model, params, *size)
+
+
+def test_absurd_lenses_give_finite_maps_of_bounded_size():
+    rng = np.random.default_rng(0)
+    for trial in range(300):
+        model = sorted(LENSES)[trial % len(LENSES)]
+        size = 10.0 ** rng.uniform(-3, rng.choice([0, 2, 20, 300]))
+        params = np.abs(rng.normal(size=len(LENSES[model])) * size) + 1e-6
+        params[4:] *= rng.choice([-1, 1], len(params) - 4) if len(params) > 4 else 1
+        if trial % 3:
+            params[:4] = (50.0, 50.0, 20.0, 15.0)[: len(params)]
+        here = Lens(model, tuple(params.tolist()), 40, 30)
+        target = here.pinhole()
+        assert 1 <= target.width <= 80 and 1 <= target.height <= 60 and np.isfinite(target.K).all()
+        way = Maps().get(here, target, None)
+        assert way.grid.isfinite().all() and way.grid.abs().max() <= 2

@@ -235,6 +235,11 @@ BAD_SCENES = {
     "points of NaN": (built(points=NOT_A_NUMBER), r"finite 3D points, got \(0.0, nan, 0.0\)"),
     "escaping name": (built(names=["../x.png", "a.png"]), "image name '../x.png' leaves the images folder"),
     "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
+    "name of bytes": (
+        damaged("sparse/0/images.bin", lambda data: data.replace(b"03.png", b"\xff3.png")),
+        r"expected image names in UTF-8, got b'\\xff3.png'",
+    ),
+    "name of two lines": (built(names=["a\nb.png", "a.png"]), r"image name 'a\\nb.png' leaves the images folder"),
     "absent photo": (lacking("images/03.png"), "03.png: image not found, but the COLMAP model names it"),
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),

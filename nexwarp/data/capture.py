@@ -72,9 +72,9 @@ class Capture:
 
 
 def leaves_folder(name: str) -> bool:
-    """Whether a file name of a scene is no relative path below the scene's folder, on any system."""
+    """Whether a file name of a scene is no printable relative path below the scene's folder, on any system."""
     return (
         not name
-        or "\0" in name
+        or not name.isprintable()
         or any(".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name)))
     )

@@ -79,7 +79,10 @@ def _check_cameras_size(path: Path, cameras: Any) -> None:
 
 
 def _photo(image: Any, folder: Path, images: Path) -> Photo:
-    name, camera = image.name, image.camera
+    try:
+        name, camera = image.name, image.camera
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{folder}: expected image names in UTF-8, got {error.object[:60]!r}") from None
     if leaves_folder(name):
         raise ValueError(f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it")
     viewmat = np.eye(4)

@@ -200,7 +200,7 @@ def _map(lens: Lens, target: Pinhole, face: str | None) -> Map:
             rays = rays @ np.array(FACES[face], np.float64)
         pixels = lens.project(rays.reshape(-1, 3)).reshape(len(y), len(x), 2)
         size = np.array([lens.width, lens.height], np.float64)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             valid[rows] = ((pixels >= -BORDER) & (pixels <= size + BORDER)).all(axis=-1)
-        grid[rows] = np.nan_to_num(2.0 * pixels / size - 1.0, nan=0.0, posinf=2.0, neginf=-2.0).clip(-2.0, 2.0)
+            grid[rows] = np.nan_to_num(2.0 * pixels / size - 1.0, nan=0.0, posinf=2.0, neginf=-2.0).clip(-2.0, 2.0)
     return Map(torch.from_numpy(grid)[None], None if valid.all() else torch.from_numpy(valid))
