@@ -71,7 +71,7 @@ class Train:
     """Train a scene, evaluate it on its test views, and keep everything in a run folder."""
 
     scene: Scene_
-    """COLMAP folder (images/ and sparse/0/), or `demo` for the built-in scene."""
+    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
     run: Path | None = None
     """Folder to write to; runs/SCENE by default."""
     max_surfels: int | None = None
@@ -82,6 +82,14 @@ class Train:
     """Reduce photos by this factor, by area."""
     images: str = "images"
     """Folder of the photos below SCENE, such as images_4."""
+    masks: str = "masks"
+    """Folder of the masks below SCENE, if it is there; `alpha` for the photos' own transparency; `none`."""
+    background: str | None = None
+    """Behind transparent photos and renderings: white (default of Blender scenes), black, R,G,B up to 1, or random."""
+    points: str | None = None
+    """PLY file of the points to start from, in place of the scene's own."""
+    format: str | None = None
+    """`colmap`, `nerfstudio` or `blender`, for a folder that holds more than one of them."""
     max_hits: int | None = None
     """K, hits a pixel textures, 0 to 8 (2); 0 trains without a texture."""
     preset: str = "default"
@@ -103,7 +111,7 @@ class Train:
 
     def __call__(self, console: Console) -> None:
         """Train."""
-        source = SceneSource(self.scene, self.images, self.downscale)
+        source = self._source()
         run = self.run or Path("runs") / source.name
         prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
@@ -117,7 +125,10 @@ class Train:
         if self.downscale < 1:
             raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
         console.print(f"{source.name} on {_name(device)}, preset {config.preset}")
-        scene = source.load()
+        with display.loading(console) as progress:
+            scene = source.load(progress)
+        if scene.background is not None and not self.resume:
+            config = dataclasses.replace(config, background=scene.background)
         size = scene.train[0].camera
         console.print(
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
@@ -159,12 +170,22 @@ class Train:
         console.print(f"viewer: {viewer.url}")
         return viewer
 
+    def _source(self) -> SceneSource:
+        """The scene that the flags ask for."""
+        return SceneSource(
+            self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
+        )
+
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
         """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
         old, config, _ = read_run(run)
         for flag, default, given, expected in (
             ("--downscale", 1, self.downscale, old.downscale),
             ("--images", "images", self.images, old.images),
+            ("--masks", "masks", self.masks, old.masks),
+            ("--background", None, self.background, old.background),
+            ("--points", None, self.points and str(Path(self.points).resolve()), old.points),
+            ("--format", None, self.format, old.format),
             ("--preset", "default", self.preset, config.preset),
         ):
             if given not in (default, expected):
@@ -207,7 +228,8 @@ class Eval:
         model = load(self.run).to(device)
         if self.scene is not None:
             source = dataclasses.replace(source, path=self.scene)
-        scene = source.load()
+        with display.loading(console) as progress:
+            scene = source.load(progress)
         metrics = _evaluate(model, scene, self.run, console)
         rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))

@@ -108,6 +108,15 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
         yield observe
 
 
+@contextmanager
+def loading(console: Console) -> Iterator:
+    """Yield a function to call with the number of photos read and their total."""
+    columns = (TextColumn("reading photos"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("reading photos", total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
 def results_table(rows: dict[str, str], title: str) -> Table:
     """Make a two-column table."""
     table = Table(title=title, show_header=False)

@@ -5,9 +5,11 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 """
 
 import ctypes
+import dataclasses
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,21 +33,30 @@ class SceneSource:
     """Where a run's photos come from."""
 
     path: str
-    """A COLMAP folder, or "demo"."""
+    """A folder (COLMAP, nerfstudio or Blender), or "demo"."""
     images: str = "images"
     """Folder of the photos below it."""
     downscale: int = 1
     """Factor by which photos are reduced, by area."""
+    masks: str = "masks"
+    """Folder of the masks below it, "alpha" or "none"."""
+    background: str | None = None
+    """Colour that transparent photos are put on: white, black, R,G,B or random."""
+    points: str | None = None
+    """PLY file of the points to start from."""
+    format: str | None = None
+    """Kind of the scene, where its folder holds more than one."""
 
     @property
     def name(self) -> str:
         """Name of the scene, for folders and tables."""
         return DEMO if self.path == DEMO else Path(self.path).resolve().name
 
-    def load(self) -> Scene:
-        """Load the scene; the demo is made on first use."""
-        folder = demo_folder() if self.path == DEMO else self.path
-        return load_scene(folder, images=self.images, downscale=self.downscale)
+    def load(self, progress: Callable[[int, int], None] | None = None) -> Scene:
+        """Load the scene, telling `progress` how many photos are read; the demo is made on first use."""
+        options = dataclasses.asdict(self) | {"progress": progress}
+        folder = options.pop("path")
+        return load_scene(demo_folder() if folder == DEMO else folder, **options)
 
 
 def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> None:
@@ -76,8 +87,11 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str) -> N
     if run.exists():
         shutil.rmtree(run)
     run.mkdir(parents=True)
-    path = source.path if source.path == DEMO else str(Path(source.path).resolve())
-    scene = {"path": path, "images": source.images, "downscale": source.downscale}
+    scene = dataclasses.asdict(source)
+    if source.path != DEMO:
+        scene["path"] = str(Path(source.path).resolve())
+    if source.points is not None:
+        scene["points"] = str(Path(source.points).resolve())
     write_json(run / CONFIG_FILE, {"scene": scene, "device": device, "config": config.as_dict()})
 
 
@@ -95,6 +109,9 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
         scene = data["scene"]
         if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
             raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
+        for name in ("images", "masks", "background", "points", "format"):
+            if not isinstance(scene.get(name), (str, type(None))):
+                raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None

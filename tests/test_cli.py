@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
+from benchmarks.inputs import write_blender, write_ply
 from nexwarp import cli, config
 from nexwarp.checkpoint import load_cameras
 from nexwarp.config import Config, TextureConfig
@@ -84,7 +85,8 @@ def test_a_run_holds_what_it_should(trained, scene):
     assert {f.name for f in trained.iterdir()} == RUN_FILES
     assert {f.name for f in (trained / "checkpoint").iterdir()} == {"tensors.safetensors", "state.json"}
     config = read(trained, "config.json")
-    assert config["scene"] == {"path": str(scene.resolve()), "images": "images", "downscale": 1}
+    given = {"path": str(scene.resolve()), "images": "images", "downscale": 1, "masks": "masks"}
+    assert config["scene"] == given | dict.fromkeys(("background", "points", "format"))
     assert config["device"] == "cpu" and config["config"]["preset"] == "default"
     settings = Config.from_dict(config["config"])
     assert (settings.iterations, settings.max_surfels, settings.texture) == (20, 100, SMALL.texture)
@@ -318,12 +320,14 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
 
 
 def test_missing_folder(tmp_path, refuses):
-    refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a COLMAP scene")
+    refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a scene")
 
 
 def test_folder_without_a_model(tmp_path, refuses):
     (tmp_path / "empty").mkdir()
-    refuses(tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no COLMAP model", "expected")
+    refuses(
+        tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "expected a COLMAP model", "transforms.json"
+    )
 
 
 def test_no_images_folder(tmp_path, refuses):
@@ -351,9 +355,10 @@ def test_truncated_photo(tmp_path, refuses):
     refuses(folder, [], str(photo), "expected a complete image file")
 
 
-def test_unsupported_camera_model(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene", model="OPENCV", params=(40.0, 40.0, 24.0, 18.0, 0.1, 0.0, 0.0, 0.0))
-    refuses(folder, [], "OPENCV", "expected PINHOLE or SIMPLE_PINHOLE", "undistort")
+def test_lens_that_is_no_number(tmp_path, refuses):
+    params = (40.0, 40.0, 24.0, 18.0, float("nan"), 0.0, 0.0, 0.0)
+    folder = make_scene(tmp_path / "scene", model="OPENCV", params=params)
+    refuses(folder, [], "00.png", "OPENCV", "expected finite parameters")
 
 
 def test_zero_points(tmp_path, refuses):
@@ -504,7 +509,10 @@ def test_python_dash_m(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(root)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=120)
     assert done.returncode == 2
-    assert done.stderr == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a COLMAP scene\n"
+    assert (
+        done.stderr
+        == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a scene: COLMAP, nerfstudio or Blender\n"
+    )
     assert os.listdir(tmp_path) == []
 
 
@@ -515,3 +523,45 @@ def test_a_run_may_not_replace_its_own_scene(scene, tmp_path, capsys):
     assert cli.main(["train", str(folder / "scene"), "--run", str(folder), "--overwrite"]) == 2
     assert "--run: expected a folder that does not hold the scene" in capsys.readouterr().err
     assert (folder / "scene" / "images").is_dir()
+
+
+# Scenes in other forms
+
+
+def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
+    """Background, masks and points of the flags reach the run, and eval and --resume find them there again."""
+    path = write_blender(make_scene(tmp_path / "colmap"), tmp_path / "blender")
+    for file in path.rglob("*.png"):
+        with Image.open(file) as photo:
+            photo.putalpha(Image.linear_gradient("L").resize(photo.size))
+            photo.save(file)
+    points = write_ply(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
+    run = tmp_path / "run"
+    flags = ["--run", str(run), "--device", "cpu", "--max-surfels", "32"]
+    flags += ["--background", "0,0.5,1", "--masks", "alpha", "--points", str(points), "--iterations", "3"]
+    assert cli.main(["train", str(path), *flags]) == 0
+    assert "50 points" in capsys.readouterr().out
+    config = read(run, "config.json")
+    given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
+    assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given
+    assert config["config"]["background"] == [0.0, 0.5, 1.0]
+    assert nw.load(run).meta["background"] == [0.0, 0.5, 1.0]
+    before = read(run, "metrics.json")["psnr"]
+    assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
+    assert read(run, "metrics.json")["psnr"] == pytest.approx(before, abs=1e-6)
+    assert cli.main(["train", str(path), "--run", str(run), "--device", "cpu", "--resume"]) == 0
+    assert cli.main(["train", str(path), "--run", str(run), "--resume", "--background", "white"]) == 2
+    assert "--background: expected 0,0.5,1 as in the run to resume, got white" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--background", "pink"], ["background: expected white, black, random or three numbers", "'pink'"]),
+        (["--masks", "absent"], ["masks: no folder 'absent'"]),
+        (["--points", "nowhere.ply"], ["nowhere.ply: no such file, expected a PLY file"]),
+        (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
+    ],
+)
+def test_flags_of_scenes_that_cannot_be(scene, refuses, flags, words):
+    refuses(scene, flags, *words)

@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 
 from nexwarp.data import load_scene
-from nexwarp.data.colmap import pycolmap_module
 from nexwarp.data.images import downscale_image, read_image
+from nexwarp.data.lens import pycolmap_module
 
 WIDTH, HEIGHT = 48, 36
 REAL = Path(__file__).parents[2] / "shared" / "data"
@@ -220,12 +220,11 @@ def built(**options):
     return lambda path: make_scene(path, **options)
 
 
-DISTORTED = (40.0, 40.0, 24.0, 18.0, 0.1, 0.0, 0.0, 0.0)
 NOT_A_NUMBER = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]])
 UNDECODABLE = "03.png: expected a complete image file, could not decode it"
 BAD_SCENES = {
-    "no folder": (lambda path: path / "absent", "no such folder, expected a COLMAP scene"),
-    "no model": (lambda path: path, "no COLMAP model found, expected cameras, images and points3D"),
+    "no folder": (lambda path: path / "absent", "no such folder, expected a scene: COLMAP, nerfstudio or Blender"),
+    "no model": (lambda path: path, "no scene found, expected a COLMAP model .*, transforms.json .*transforms_train"),
     "half a model": (
         lacking("sparse/0/points3D.bin"),
         "incomplete COLMAP model in .*0: points3D.bin not found",
@@ -234,9 +233,13 @@ BAD_SCENES = {
     "one image": (built(names=["a.png"]), "at least 2 registered images .* got 1"),
     "no points": (built(points=np.zeros((0, 3))), "no 3D points, expected at least one"),
     "points of NaN": (built(points=NOT_A_NUMBER), r"finite 3D points, got \(0.0, nan, 0.0\)"),
-    "distorted": (built(model="OPENCV", params=DISTORTED), "model OPENCV of .*colmap image_undistorter"),
     "escaping name": (built(names=["../x.png", "a.png"]), "image name '../x.png' leaves the images folder"),
     "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
+    "name of bytes": (
+        damaged("sparse/0/images.bin", lambda data: data.replace(b"03.png", b"\xff3.png")),
+        r"expected image names in UTF-8, got b'\\xff3.png'",
+    ),
+    "name of two lines": (built(names=["a\nb.png", "a.png"]), r"image name 'a\\nb.png' leaves the images folder"),
     "absent photo": (lacking("images/03.png"), "03.png: image not found, but the COLMAP model names it"),
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),

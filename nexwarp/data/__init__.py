@@ -1,7 +1,8 @@
-"""Where scenes come from: COLMAP folders, the built-in demo, and the points that training starts from."""
+"""Where scenes come from: COLMAP, nerfstudio, Blender, the built-in demo; and the points that training starts from."""
 
 from nexwarp.data.demo import demo_folder, write_demo
 from nexwarp.data.points import InitialPoints, initial_points
-from nexwarp.data.scene import Scene, View, load_scene
+from nexwarp.data.scene import Scene, load_scene
+from nexwarp.data.views import View
 
 __all__ = ["InitialPoints", "Scene", "View", "demo_folder", "initial_points", "load_scene", "write_demo"]

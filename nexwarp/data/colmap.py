@@ -1,69 +1,24 @@
 """COLMAP models, read through pycolmap into plain numpy arrays; nothing of pycolmap leaves this file."""
 
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from nexwarp.data.capture import Capture, Cloud, Photo, leaves_folder
 from nexwarp.data.colmap_files import check_binary_model
+from nexwarp.data.lens import Lens, pycolmap_module
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
+FOLDERS = ("sparse/0", "sparse", ".")
 # What pycolmap 4.2 raises on damaged files: for a missing rig IndexError, for absurd counts MemoryError.
 READ_ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError, OverflowError)
 
 
-@dataclass(frozen=True)
-class Photo:
-    """One registered image of a model; the pixels are elsewhere.
-
-    Attributes:
-        name: path of the image below the images folder, as COLMAP wrote it ("/" between its parts).
-        viewmat: (4, 4) float64, world to camera, OpenCV axes.
-        K: (3, 3) float64, intrinsics in pixels of a width x height image, pixel centres at +0.5.
-        width: width of the COLMAP camera in pixels.
-        height: height of the COLMAP camera in pixels.
-    """
-
-    name: str
-    viewmat: np.ndarray
-    K: np.ndarray
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class ColmapModel:
-    """A sparse reconstruction.
-
-    Attributes:
-        folder: where the model's files lie.
-        photos: the registered images, sorted by name.
-        points: (P, 3) float64 positions in the world frame, by ascending COLMAP id.
-        colors: (P, 3) uint8 sRGB.
-        track_lengths: (P,) int32, how many images see a point.
-        reprojection_errors: (P,) float32, mean over the track, in pixels of the COLMAP cameras; -1 when
-            unknown.
-    """
-
-    folder: Path
-    photos: list[Photo]
-    points: np.ndarray
-    colors: np.ndarray
-    track_lengths: np.ndarray
-    reprojection_errors: np.ndarray
-
-
-def pycolmap_module() -> Any:
-    """Import pycolmap, late (it costs start-up time) and after numpy and PIL.
-
-    Version 4.2.1 corrupts the heap now and then when it is imported before them.
-    """
-    import PIL.Image  # noqa: F401
-    import pycolmap
-
-    return pycolmap
+def has_model(path: Path) -> bool:
+    """Whether a COLMAP model, or a part of one, lies where `find_model` looks."""
+    return any((path / folder / f"{part}.{end}").is_file() for folder in FOLDERS for part in PARTS for end in FORMATS)
 
 
 def find_model(path: Path) -> tuple[Path, str]:
@@ -75,7 +30,7 @@ def find_model(path: Path) -> tuple[Path, str]:
         FileNotFoundError: there is no complete model; of a partial one, the message says what lacks.
     """
     partial = None
-    for folder in (path / "sparse" / "0", path / "sparse", path):
+    for folder in (path / name for name in FOLDERS):
         for suffix in FORMATS:
             missing = [f"{part}.{suffix}" for part in PARTS if not (folder / f"{part}.{suffix}").is_file()]
             if not missing:
@@ -89,13 +44,13 @@ def find_model(path: Path) -> tuple[Path, str]:
     )
 
 
-def read_model(path: Path) -> ColmapModel:
-    """Read the COLMAP model of the scene at `path`.
+def read_model(path: Path, images: Path) -> Capture:
+    """Read the COLMAP model of the scene at `path`, whose photos lie in `images`.
 
     Raises:
         FileNotFoundError: there is no model.
-        ValueError: the model is damaged, has no registered image, a camera that is no pinhole, an image name
-            that leaves the images folder, no points, or points that are not finite.
+        ValueError: the model is damaged, has no registered image, a camera that is not usable, an image name that
+            leaves the images folder, or points that are not finite.
     """
     folder, suffix = find_model(path)
     if suffix == "bin":
@@ -109,11 +64,11 @@ def read_model(path: Path) -> ColmapModel:
         raise ValueError(f"{folder}: not a readable COLMAP model ({suffix}), damaged or truncated: {detail}") from error
     if suffix == "bin":
         _check_cameras_size(folder / "cameras.bin", reconstruction.cameras.values())
-    images = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
-    if not images:
+    registered = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
+    if not registered:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
-    photos = sorted((_photo(image, folder) for image in images), key=lambda photo: photo.name)
-    return ColmapModel(folder, photos, *_points(reconstruction, folder))
+    photos = sorted((_photo(image, folder, images) for image in registered), key=lambda photo: photo.name)
+    return Capture(folder, photos, _points(reconstruction, folder))
 
 
 def _check_cameras_size(path: Path, cameras: Any) -> None:
@@ -123,33 +78,34 @@ def _check_cameras_size(path: Path, cameras: Any) -> None:
         raise ValueError(f"{path}: truncated, expected {expected} bytes, got {path.stat().st_size}")
 
 
-def _photo(image: Any, folder: Path) -> Photo:
-    name, camera = image.name, image.camera
-    if not name or any(".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name))):
+def _photo(image: Any, folder: Path, images: Path) -> Photo:
+    try:
+        name, camera = image.name, image.camera
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{folder}: expected image names in UTF-8, got {error.object[:60]!r}") from None
+    if leaves_folder(name):
         raise ValueError(f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it")
-    model = camera.model.name
-    if model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-        raise ValueError(
-            f"{folder}: camera model {model} of {name} is not supported, expected PINHOLE or SIMPLE_PINHOLE: "
-            "undistort the images with `colmap image_undistorter` or pycolmap.undistort_images first"
-        )
     viewmat = np.eye(4)
     viewmat[:3] = image.cam_from_world().matrix()
-    return Photo(name, viewmat, np.array(camera.calibration_matrix()), int(camera.width), int(camera.height))
+    try:
+        lens = Lens(camera.model.name, tuple(map(float, camera.params)), int(camera.width), int(camera.height))
+    except ValueError as error:
+        raise ValueError(f"{folder}: {name}: the COLMAP camera of this image is not usable: {error}") from error
+    return Photo(name, images / name, viewmat, lens)
 
 
-def _points(reconstruction: Any, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, colours, track lengths and errors, by id so that binary and text models load alike."""
+def _points(reconstruction: Any, folder: Path) -> Cloud | None:
+    """The model's points by id, so that binary and text models load alike."""
     points = sorted(reconstruction.points3D.items())
     if not points:
-        raise ValueError(f"{folder}: the COLMAP model has no 3D points, expected at least one")
+        return None
     positions = np.array([point.xyz for _, point in points], dtype=np.float64)
     bad = ~np.isfinite(positions).all(axis=1)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
         where = tuple(positions[index].tolist())
         raise ValueError(f"{folder}: expected finite 3D points, got {where} (point id {points[index][0]})")
-    return (
+    return Cloud(
         positions,
         np.array([point.color for _, point in points], dtype=np.uint8),
         np.array([point.track.length() for _, point in points], dtype=np.int32),

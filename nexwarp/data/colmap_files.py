@@ -8,7 +8,7 @@ the files are followed first.
 import struct
 from pathlib import Path
 
-MIN_CAMERA = 24 + 3 * 8  # id, model, width and height, and the three parameters of the simplest model
+MIN_CAMERA = 24 + 2 * 8  # id, model, width and height, and the two parameters of the simplest model
 
 
 def check_binary_model(folder: Path) -> None:

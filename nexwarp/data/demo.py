@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nexwarp.data.colmap import pycolmap_module
+from nexwarp.data.cache import cache_folder
 from nexwarp.data.demo_points import Rig, SparsePoint, sparse_points
 from nexwarp.data.demo_room import LAMP, build_room
+from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.raytrace import render
 from nexwarp.ops.checks import check_range
 
@@ -26,10 +27,7 @@ def demo_folder() -> Path:
 
     It lies in a cache of the user: $NEXWARP_CACHE, else $XDG_CACHE_HOME/nexwarp, else ~/.cache/nexwarp.
     """
-    cache = os.environ.get("NEXWARP_CACHE")
-    if not cache:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nexwarp"
-    folder = Path(cache) / f"demo-v{VERSION}-{WIDTH}x{HEIGHT}-{VIEWS}"
+    folder = cache_folder() / f"demo-v{VERSION}-{WIDTH}x{HEIGHT}-{VIEWS}"
     if not folder.is_dir():
         try:
             write_demo(folder)

@@ -1,44 +1,122 @@
-"""Reading photos into uint8 RGB tensors, and shrinking them."""
+"""Reading photos and masks into uint8 tensors, and shrinking them."""
 
 import struct
+import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
+
+# PIL has more, some of which start other programs.
+FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF")
+MAX_SUM = 2**32 - 1
+WHITE = 128  # and above counts in a mask that has such values; in another, such as one of 0 and 1, all but 0
+
+
+@contextmanager
+def quiet_pillow() -> Iterator[None]:
+    """Keep PIL's warning of very large images back; above twice that size they are refused."""
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        yield
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator:
+    """A PIL image; whatever goes wrong with it until the end is told in one line."""
+    from PIL import Image
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
+    try:
+        with Image.open(path, formats=[name for name in FORMATS if name in _registered()]) as image:
+            yield image
+    except Image.DecompressionBombError:
+        limit = 2 * Image.MAX_IMAGE_PIXELS // 10**6
+        raise ValueError(
+            f"{path}: expected an image of at most {limit} megapixels, got more; reduce it first"
+        ) from None
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error, MemoryError, OverflowError) as error:
+        raise ValueError(f"{path}: expected a complete image file, could not decode it: {error}") from error
+
+
+def _registered() -> dict:
+    from PIL import Image
+
+    Image.init()
+    return Image.OPEN
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image in pixels, from its header; errors as of `read_image`."""
+    with quiet_pillow(), _opened(path) as image:
+        return image.size
 
 
 def read_image(path: Path) -> torch.Tensor:
     """Read a photo as COLMAP does: no EXIF orientation is applied; grey is repeated, alpha is dropped.
 
     Args:
-        path: any file that PIL can decode, 8 or 16 bits a channel.
+        path: a JPEG, PNG, WebP, TIFF, BMP, PPM, GIF, TGA, JPEG 2000 or AVIF file, 8 or 16 bits a channel.
 
     Returns:
         (H, W, 3) uint8 sRGB.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file cannot be decoded or is truncated.
+        ValueError: the file cannot be decoded, is truncated, or has more pixels than PIL takes for an honest image.
     """
-    from PIL import Image
+    with _opened(path) as image:
+        image.load()
+        return torch.from_numpy(_to_rgb(image))
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return torch.from_numpy(_to_rgb(image))
-    except (
-        OSError,
-        ValueError,
-        SyntaxError,
-        EOFError,
-        struct.error,
-        zlib.error,
-        Image.DecompressionBombError,
-    ) as error:
-        raise ValueError(f"{path}: expected a complete image file, could not decode it: {error}") from error
+
+def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Read a photo with its transparency.
+
+    Returns:
+        (H, W, 3) uint8 sRGB as of `read_image`, and (H, W) uint8 alpha, None where the file has none.
+    """
+    with _opened(path) as image:
+        image.load()
+        alpha = None
+        if image.has_transparency_data:
+            rgba = np.array(image.convert("RGBA"))
+            return torch.from_numpy(rgba[:, :, :3].copy()), torch.from_numpy(rgba[:, :, 3].copy())
+        return torch.from_numpy(_to_rgb(image)), alpha
+
+
+def read_mask(path: Path) -> torch.Tensor:
+    """Read a mask: white counts, black does not.
+
+    Returns:
+        (H, W) bool, True for values of 128 and above; where the file has none of them, for all but 0.
+    """
+    with _opened(path) as image:
+        image.load()
+        if image.mode == "P":  # label pictures: the index says more than the palette's colour
+            values = np.array(image)
+        elif image.mode == "1":
+            values = np.array(image).astype(np.uint8)
+        else:
+            values = _to_rgb(image).max(axis=2) if image.mode.startswith("I") else np.array(_grey(image))
+    white = values >= WHITE
+    return torch.from_numpy(white if white.any() else values > 0)
+
+
+def _grey(image):
+    """A mask with an alpha channel is one painted on nothing: its colours say what counts, its alpha where it is."""
+    if image.has_transparency_data:
+        from PIL import Image
+
+        rgba = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), rgba)
+    return image.convert("L")
 
 
 def _to_rgb(image) -> np.ndarray:
@@ -51,26 +129,61 @@ def _to_rgb(image) -> np.ndarray:
     return np.array(image.convert("RGB"))
 
 
+def compose(image: torch.Tensor, alpha: torch.Tensor, background: tuple[float, float, float]) -> torch.Tensor:
+    """Put a transparent photo on a colour, in sRGB as 8-bit tools do.
+
+    Args:
+        image: (H, W, 3) uint8, not premultiplied.
+        alpha: (H, W) uint8.
+        background: three numbers in [0, 1].
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    out = torch.empty_like(image)
+    for channel, color in enumerate(background):
+        a = alpha.float() / 255.0
+        mixed = image[:, :, channel].float().mul_(a).add_((1.0 - a) * (255.0 * color))
+        out[:, :, channel] = mixed.add_(0.5).clamp_(0, 255).byte()
+    return out
+
+
+def downscale_mask(mask: torch.Tensor, factor: int) -> torch.Tensor:
+    """Reduce a mask (H, W) bool as `downscale_image` does; a pixel counts where all of its block does."""
+    if factor == 1:
+        return mask
+    height, width = mask.shape[0] // factor, mask.shape[1] // factor
+    blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return blocks.all(dim=3).all(dim=1)
+
+
+def resize_mask(mask: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """Take the nearest pixels of a mask (H, W) bool, for an image of another size."""
+    rows = ((torch.arange(height) + 0.5) * (mask.shape[0] / height)).long()
+    columns = ((torch.arange(width) + 0.5) * (mask.shape[1] / width)).long()
+    return mask[rows][:, columns]
+
+
 def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:
     """Average blocks of `factor` x `factor` pixels; what fills no block at the right and bottom is cropped.
 
     Args:
-        image: (H, W, 3) uint8.
+        image: (H, W, C) uint8.
         factor: at least 1, at most min(H, W).
 
     Returns:
-        (H // factor, W // factor, 3) uint8, the mean of the 8-bit values rounded to the nearest (half up).
+        (H // factor, W // factor, C) uint8, the mean of the 8-bit values rounded to the nearest (half up).
     """
     if factor == 1:
         return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
     pixels = image[: height * factor, : width * factor].numpy()
     # Adding up slices is far faster than a sum over two strided axes.
-    rows = pixels[::factor].astype(np.int64)
+    area = factor * factor
+    rows = pixels[::factor].astype(np.uint32 if area * 511 < MAX_SUM else np.int64)
     for offset in range(1, factor):
         rows += pixels[offset::factor]
     total = rows[:, ::factor].copy()
     for offset in range(1, factor):
         total += rows[:, offset::factor]
-    area = factor * factor
     return torch.from_numpy(((2 * total + area) // (2 * area)).astype(np.uint8))

@@ -48,7 +48,7 @@ def initial_points(
         points: (P, 3) float, world frame.
         colors: (P, 3) uint8 sRGB, or float in [0, 1].
         count: how many are wanted; fewer come when fewer are available.
-        track_lengths: (P,) integer, photos that a point was triangulated from.
+        track_lengths: (P,) integer, photos that a point was triangulated from; 0 when unknown.
         errors: (P,) float, mean reprojection errors in pixels; negative when unknown.
         filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust
             sigmas, as far as `track_lengths` and `errors` are given; never more than half of the points.
@@ -99,10 +99,12 @@ def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | N
 
     Args:
         count: number of points P.
-        track_lengths: (P,) integer or None.
+        track_lengths: (P,) integer, 0 when unknown, or None.
         errors: (P,) float, pixels, negative when unknown, or None.
     """
-    short = np.zeros(count, dtype=bool) if track_lengths is None else track_lengths < MIN_TRACK_LENGTH
+    short = np.zeros(count, dtype=bool)
+    if track_lengths is not None:
+        short = (track_lengths > 0) & (track_lengths < MIN_TRACK_LENGTH)
     error = np.zeros(count) if errors is None else np.where(np.isnan(errors), np.inf, errors)
     known = error[(error >= 0) & np.isfinite(error)]
     bound = np.inf

@@ -1,54 +1,63 @@
-"""A scene: posed photos, split into training and test views, and the sparse points they were posed with."""
+"""A scene: posed photos, split into training and test views, and the points that training starts from."""
 
+import dataclasses
+import math
 import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
-from nexwarp.data.colmap import ColmapModel, Photo, read_model
-from nexwarp.data.images import downscale_image, read_image
+from nexwarp.data.cache import PhotoCache, cache_folder
+from nexwarp.data.capture import Capture, Cloud, Photo
+from nexwarp.data.colmap import has_model, read_model
+from nexwarp.data.images import quiet_pillow
+from nexwarp.data.memory import check_memory
+from nexwarp.data.ply import read_ply
+from nexwarp.data.random_points import random_points
+from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
+from nexwarp.data.views import Job, View, ViewReader, find_mask
 
 TEST_EVERY = 8  # the field's split: of the views sorted by name, those with index % 8 == 0 are for testing
 NEAR_FRACTION = 0.01  # near plane, in units of the scene scale
 SCALE_MARGIN = 1.1
+MAX_POINTS = 4_000_000  # to start from: more than any budget of surfels
+READERS = {"colmap": "a COLMAP model", "nerfstudio": NERFSTUDIO_FILE, "blender": BLENDER_FILES["train"]}
+MASKS, ALPHA, NONE = "masks", "alpha", "none"
+RANDOM = "random"
+COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+# Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
+READ_BYTES, UNDISTORT_BYTES = 24, 64
+MAX_READERS = 32
 
-
-@dataclass(frozen=True)
-class View:
-    """One posed photo.
-
-    Attributes:
-        camera: its pinhole camera, float32 on the CPU, in pixels of `image`.
-        image: (H, W, 3) uint8 sRGB on the CPU.
-        mask: (H, W) bool, True where the photo counts; None when all of it does.
-        name: name of the photo below the images folder.
-    """
-
-    camera: Camera
-    image: torch.Tensor
-    mask: torch.Tensor | None
-    name: str
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What training sees and what it is judged by, in COLMAP's world frame and units.
+    """What training sees and what it is judged by, in the world frame and units of the scene's files.
 
     Attributes:
         train: views to learn from, sorted by name.
         test: views to judge by, never to learn from, sorted by name.
-        points: (P, 3) float32 sparse points.
+        points: (P, 3) float32 points to start from: sparse, of a PLY file, or random where there are none.
         colors: (P, 3) uint8 sRGB of the points.
-        track_lengths: (P,) int32, how many photos a point was triangulated from.
-        reprojection_errors: (P,) float32, mean over the track, in pixels of the COLMAP cameras; -1 when
+        track_lengths: (P,) int32, how many photos a point was triangulated from; 0 when unknown.
+        reprojection_errors: (P,) float32, mean over the track, in pixels of the photos as taken; -1 when
             unknown.
         scale: 1.1 times the largest distance of a training camera from their mean, in world units; with all
             of them in one place, the median distance of the points from there.
         path: the folder it was read from.
+        background: colour, three numbers in [0, 1], that transparent photos were put on, and that should lie
+            behind a rendering to compare with; None where no photo's transparency was looked at.
+        random_background: whether training was asked to put each photo on a colour of its own instead, which
+            `View.alpha` allows; `background` is white then, for comparisons.
     """
 
     train: list[View]
@@ -59,58 +68,167 @@ class Scene:
     reprojection_errors: torch.Tensor
     scale: float
     path: Path
+    background: tuple[float, float, float] | None = None
+    random_background: bool = False
 
 
-def load_scene(path: str | os.PathLike, images: str = "images", downscale: int = 1) -> Scene:
-    """Read a COLMAP scene: undistorted photos, and a model in sparse/0, in sparse or in the folder itself.
+def load_scene(
+    path: str | os.PathLike,
+    images: str = "images",
+    downscale: int = 1,
+    *,
+    masks: str | None = MASKS,
+    background: str | Sequence[float] | None = None,
+    points: str | os.PathLike | None = None,
+    format: str | None = None,
+    progress: Progress | None = None,
+) -> Scene:
+    """Read a scene: a COLMAP folder, nerfstudio's transforms.json, or Blender's transforms_train.json.
 
-    Photos of another size than the COLMAP cameras (images_2, images_4, ...) scale the intrinsics by the ratio
-    of the sizes, an axis at a time. Every camera's near depth is 0.01 of the scene scale.
+    A COLMAP model lies in sparse/0, in sparse or in the folder itself, binary or text. Photos of another size than
+    their cameras (images_2, images_4, ...) scale the intrinsics by the ratio of the sizes, an axis at a time.
+    Photos of distorted cameras, of every model that COLMAP knows, are undistorted and kept in the user's cache; a
+    panorama becomes six views. Every camera's near depth is 0.01 of the scene scale. The test views are those that
+    the files name, else every eighth by name. More in docs/scenes.md.
 
     Args:
         path: folder of the scene.
         images: folder of the photos, inside `path`.
         downscale: average blocks of this many pixels squared; what fills no block is cropped.
+        masks: where the views' masks come from. A folder inside `path` with a mask for each photo that needs one,
+            NAME.png beside NAME or of the same stem, white where the photo counts; "masks", the default, need not
+            exist, and what transforms.json names as a frame's `mask_path` goes before it. "alpha": alpha of one half
+            and more counts. None or "none": no masks.
+        background: colour that transparent photos are put on, "white", "black" or three numbers in [0, 1]; by
+            default white for a Blender scene, while for others alpha is dropped. "random" puts them on white and
+            marks the scene for training on random colours.
+        points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
+        format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
+        progress: called with the number of photos read and their total, from one thread at a time.
 
     Returns:
         The scene, all tensors on the CPU.
 
     Raises:
-        FileNotFoundError: no such folder, no model, no images folder, or a photo of the model is absent.
-        TypeError: `downscale` is not an int.
-        ValueError: `downscale` < 1 or larger than a photo, a damaged model or photo, a camera that is no
-            pinhole, a photo whose shape is not its camera's, fewer than 2 photos, no points, points that are
-            not finite.
+        FileNotFoundError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
+            scene names are absent.
+        TypeError: an argument has the wrong type.
+        ValueError: an argument out of range, more than one kind of scene, damaged or malformed files, cameras that
+            are not usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than
+            2 photos, no points in a COLMAP model, points that are not finite, photos too many for the memory.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    if not isinstance(images, str):
-        raise TypeError(f"images: expected the name of a folder, got {type(images).__name__}")
+    for name, value in (("images", images), ("masks", masks)):
+        if not isinstance(value, str) and not (name == "masks" and value is None):
+            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
+    if points is not None and not isinstance(points, (str, os.PathLike)):
+        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
     path = Path(path)
     _check_downscale(downscale)
+    random = isinstance(background, str) and background == RANDOM
+    color = parse_color("white" if random else background)
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder, expected a COLMAP scene")
-    model = read_model(path)
-    if len(model.photos) < 2:
-        raise ValueError(f"{model.folder}: expected at least 2 registered images (1 to train, 1 to test), got 1")
-    folder = _images_folder(path, images)
-    scale = _scene_scale(model)
-    with ThreadPoolExecutor() as pool:  # decoding frees the GIL
-        views = list(
-            pool.map(
-                lambda photo: _view(photo, folder / photo.name, downscale, NEAR_FRACTION * scale),
-                model.photos,
-            )
+        raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
+    with quiet_pillow():
+        scene = _load(path, images, downscale, masks, color, points, format, progress)
+    return dataclasses.replace(scene, random_background=random)
+
+
+def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
+    """Three numbers in [0, 1] of a colour's name, of "R,G,B" or of three numbers; None stays None.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if color is None:
+        return None
+    if isinstance(color, str) and color in COLORS:
+        return COLORS[color]
+    try:
+        values = tuple(float(x) for x in (color.split(",") if isinstance(color, str) else color))
+    except (TypeError, ValueError):
+        values = ()
+    if len(values) != 3 or not all(0 <= x <= 1 for x in values):
+        raise ValueError(f"background: expected white, black, random or three numbers in [0, 1], got {color!r}")
+    return values
+
+
+def find_format(path: Path, format: str | None = None) -> str:
+    """Tell which kind of scene a folder holds: "colmap", "nerfstudio" or "blender".
+
+    Raises:
+        FileNotFoundError: none of them.
+        ValueError: more than one, or `format` is no such kind.
+    """
+    if format is not None:
+        if format not in READERS:
+            raise ValueError(f"format: expected one of {', '.join(READERS)}, got {format!r}")
+        return format
+    found = ["colmap"] if has_model(path) else []
+    found += ["nerfstudio"] if (path / NERFSTUDIO_FILE).is_file() else []
+    found += ["blender"] if (path / BLENDER_FILES["train"]).is_file() else []
+    if len(found) > 1:
+        raise ValueError(
+            f"{path}: expected one kind of scene, got {' and '.join(READERS[kind] for kind in found)}; "
+            f"choose with format: {' or '.join(found)}"
         )
+    if not found:
+        raise FileNotFoundError(
+            f"{path}: no scene found, expected a COLMAP model (cameras, images and points3D, .bin or .txt, in "
+            f"sparse/0, in sparse or in the folder itself), {NERFSTUDIO_FILE} of nerfstudio, or "
+            f"{BLENDER_FILES['train']} of Blender"
+        )
+    return found[0]
+
+
+def _load(
+    path: Path,
+    images: str,
+    downscale: int,
+    masks: str | None,
+    background: tuple[float, float, float] | None,
+    points: str | os.PathLike | None,
+    format: str | None,
+    progress: Progress | None,
+) -> Scene:
+    kind = find_format(path, format)
+    capture = _read_capture(path, images, kind)
+    if len(capture.photos) < 2:
+        raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
+    cloud = Cloud.of(*read_ply(Path(points))) if points is not None else capture.cloud
+    if cloud is None and kind == "colmap":
+        raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
+    background = capture.background if background is None else background
+    tests = [
+        index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
+        for index, photo in enumerate(capture.photos)
+    ]
+    scale = _scene_scale(capture, cloud, tests)
+    reader = ViewReader(
+        downscale=downscale,
+        background=background,
+        alpha_mask=masks == ALPHA,
+        cache=PhotoCache(cache_folder() / "undistorted"),
+    )
+    plans = _map(reader.plan, _with_masks(path, capture.photos, masks), MAX_READERS)
+    jobs = [job for plan in plans for job in plan]
+    held_out = [test for plan, test in zip(plans, tests, strict=True) for _ in plan]
+    channels = 3 + (background is not None) + (masks == ALPHA or any(job.photo.mask for job in jobs))
+    workers = _workers(path, images, downscale, channels, jobs)
+    views = _map(lambda job: reader.read(job, NEAR_FRACTION * scale), jobs, workers, progress)
+    train = [view for view, test in zip(views, held_out, strict=True) if not test]
+    cloud = _thinned(random_points(train, scale) if cloud is None else cloud)
     return Scene(
-        train=[view for index, view in enumerate(views) if index % TEST_EVERY != 0],
-        test=views[::TEST_EVERY],
-        points=torch.from_numpy(model.points.astype(np.float32)),
-        colors=torch.from_numpy(model.colors),
-        track_lengths=torch.from_numpy(model.track_lengths),
-        reprojection_errors=torch.from_numpy(model.reprojection_errors),
+        train=train,
+        test=[view for view, test in zip(views, held_out, strict=True) if test],
+        points=torch.from_numpy(cloud.positions.astype(np.float32)),
+        colors=torch.from_numpy(cloud.colors),
+        track_lengths=torch.from_numpy(cloud.track_lengths),
+        reprojection_errors=torch.from_numpy(cloud.reprojection_errors),
         scale=scale,
         path=path,
+        background=background,
     )
 
 
@@ -121,51 +239,79 @@ def _check_downscale(downscale: int) -> None:
         raise ValueError(f"downscale: expected at least 1, got {downscale}")
 
 
-def _images_folder(path: Path, images: str) -> Path:
-    folder = path / images
-    if not folder.is_dir():
-        found = sorted(entry.name for entry in path.glob("images*") if entry.is_dir())
-        there = ", ".join(found) if found else "no folder images*"
-        raise FileNotFoundError(f"images: no folder {images!r} in {path}, which has {there}")
-    return folder
+def _read_capture(path: Path, images: str, kind: str) -> Capture:
+    if kind == "colmap":
+        capture = read_model(path, path / images)
+        _check_folder("images", path, images)
+        return capture
+    if images != "images":
+        _check_folder("images", path, images)
+    return (read_nerfstudio if kind == "nerfstudio" else read_blender)(path, images)
 
 
-def _scene_scale(model: ColmapModel) -> float:
-    train = [photo.viewmat for index, photo in enumerate(model.photos) if index % TEST_EVERY != 0]
+def _check_folder(argument: str, path: Path, name: str) -> None:
+    if not (path / name).is_dir():
+        found = sorted(entry.name for entry in path.glob(f"{argument}*") if entry.is_dir())
+        there = ", ".join(found) if found else f"no folder {argument}*"
+        raise FileNotFoundError(f"{argument}: no folder {name!r} in {path}, which has {there}")
+
+
+def _with_masks(path: Path, photos: list[Photo], masks: str | None) -> list[Photo]:
+    """The photos with the mask that goes with each."""
+    if masks in (None, NONE, ALPHA):
+        return [dataclasses.replace(photo, mask=None) for photo in photos]
+    if masks == MASKS and (any(photo.mask for photo in photos) or not (path / masks).is_dir()):
+        return photos
+    _check_folder("masks", path, masks)
+    photos = [dataclasses.replace(photo, mask=find_mask(path / masks, photo.name)) for photo in photos]
+    if not any(photo.mask for photo in photos):
+        raise FileNotFoundError(
+            f"masks: none in {path / masks} is named after a photo, expected {Path(photos[0].name).name}.png, say, "
+            "or masks=None for none"
+        )
+    return photos
+
+
+def _scene_scale(capture: Capture, cloud: Cloud | None, tests: Sequence[bool]) -> float:
+    train = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
     centres = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in train])
     mean = centres.mean(axis=0)
     radius = float(np.linalg.norm(centres - mean, axis=1).max())
-    distance = float(np.median(np.linalg.norm(model.points - mean, axis=1)))
+    distance = 1.0 if cloud is None else float(np.median(np.linalg.norm(cloud.positions - mean, axis=1)))
     # A camera that only turns is at one place but for rounding: its centres are computed from its poses.
     scale = SCALE_MARGIN * radius if radius > 1e-6 * distance else distance
-    if not 0 < scale < float("inf"):
-        raise ValueError(f"{model.folder}: cannot tell the scene's scale: cameras and points give {scale}")
+    if not 0 < scale < math.inf:
+        raise ValueError(f"{capture.source}: cannot tell the scene's scale: cameras and points give {scale}")
     return scale
 
 
-def _view(photo: Photo, path: Path, downscale: int, near: float) -> View:
-    image = read_image(path)
-    height, width = image.shape[:2]
-    # One pixel of the longer side's rounding may go either way when a folder like images_4 was made.
-    if abs(width * photo.height - height * photo.width) > max(photo.width, photo.height):
-        raise ValueError(
-            f"{path}: expected an image of {photo.width}x{photo.height} pixels, or that shape at another "
-            f"size, got {width}x{height}"
-        )
-    if downscale > min(width, height):
-        raise ValueError(f"downscale: expected at most the size of {path}, {width}x{height}, got {downscale}")
-    K = photo.K.copy()
-    K[0] *= width / photo.width / downscale
-    K[1] *= height / photo.height / downscale
-    image = downscale_image(image, downscale)
-    try:
-        camera = Camera(
-            torch.from_numpy(photo.viewmat).float(),
-            torch.from_numpy(K).float(),
-            image.shape[1],
-            image.shape[0],
-            near,
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: the COLMAP camera of this image is not usable: {error}") from error
-    return View(camera, image, None, photo.name)
+def _workers(path: Path, images: str, downscale: int, channels: int, jobs: list[Job]) -> int:
+    """How many photos to read at a time, so that what reading takes beside them fits as well."""
+    free = check_memory(path, images, [(job.target.width, job.target.height) for job in jobs], downscale, channels)
+    largest = max(
+        READ_BYTES * job.size[0] * job.size[1]
+        + (UNDISTORT_BYTES * job.target.width * job.target.height if job.photo.lens.distorted else 0)
+        for job in jobs
+    )
+    return max(1, min(MAX_READERS, (os.cpu_count() or 1) + 4, free // (2 * largest)))
+
+
+def _map(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, progress: Progress | None = None
+) -> list[Result]:
+    """Apply a function in threads: decoding frees the GIL."""
+    results = []
+    with ThreadPoolExecutor(workers) as pool:
+        for result in pool.map(function, items):
+            results.append(result)
+            if progress is not None:
+                progress(len(results), len(items))
+    return results
+
+
+def _thinned(cloud: Cloud) -> Cloud:
+    count = len(cloud.positions)
+    if count <= MAX_POINTS:
+        return cloud
+    keep = np.sort(np.random.default_rng(0).choice(count, MAX_POINTS, replace=False))
+    return Cloud(*(getattr(cloud, field.name)[keep] for field in dataclasses.fields(cloud)))

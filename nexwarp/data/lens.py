@@ -1,0 +1,206 @@
+"""Lenses: COLMAP's camera models, the pinhole that replaces a distorted one, and the resampling in between.
+
+Pixel centres lie at +0.5 in every image. A photo is resampled once, by bicubic interpolation; masks take the
+nearest pixel.
+"""
+
+import math
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+PANORAMA = "EQUIRECTANGULAR"
+MAX_SIDE = 2**16  # pixels, of an undistorted image
+ROWS = 128  # of a map that are computed at a time: their rays take double precision
+KEPT_MAPS = 6  # a panorama's faces
+BORDER = 0.5  # pixels outside a photo that still take the colour of its edge
+
+# World-to-face rotations of a panorama's six views, each of 90 degrees, x right, y down, z forward.
+FACES = {
+    "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "back": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    "left": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "up": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "down": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+}
+
+
+def pycolmap_module() -> Any:
+    """Import pycolmap, late (it costs start-up time) and after numpy and PIL.
+
+    Version 4.2.1 corrupts the heap now and then when it is imported before them.
+    """
+    import PIL.Image  # noqa: F401
+    import pycolmap
+
+    return pycolmap
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """An image without distortion.
+
+    Attributes:
+        K: (3, 3) float64, intrinsics in pixels, pixel centres at +0.5.
+        width: of the image in pixels.
+        height: of the image in pixels.
+    """
+
+    K: np.ndarray
+    width: int
+    height: int
+
+    def resized(self, width: int, height: int) -> "Pinhole":
+        """Return the same view with other pixels, an axis at a time."""
+        K = self.K.copy()
+        K[0] *= width / self.width
+        K[1] *= height / self.height
+        return Pinhole(K, width, height)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera as it took the photo: one of COLMAP's models.
+
+    Attributes:
+        model: COLMAP's name, such as OPENCV.
+        params: its parameters in COLMAP's order, in pixels of a width x height image.
+        width: of the photo in pixels.
+        height: of the photo in pixels.
+
+    Raises:
+        ValueError: an unknown model, another number of parameters, parameters that are not finite, a focal length
+            or size that is not positive.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            raise ValueError(f"expected an image size of 1 to {MAX_SIDE} pixels, got {self.width}x{self.height}")
+        if self.model == "INVALID" or self.model not in pycolmap_module().CameraModelId.__members__:
+            raise ValueError(f"camera model {self.model} is unknown to COLMAP")
+        camera = self._camera()
+        if not camera.verify_params():
+            raise ValueError(f"camera model {self.model}: expected {camera.params_info}, got {len(self.params)} values")
+        if not all(map(math.isfinite, self.params)):
+            raise ValueError(f"camera model {self.model}: expected finite parameters, got {self.params}")
+        focal = [self.params[index] for index in camera.focal_length_idxs()]
+        if min(focal, default=1.0) <= 0:
+            raise ValueError(f"K: expected focal lengths > 0, got {', '.join(f'{f:g}' for f in focal)}")
+
+    @property
+    def distorted(self) -> bool:
+        """Whether straight lines may come out bent."""
+        return self.model not in PINHOLES
+
+    def pinhole(self) -> Pinhole:
+        """The pinhole image that replaces the photo: itself, or as much of it as leaves no empty corners.
+
+        An undistorted image keeps the focal length; it is at most twice as wide and high as the photo. A panorama's
+        faces have the resolution of its equator.
+        """
+        if not self.distorted:
+            return Pinhole(np.array(self._camera().calibration_matrix()), self.width, self.height)
+        if self.model == PANORAMA:
+            side = max(round(self.width / math.pi), 1)
+            K = np.array([[side / 2, 0.0, side / 2], [0.0, side / 2, side / 2], [0.0, 0.0, 1.0]])
+            return Pinhole(K, side, side)
+        pycolmap = pycolmap_module()
+        options = pycolmap.UndistortCameraOptions()
+        camera = pycolmap.undistort_camera(options, self._camera())
+        return Pinhole(np.array(camera.calibration_matrix()), int(camera.width), int(camera.height))
+
+    def project(self, rays: np.ndarray) -> np.ndarray:
+        """Pixel coordinates (N, 2) float64 of camera-frame directions (N, 3); NaN where the lens sees nothing."""
+        return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)))
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Camera-frame directions (N, 3) float64 of pixel coordinates (N, 2); NaN where there is none."""
+        return np.asarray(self._camera().cam_ray_from_img(np.ascontiguousarray(pixels, dtype=np.float64)))
+
+    def _camera(self) -> Any:
+        return pycolmap_module().Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+
+
+@dataclass(frozen=True)
+class Map:
+    """Where an undistorted image's pixels lie in the photo.
+
+    Attributes:
+        grid: (1, h, w, 2) float32, as `torch.nn.functional.grid_sample` takes it.
+        valid: (h, w) bool, True inside the photo; None when all are.
+    """
+
+    grid: torch.Tensor
+    valid: torch.Tensor | None
+
+    def colors(self, image: torch.Tensor) -> torch.Tensor:
+        """Resample a photo (H, W, C) uint8 to (h, w, C) uint8, a channel at a time to save memory."""
+        out = torch.empty(*self.grid.shape[1:3], image.shape[2], dtype=torch.uint8)
+        for channel in range(image.shape[2]):
+            plane = image[None, None, :, :, channel].float()
+            fine = torch.nn.functional.grid_sample(
+                plane, self.grid, mode="bicubic", padding_mode="border", align_corners=False
+            )
+            out[:, :, channel] = (fine[0, 0] + 0.5).clamp_(0, 255).byte()
+        return out
+
+    def mask(self, mask: torch.Tensor | None) -> torch.Tensor | None:
+        """Resample a mask (H, W) bool to (h, w) bool, False outside the photo; None where all of it counts."""
+        if mask is None:
+            return self.valid
+        near = torch.nn.functional.grid_sample(
+            mask[None, None].float(), self.grid, mode="nearest", padding_mode="border", align_corners=False
+        )
+        out = near[0, 0] > 0.5
+        return out if self.valid is None else out & self.valid
+
+
+class Maps:
+    """The maps of a scene's lenses, computed once for photos that share one; safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._maps: OrderedDict[tuple, Map] = OrderedDict()
+
+    def get(self, lens: Lens, target: Pinhole, face: str | None) -> Map:
+        """The map from a pinhole image to a photo; `face` names a panorama's face."""
+        key = (lens, target.width, target.height, target.K.tobytes(), face)
+        with self._lock:
+            if key not in self._maps:
+                self._maps[key] = _map(lens, target, face)
+            self._maps.move_to_end(key)
+            while len(self._maps) > KEPT_MAPS:
+                self._maps.popitem(last=False)
+            return self._maps[key]
+
+
+def _map(lens: Lens, target: Pinhole, face: str | None) -> Map:
+    grid = np.empty((target.height, target.width, 2), np.float32)
+    valid = np.empty((target.height, target.width), bool)
+    x = (np.arange(target.width) + 0.5 - target.K[0, 2]) / target.K[0, 0]
+    for top in range(0, target.height, ROWS):
+        rows = slice(top, min(top + ROWS, target.height))
+        y = (np.arange(rows.start, rows.stop) + 0.5 - target.K[1, 2]) / target.K[1, 1]
+        rays = np.ones((len(y), len(x), 3))
+        rays[..., 0], rays[..., 1] = x, y[:, None]
+        if face is not None:
+            rays = rays @ np.array(FACES[face], np.float64)
+        pixels = lens.project(rays.reshape(-1, 3)).reshape(len(y), len(x), 2)
+        size = np.array([lens.width, lens.height], np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            valid[rows] = ((pixels >= -BORDER) & (pixels <= size + BORDER)).all(axis=-1)
+            grid[rows] = np.nan_to_num(2.0 * pixels / size - 1.0, nan=0.0, posinf=2.0, neginf=-2.0).clip(-2.0, 2.0)
+    return Map(torch.from_numpy(grid)[None], None if valid.all() else torch.from_numpy(valid))

@@ -1,0 +1,63 @@
+"""Whether a scene's photos fit into the host's memory, told before the first of them is decoded."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+GIB = 2**30
+SHARE = 0.9  # of the free memory that photos may take
+MAX_DOWNSCALE = 64
+
+
+def available_memory() -> int:
+    """Bytes that this process can still take: of the machine, or of its control group where that allows less."""
+    import psutil
+
+    free = int(psutil.virtual_memory().available)
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            used = int((group / "memory.current").read_text())
+            stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
+    except (OSError, ValueError):  # no control groups of version 2 here
+        pass
+    return max(free, 0)
+
+
+def photos_bytes(sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:
+    """Bytes of photos (width, height) that are reduced by a factor."""
+    return sum((width // downscale) * (height // downscale) * channels for width, height in sizes)
+
+
+def check_memory(path: Path, images: str, sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:
+    """Return the bytes that stay free; raise when the photos would not fit.
+
+    Args:
+        path: folder of the scene, for the message.
+        images: folder of the photos in use, likewise.
+        sizes: width and height of every photo as it is kept, before `downscale`.
+        downscale: factor that reduces them.
+        channels: bytes a pixel.
+
+    Raises:
+        ValueError: they do not fit; the message says by how much to reduce them, or which folder to use.
+    """
+    free = available_memory()
+    limit = int(SHARE * free)
+    need = photos_bytes(sizes, downscale, channels)
+    if need <= limit:
+        return free - need
+    width, height = max(sizes)
+    smallest = min(min(size) for size in sizes)
+    factors = range(downscale + 1, min(MAX_DOWNSCALE, smallest) + 1)
+    fits = [k for k in factors if photos_bytes(sizes, k, channels) <= limit]
+    advice = "use fewer photos"
+    if fits:
+        advice = f"use downscale={fits[0]} ({photos_bytes(sizes, fits[0], channels) / GIB:.1f} GiB)"
+        folders = sorted(f.name for f in path.glob("images_*") if f.is_dir() and f.name != images)
+        advice += f" or a folder of smaller images ({', '.join(folders)})" if folders else ""
+    raise ValueError(
+        f"{path}: {len(sizes)} photos of up to {width}x{height} at downscale={downscale} need {need / GIB:.1f} GiB of "
+        f"host memory, of which {free / GIB:.1f} GiB are free; {advice}"
+    )

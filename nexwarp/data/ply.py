@@ -1,0 +1,145 @@
+"""Points from PLY files: ascii or binary, positions and, where there are any, colours."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+MAX_HEADER = 64 * 1024  # bytes
+MAX_PROPERTIES = 1024
+MAX_POINTS = 100_000_000
+COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats: coefficients of Y_0
+BAND_0 = 0.28209479177387814
+GREY = 128
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the vertices of a PLY file.
+
+    Args:
+        path: the file; its vertices have x, y and z, and may have red, green and blue (also diffuse_red ... or r, g,
+            b; integers of full range, or floats in [0, 1]) or the f_dc_0 ... of Gaussian splats. Others are ignored.
+
+    Returns:
+        (P, 3) float64 positions and (P, 3) uint8 sRGB colours, grey where the file has none.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no PLY file, one that is damaged or truncated, no vertices, or positions that are not finite.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file, expected a PLY file of points")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        order, elements = _header(path, file)
+        vertices = _vertices(path, file, order, elements, size)
+    names = vertices.dtype.names
+    lacking = [axis for axis in "xyz" if axis not in names]
+    if lacking:
+        raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
+    positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    bad = ~np.isfinite(positions).all(axis=1)
+    if bad.any():
+        index = int(np.flatnonzero(bad)[0])
+        raise ValueError(f"{path}: expected finite points, got {tuple(positions[index].tolist())} (vertex {index})")
+    return positions, _colors(vertices)
+
+
+def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[tuple[str, int, list[tuple[str, str]] | None]]]:
+    """Format and elements: name, count and properties, which are None for an element with lists."""
+    if file.readline(16).strip() != b"ply":
+        raise ValueError(f"{path}: expected a PLY file, but it does not begin with 'ply'")
+    form = None
+    elements: list[tuple[str, int, list[tuple[str, str]] | None]] = []
+    while True:
+        if file.tell() > MAX_HEADER:
+            raise ValueError(f"{path}: expected a PLY header of at most {MAX_HEADER:,} bytes")
+        line = file.readline(MAX_HEADER)
+        words = line.decode("ascii", "replace").split()
+        if not line:
+            raise ValueError(f"{path}: truncated, the PLY header has no end_header")
+        if words[:1] == ["end_header"]:
+            break
+        if words[:1] == ["format"] and len(words) == 3 and words[1] in ORDERS:
+            form = words[1]
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 18:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:2] == ["property", "list"] and len(words) == 5 and elements:
+            elements[-1] = (*elements[-1][:2], None)
+        elif words[:1] == ["property"] and len(words) == 3 and elements and words[1] in TYPES:
+            if elements[-1][2] is not None:
+                elements[-1][2].append((words[2], TYPES[words[1]]))
+        elif words and words[0] not in ("comment", "obj_info"):
+            raise ValueError(f"{path}: expected a PLY header, got the line {' '.join(words)[:60]!r}")
+    if form is None:
+        raise ValueError(f"{path}: expected a PLY header with a format, found none")
+    return form, elements
+
+
+def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list, size: int) -> np.ndarray:
+    """Structured array of the vertices, after what lies before them is skipped."""
+    for name, count, properties in elements:
+        left = size - file.tell()
+        if properties is None:
+            what = "its lists" if name == "vertex" else f"lists of {name} before them"
+            raise ValueError(f"{path}: expected vertices without lists first, got {what}")
+        fields = [(field, ORDERS[form] + kind) for field, kind in properties]
+        if len({field for field, _ in fields}) < len(fields) or len(fields) > MAX_PROPERTIES:
+            raise ValueError(f"{path}: element {name}: expected properties of different names")
+        dtype = np.dtype(fields)
+        # An ascii value takes a digit and a blank or an end of line.
+        least = count * (dtype.itemsize if form != "ascii" else max(2 * len(fields), 1)) - (form == "ascii")
+        if least > left or count > MAX_POINTS:
+            raise ValueError(f"{path}: truncated, expected {count:,} of element {name}, got {left:,} bytes for them")
+        if name != "vertex":
+            if form == "ascii":
+                for _ in range(count):
+                    file.readline()
+            else:
+                file.seek(count * dtype.itemsize, io.SEEK_CUR)
+            continue
+        if not count or not fields:
+            raise ValueError(f"{path}: expected at least one vertex, got none")
+        if form != "ascii":
+            return np.fromfile(file, dtype, count)
+        return _ascii(path, file, dtype, count)
+    raise ValueError(f"{path}: expected an element vertex, found none")
+
+
+def _ascii(path: Path, file: io.BufferedReader, dtype: np.dtype, count: int) -> np.ndarray:
+    lines = (line for line in file if line.strip())
+    try:
+        values = np.loadtxt(lines, np.float64, comments=None, max_rows=count, ndmin=2, encoding="ascii")
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: expected rows of {len(dtype)} numbers, could not read them: {error}") from None
+    if values.shape != (count, len(dtype)):
+        raise ValueError(f"{path}: truncated, expected {count:,} rows of {len(dtype)} numbers, got {values.shape}")
+    vertices = np.empty(count, dtype)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for index, name in enumerate(dtype.names):
+            vertices[name] = values[:, index]
+    return vertices
+
+
+def _colors(vertices: np.ndarray) -> np.ndarray:
+    names = vertices.dtype.names
+    for triple in COLORS:
+        if set(triple) <= set(names):
+            channels = [vertices[name] for name in triple]
+            scale = [255.0 / np.iinfo(c.dtype).max if c.dtype.kind in "iu" else 255.0 for c in channels]
+            return _bytes(np.stack([c * s for c, s in zip(channels, scale, strict=True)], axis=1))
+    if set(HARMONICS) <= set(names):
+        return _bytes(np.stack([255.0 * (0.5 + BAND_0 * vertices[name]) for name in HARMONICS], axis=1))
+    return np.full((len(vertices), 3), GREY, np.uint8)
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.floor(np.nan_to_num(values, nan=float(GREY)).clip(0, 255) + 0.5).astype(np.uint8)

@@ -1,0 +1,362 @@
+"""Scenes told in JSON: nerfstudio's transforms.json and Blender's transforms_train/val/test.json.
+
+Both hold camera-to-world matrices with OpenGL's camera axes (x right, y up, z backward). With `applied_transform`
+(and `applied_scale`) a file says how its world came from the original one; it is undone, for cameras and points.
+"""
+
+import itertools
+import json
+import math
+import re
+import warnings
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from nexwarp.data.capture import Capture, Cloud, Photo, leaves_folder
+from nexwarp.data.images import image_size, read_image
+from nexwarp.data.lens import Lens
+from nexwarp.data.ply import read_ply
+
+NERFSTUDIO_FILE = "transforms.json"
+BLENDER_FILES = {split: f"transforms_{split}.json" for split in ("train", "test", "val")}
+MAX_BYTES = 32 * 2**20  # of a JSON file: some 30,000 frames; parsed it takes at most twenty times as much
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
+ROTATION_TOLERANCE = 1e-3  # as of Camera
+WHITE = (1.0, 1.0, 1.0)
+PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
+FISHEYE = ("k1", "k2", "k3", "k4")
+AGREEMENT = 2.0  # so many times better must points fit the photos in another frame than in the one promised
+JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
+
+
+def read_nerfstudio(path: Path, images: str) -> Capture:
+    """Read `transforms.json` in a scene's folder, with the photos in the folder `images` in place of "images".
+
+    Raises:
+        FileNotFoundError: a photo, a mask or the points that the file names are absent.
+        ValueError: anything that the file says cannot be, in one line that says where.
+    """
+    file = path / NERFSTUDIO_FILE
+    data = _read_json(file)
+    photos = _photos(file, data, images)
+    photos, test = _split(file, data, photos)
+    return Capture(file, photos, _points(file, data, photos), test)
+
+
+def read_blender(path: Path, images: str) -> Capture:
+    """Read a Blender scene: train and test files, val in place of a test file that is not there.
+
+    Raises:
+        FileNotFoundError: no transforms_train.json, or a photo that a file names is absent.
+        ValueError: anything that a file says cannot be, in one line that says where.
+    """
+    train = path / BLENDER_FILES["train"]
+    if not train.is_file():
+        raise FileNotFoundError(f"{path}: expected {train.name} of a Blender scene, found none")
+    data = _read_json(train)
+    photos = _photos(train, data, images)
+    cloud = _points(train, data, photos)
+    for split in ("test", "val"):
+        other = path / BLENDER_FILES[split]
+        if other.is_file():
+            held_out = _photos(other, _read_json(other), images)
+            names = {photo.name for photo in photos}
+            again = [photo.name for photo in held_out if photo.name in names]
+            if again:
+                raise ValueError(f"{other}: {again[0]} is in {train.name} too, expected other photos to judge by")
+            merged = sorted(photos + held_out, key=lambda photo: photo.name)
+            return Capture(train, merged, cloud, frozenset(photo.name for photo in held_out), WHITE)
+    return Capture(train, photos, cloud, None, WHITE)
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    size = file.stat().st_size
+    if size > MAX_BYTES:
+        raise ValueError(f"{file}: expected at most {MAX_BYTES:,} bytes of JSON, got {size:,}")
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except RecursionError:
+        raise ValueError(f"{file}: expected a JSON object of frames, got one nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"{file}: expected JSON, could not parse it: {error}") from None
+    if not isinstance(data, dict):
+        raise ValueError(f"{file}: expected a JSON object, got {type(data).__name__}")
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {_short(frames)}")
+    return data
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _photos(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
+    to_original = _inverse_applied(file, data)
+    photos = []
+    for index, frame in enumerate(data["frames"]):
+        where = f"{file}: frame {index}"
+        if not isinstance(frame, dict):
+            raise ValueError(f"{where}: expected a JSON object, got {_short(frame)}")
+        photos.append(_photo(where, file.parent, data, frame, images, to_original))
+    photos.sort(key=lambda photo: photo.name)
+    for one, other in itertools.pairwise(photos):
+        if one.name == other.name:
+            raise ValueError(f"{file}: expected each photo once, got {one.name} twice")
+    return photos
+
+
+def _photo(
+    where: str, folder: Path, data: dict[str, Any], frame: dict[str, Any], images: str, to_original: np.ndarray
+) -> Photo:
+    named = _file_name(where, "file_path", frame.get("file_path"))
+    where = f"{where} ({named})"
+    file = _find(where, folder, named, images)
+    name = _view_name(str(PurePosixPath(named).with_name(file.name)))
+    mask = None
+    if frame.get("mask_path") is not None:
+        mask = folder / _file_name(where, "mask_path", frame["mask_path"])
+        if not mask.is_file():
+            raise FileNotFoundError(f"{where}: mask not found: {mask}")
+    lens = _lens(where, {**data, **frame}, file)
+    return Photo(name, file, _viewmat(where, frame.get("transform_matrix"), to_original), lens, mask)
+
+
+def _file_name(where: str, key: str, value: Any) -> str:
+    """A file's name below the scene's folder, with "/" between its parts."""
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"{where}: {key}: expected the name of a file, got {_short(value)}")
+    name = value.replace("\\", "/")
+    if leaves_folder(name):
+        raise ValueError(f"{where}: {key}: {value!r} leaves the scene's folder, expected a relative path below it")
+    return str(PurePosixPath(name))
+
+
+def _view_name(named: str) -> str:
+    return named[7:] if named.startswith("images/") else named
+
+
+def _find(where: str, folder: Path, named: str, images: str) -> Path:
+    """The image file, with the folder asked for and, where the name has none, an extension."""
+    if images != "images":
+        if not named.startswith("images/"):
+            raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
+        named = f"{images}/{named[7:]}"
+    path = folder / named
+    candidates = [path, *(path.with_name(path.name + extension) for extension in EXTENSIONS)]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise FileNotFoundError(f"{where}: image not found: {path}")
+
+
+def _number(where: str, keys: dict[str, Any], key: str) -> float | None:
+    value = keys.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{where}: {key}: expected a number, got {_short(value)}")
+    try:
+        value = float(value)
+    except OverflowError:
+        value = math.inf
+    if not math.isfinite(value):
+        raise ValueError(f"{where}: {key}: expected a finite number, got {value}")
+    return value
+
+
+def _lens(where: str, keys: dict[str, Any], file: Path) -> Lens:
+    """The lens of a frame, whose own keys go before the file's."""
+    size = [_number(where, keys, "w"), _number(where, keys, "h")]
+    if None in size:
+        size = list(image_size(file))
+    if any(side != int(side) or side < 1 for side in size):
+        raise ValueError(f"{where}: w, h: expected whole numbers of pixels, got {size[0]:g}x{size[1]:g}")
+    width, height = map(int, size)
+    model = keys.get("camera_model")
+    if model is None:
+        model = (
+            "OPENCV_FISHEYE"
+            if keys.get("is_fisheye")
+            else "EQUIRECTANGULAR"
+            if keys.get("is_equirectangular")
+            else "OPENCV"
+        )
+    coefficients: list[float] = []
+    if model in PERSPECTIVE:
+        known: tuple[str, ...] = RADIAL_TANGENTIAL
+        coefficients = [_number(where, keys, key) or 0.0 for key in known]
+        if not any(coefficients):
+            model, coefficients = "PINHOLE", []
+        elif not any(coefficients[4:]):
+            model, coefficients = "OPENCV", coefficients[:4]
+        else:
+            model = "FULL_OPENCV"
+    elif model == "OPENCV_FISHEYE":
+        known = FISHEYE
+        coefficients = [_number(where, keys, key) or 0.0 for key in known]
+    elif model == "EQUIRECTANGULAR":
+        known = ()
+    else:
+        raise ValueError(
+            f"{where}: camera_model: expected one of {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, EQUIRECTANGULAR, "
+            f"got {_short(model)}"
+        )
+    unknown = [key for key in keys if re.fullmatch(r"[kps]\d", key) and key not in known and keys[key]]
+    if unknown:
+        raise ValueError(f"{where}: lens coefficient {unknown[0]} is no part of camera model {model}")
+    try:
+        if model == "EQUIRECTANGULAR":
+            return Lens(model, (float(width), float(height)), width, height)
+        return Lens(model, (*_focal(where, keys, width, height), *coefficients), width, height)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(where) else f"{where}: {text}") from None
+
+
+def _focal(where: str, keys: dict[str, Any], width: int, height: int) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point: given, or from fields of view; the image's centre by default."""
+    focal: list[float | None] = []
+    for axis, side in (("x", width), ("y", height)):
+        length, angle = _number(where, keys, f"fl_{axis}"), _number(where, keys, f"camera_angle_{axis}")
+        if length is None and angle is not None:
+            if not 0 < angle < math.pi:
+                raise ValueError(f"{where}: camera_angle_{axis}: expected radians between 0 and pi, got {angle:g}")
+            length = 0.5 * side / math.tan(0.5 * angle)
+        focal.append(length)
+    fx, fy = (given if given is not None else focal[1 - index] for index, given in enumerate(focal))
+    if fx is None or fy is None:
+        raise ValueError(f"{where}: expected a focal length (fl_x or camera_angle_x), found none")
+    cx, cy = _number(where, keys, "cx"), _number(where, keys, "cy")
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _matrix(where: str, key: str, value: Any) -> np.ndarray:
+    """(4, 4) float64 of a list of 3 or 4 rows."""
+    rows = value if isinstance(value, list) else []
+    good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for row in rows for x in row):
+        raise ValueError(f"{where}: {key}: expected 4 rows of 4 numbers, got {_short(value)}")
+    try:
+        matrix = np.array([*rows[:3], rows[3] if len(rows) == 4 else [0, 0, 0, 1]], dtype=np.float64)
+    except OverflowError:
+        raise ValueError(f"{where}: {key}: expected finite numbers, got {_short(value)}") from None
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{where}: {key}: expected finite numbers, got {_short(value)}")
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
+        raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {_short(rows[3])}")
+    return matrix
+
+
+def _check_rotation(where: str, key: str, rotation: np.ndarray, what: str) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{where}: {key}: expected {what}, got a singular, sheared, scaled or mirroring one")
+
+
+def _viewmat(where: str, value: Any, to_original: np.ndarray) -> np.ndarray:
+    """(4, 4) world to camera, OpenCV axes, of an OpenGL camera-to-world matrix."""
+    pose = _matrix(where, "transform_matrix", value)
+    _check_rotation(where, "transform_matrix", pose[:3, :3], "a rotation and a position")
+    linear = to_original[:3, :3]
+    rotation = linear / np.cbrt(np.linalg.det(linear)) @ pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ (linear @ pose[:3, 3] + to_original[:3, 3])
+    return viewmat
+
+
+def _inverse_applied(file: Path, data: dict[str, Any]) -> np.ndarray:
+    """(4, 4) similarity from the file's world to the original one."""
+    applied = np.eye(4)
+    if data.get("applied_transform") is not None:
+        applied = _matrix(str(file), "applied_transform", data["applied_transform"])
+    scale = _number(str(file), data, "applied_scale")
+    if scale is not None:
+        if not scale > 0:
+            raise ValueError(f"{file}: applied_scale: expected a number > 0, got {scale:g}")
+        applied[:3] *= scale
+    volume = np.linalg.det(applied[:3, :3])
+    factor = np.cbrt(volume) if volume > 0 else 1.0
+    what = "a rotation, a position and at most one scale"
+    _check_rotation(str(file), "applied_transform", applied[:3, :3] / factor, what)
+    return np.linalg.inv(applied)
+
+
+def _split(file: Path, data: dict[str, Any], photos: list[Photo]) -> tuple[list[Photo], frozenset[str] | None]:
+    """The photos in use, and which of them the file holds out; None where it says nothing."""
+    lists: dict[str, set[str]] = {}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = data.get(key)
+        if names is None:
+            continue
+        if not isinstance(names, list):
+            raise ValueError(f"{file}: {key}: expected a list of file names, got {_short(names)}")
+        lists[key] = {_view_name(_file_name(str(file), key, name)) for name in names}
+        known = {photo.name for photo in photos}
+        known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
+        missing = sorted(lists[key] - known)
+        if missing:
+            raise ValueError(f"{file}: {key}: expected photos of the frames, got {missing[0]}")
+    if not lists:
+        return photos, None
+
+    def listed(photo: Photo, names: set[str]) -> bool:
+        return photo.name in names or str(PurePosixPath(photo.name).with_suffix("")) in names
+
+    held_out = lists.get("test_filenames") or lists.get("val_filenames") or set()
+    test = [photo for photo in photos if listed(photo, held_out)]
+    learnt = [photo for photo in photos if "train_filenames" not in lists or listed(photo, lists["train_filenames"])]
+    both = [photo for photo in learnt if listed(photo, held_out)]
+    if both and "train_filenames" in lists:
+        warnings.warn(f"{file}: {len(both)} photos are to train and to test, and are kept for testing", stacklevel=2)
+    train = [photo for photo in learnt if not listed(photo, held_out)]
+    if not train:
+        raise ValueError(f"{file}: train_filenames: expected at least one photo that is not for testing, got none")
+    return sorted(train + test, key=lambda photo: photo.name), frozenset(photo.name for photo in test)
+
+
+def _points(file: Path, data: dict[str, Any], photos: list[Photo]) -> Cloud | None:
+    """The points that the file names, in the original world."""
+    if data.get("ply_file_path") is None:
+        return None
+    path = file.parent / _file_name(str(file), "ply_file_path", data["ply_file_path"])
+    if not path.is_file():
+        raise FileNotFoundError(f"{file}: ply_file_path: points not found: {path}")
+    positions, colors = read_ply(path)
+    to_original = _inverse_applied(file, data)
+    moved = positions @ to_original[:3, :3].T + to_original[:3, 3]
+    # Some releases of nerfstudio left the points in the original world and moved only the cameras.
+    if not np.allclose(to_original, np.eye(4)):
+        as_promised, as_they_are = (_color_error(where, colors, photos) for where in (moved, positions))
+        if as_promised > AGREEMENT * as_they_are:
+            warnings.warn(
+                f"{path}: its points fit the photos only without applied_transform; left as they are", stacklevel=2
+            )
+            moved = positions
+    return Cloud.of(moved, colors)
+
+
+def _color_error(points: np.ndarray, colors: np.ndarray, photos: list[Photo]) -> float:
+    """Median difference, of 255, between points and the pixels that some photos show in their place."""
+    sample = np.linspace(0, len(points) - 1, min(len(points), JUDGED_POINTS)).astype(int)
+    errors = [np.zeros((0, 3))]
+    for photo in photos[:: -(-len(photos) // JUDGED_PHOTOS)]:
+        image = read_image(photo.file).numpy()
+        rotation, shift = photo.viewmat[:3, :3], photo.viewmat[:3, 3]
+        pixels = photo.lens.project(points[sample] @ rotation.T + shift) / [photo.lens.width, photo.lens.height]
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < 1)).all(axis=1)
+        column, row = (pixels[inside] * image.shape[1::-1]).astype(int).T
+        errors.append(np.abs(image[row, column].astype(float) - colors[sample][inside]))
+    error = np.concatenate(errors)
+    return float(np.median(error)) if len(error) else 255.0

@@ -1,0 +1,168 @@
+"""Lenses: closed forms, the place of every resampled pixel, panoramas, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from nexwarp.data.lens import FACES, Lens, Maps, pycolmap_module
+
+WIDTH, HEIGHT = 120, 90
+F = (80.0, 83.0, 61.5, 43.0)  # fx, fy, cx, cy
+LENSES = {
+    "SIMPLE_RADIAL": (80.0, 61.5, 43.0, -0.1),
+    "RADIAL": (80.0, 61.5, 43.0, -0.1, 0.02),
+    "OPENCV": (*F, -0.15, 0.03, 0.002, -0.001),
+    "FULL_OPENCV": (*F, -0.15, 0.03, 0.002, -0.001, 0.01, 0.02, 0.0, 0.001),
+    "OPENCV_FISHEYE": (*F, 0.03, -0.01, 0.004, -0.001),
+    "SIMPLE_RADIAL_FISHEYE": (80.0, 61.5, 43.0, 0.01),
+    "RADIAL_FISHEYE": (80.0, 61.5, 43.0, 0.01, 0.002),
+    "SIMPLE_FISHEYE": (80.0, 61.5, 43.0),
+    "FISHEYE": F,
+    "FOV": (*F, 0.7),
+    "THIN_PRISM_FISHEYE": (*F, 0.02, -0.01, 0.001, 0.001, 0.002, 0.0, 0.001, 0.001),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (*F, 0.01, -0.01, 0.002, 0.0, 0.0, 0.0, 0.001, 0.001, 0.001, 0.0, 0.001, 0.0),
+    "SIMPLE_DIVISION": (80.0, 61.5, 43.0, -0.1),
+    "DIVISION": (*F, -0.1),
+    "EUCM": (*F, 0.5, 1.1),
+}
+
+
+def lens(model: str) -> Lens:
+    return Lens(model, LENSES[model], WIDTH, HEIGHT)
+
+
+def rays_of(target) -> np.ndarray:
+    """(h * w, 3) rays through the pixel centres of a pinhole image."""
+    pixels = np.stack(np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5), axis=-1)
+    return np.concatenate([pixels.reshape(-1, 2), np.ones((pixels.size // 2, 1))], axis=1) @ np.linalg.inv(target.K).T
+
+
+def test_every_model_that_colmap_has_is_here():
+    known = set(pycolmap_module().CameraModelId.__members__) - {"INVALID", "PINHOLE", "SIMPLE_PINHOLE"}
+    assert known == set(LENSES) | {"EQUIRECTANGULAR"}
+
+
+def opencv(x, y, k1, k2, p1, p2):
+    r = x * x + y * y
+    radial = 1 + k1 * r + k2 * r * r
+    return x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x), y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y
+
+
+def fisheye(x, y, k1, k2, k3, k4):
+    r = np.hypot(x, y)
+    theta = np.arctan(r)
+    bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
+    return x * bent / r, y * bent / r
+
+
+@pytest.mark.parametrize(("model", "closed"), [("OPENCV", opencv), ("OPENCV_FISHEYE", fisheye)])
+def test_maps_are_opencvs_formulas(model, closed):
+    target = lens(model).pinhole()
+    x, y, _ = rays_of(target).T
+    x, y = closed(x, y, *LENSES[model][4:])
+    expected = np.stack([F[0] * x + F[2], F[1] * y + F[3]], axis=1)
+    grid = Maps().get(lens(model), target, None).grid[0].reshape(-1, 2).double().numpy()
+    np.testing.assert_allclose((grid + 1) / 2 * [WIDTH, HEIGHT], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_pixels_come_from_where_the_lens_put_them(model):
+    """A photo whose colours are its own coordinates: what is undistorted tells where each pixel came from."""
+    target = lens(model).pinhole()
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    photo = torch.from_numpy(np.stack([2 * x, 2 * y, 0 * x + 7], axis=-1).astype(np.uint8))
+    way = Maps().get(lens(model), target, None)
+    assert way.valid is None, "an undistorted image leaves no empty corner"
+    seen = way.colors(photo).reshape(-1, 3).double().numpy()
+    pixels = lens(model).project(rays_of(target))
+    inner = ((pixels > 2) & (pixels < [WIDTH - 2, HEIGHT - 2])).all(axis=1)
+    assert inner.mean() > 0.85
+    # A photo's value is 2 i + 1 at pixel coordinates i + 0.5: twice the coordinate.
+    assert np.abs(seen[inner, :2] - 2 * pixels[inner]).max() <= 0.75
+    assert (seen[:, 2] == 7).all()
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_an_undistorted_image_is_no_larger_than_it_must(model):
+    """It keeps the focal length; some of its edge lies within a pixel or two of the photo's edge."""
+    target = lens(model).pinhole()
+    assert target.K[0, 0] == LENSES[model][0] and target.width <= 2 * WIDTH and target.height <= 2 * HEIGHT
+    pixels = lens(model).project(rays_of(target))
+    gap = np.minimum(pixels, [WIDTH, HEIGHT] - pixels).min(axis=1)
+    assert -0.5 <= gap.min() <= 2.5
+
+
+def test_masks_take_the_nearest_pixel_and_end_with_the_photo():
+    here = lens("OPENCV")
+    target = here.pinhole()
+    wide = target.resized(target.width, target.height)
+    wide.K[:2, :2] *= 0.5  # twice the field of view: three quarters lie outside the photo
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, : WIDTH // 2] = True
+    out = Maps().get(here, wide, None).mask(mask).numpy().reshape(-1)
+    pixels = here.project(rays_of(wide))
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1)
+        outside = ~((pixels > -1) & (pixels < [WIDTH + 1, HEIGHT + 1])).all(axis=1)
+    left = pixels[:, 0] < WIDTH // 2 - 1e-3
+    assert not out[outside].any() and (out[inside & left]).all()
+    assert not out[inside & (pixels[:, 0] > WIDTH // 2 + 1e-3)].any() and 0.1 < inside.mean() < 0.5
+
+
+def test_the_faces_of_a_panorama_show_their_directions():
+    """A panorama whose colours are directions, x right, y down, z forward at its centre."""
+    size = 512, 256
+    longitude = ((np.arange(size[0]) + 0.5) / size[0] - 0.5) * 2 * np.pi
+    latitude = ((np.arange(size[1]) + 0.5) / size[1] - 0.5) * np.pi
+    x = np.sin(longitude) * np.cos(latitude)[:, None]
+    z = np.cos(longitude) * np.cos(latitude)[:, None]
+    y = np.sin(latitude)[:, None] + 0 * longitude
+    photo = torch.from_numpy(np.round(127.5 + 127.5 * np.stack([x, y, z], axis=-1)).astype(np.uint8))
+    sphere = Lens("EQUIRECTANGULAR", tuple(map(float, size)), *size)
+    target = sphere.pinhole()
+    assert target.width == target.height == round(size[0] / np.pi)
+    maps, covered = Maps(), np.zeros(3)
+    for face, rotation in FACES.items():
+        rotation = np.array(rotation, float)
+        assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
+        rays = rays_of(target) @ rotation
+        directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        way = maps.get(sphere, target, face)
+        shown = way.colors(photo).reshape(-1, 3).double().numpy() / 127.5 - 1
+        assert np.abs(shown - directions).max() < 0.02, face
+        assert way.valid is None
+        covered += rotation[2]
+    assert np.abs(covered).max() == 0
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "size", "message"),
+    [
+        ("TELESCOPE", F, (4, 4), "TELESCOPE is unknown to COLMAP"),
+        ("INVALID", F, (4, 4), "INVALID is unknown to COLMAP"),
+        ("OPENCV", F, (4, 4), "expected fx, fy, cx, cy, k1, k2, p1, p2, got 4 values"),
+        ("PINHOLE", (0.0, 1.0, 2.0, 2.0), (4, 4), "expected focal lengths > 0, got 0, 1"),
+        ("PINHOLE", (1.0, 1.0, 2.0, float("nan")), (4, 4), "expected finite parameters"),
+        ("PINHOLE", F, (0, 4), "expected an image size of 1 to 65536 pixels, got 0x4"),
+        ("PINHOLE", F, (4, 2**40), "expected an image size"),
+    ],
+)
+def test_bad_lenses(model, params, size, message):
+    with pytest.raises(ValueError, match=message):
+        Lens(model, params, *size)
+
+
+def test_absurd_lenses_give_finite_maps_of_bounded_size():
+    rng = np.random.default_rng(0)
+    for trial in range(300):
+        model = sorted(LENSES)[trial % len(LENSES)]
+        size = 10.0 ** rng.uniform(-3, rng.choice([0, 2, 20, 300]))
+        params = np.abs(rng.normal(size=len(LENSES[model])) * size) + 1e-6
+        params[4:] *= rng.choice([-1, 1], len(params) - 4) if len(params) > 4 else 1
+        if trial % 3:
+            params[:4] = (50.0, 50.0, 20.0, 15.0)[: len(params)]
+        here = Lens(model, tuple(params.tolist()), 40, 30)
+        target = here.pinhole()
+        assert 1 <= target.width <= 80 and 1 <= target.height <= 60 and np.isfinite(target.K).all()
+        way = Maps().get(here, target, None)
+        assert way.grid.isfinite().all() and way.grid.abs().max() <= 2
