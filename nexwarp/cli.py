@@ -18,10 +18,11 @@ from rich.console import Console
 from nexwarp import console as display
 from nexwarp import warmup
 from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
-from nexwarp.config import Config, LearningRates, TextureConfig, preset
+from nexwarp.config import Config, parse_settings, preset, setting, with_settings
 from nexwarp.data import Scene
 from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.logs import TrainingLog, check_tensorboard
 from nexwarp.outputs import RenderOrder, export_run
 from nexwarp.runs import (
     CAMERAS_FILE,
@@ -47,23 +48,33 @@ DEMO_SETTINGS: dict[str, Any] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
-    "texture": TextureConfig(levels=12, table_size=2**15, width=32),
-    "rates": LearningRates(
-        means=(5e-4, 5e-6),
-        quats=5e-3,
-        scales=2.5e-2,
-        opacities=0.05,
-        gammas=5e-3,
-        sh0=1.25e-2,
-        shN=6e-4,
-        grid=(2e-2, 2e-4),
-        mlp=(3e-3, 3e-4),
-    ),
+    "texture.levels": 12,
+    "texture.table_size": 2**15,
+    "texture.width": 32,
+    "rates.means": (5e-4, 5e-6),
+    "rates.quats": 5e-3,
+    "rates.scales": 2.5e-2,
+    "rates.opacities": 0.05,
+    "rates.gammas": 5e-3,
+    "rates.sh0": 1.25e-2,
+    "rates.shN": 6e-4,
+    "rates.grid": (2e-2, 2e-4),
+    "rates.mlp": (3e-3, 3e-4),
 }
 CHECKPOINTS = 10
 
+
+def option(metavar: str, default: str | None = None) -> Any:
+    """How --help shows an option's value, and its default where None stands for it."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=None if default is None else f"(default: {default})")
+
+
 Scene_ = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Run_ = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda where there is one, else cpu")]
+Preset_ = Annotated[str, option("{default,paper}")]
+Port_ = Annotated[int, option("PORT")]
+Host_ = Annotated[str, option("ADDRESS")]
 
 
 @dataclass
@@ -72,42 +83,51 @@ class Train:
 
     scene: Scene_
     """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
-    run: Path | None = None
-    """Folder to write to; runs/SCENE by default."""
-    max_surfels: int | None = None
-    """Budget P of surfels, never exceeded (400,000; demo 3,000)."""
-    iterations: int | None = None
-    """Training steps; schedules stretch with them (30,000; demo 1,200)."""
-    downscale: int = 1
+    run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
+    """Folder to write to."""
+    max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
+    """Budget of surfels, never exceeded."""
+    iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
+    """Training steps, one photo each; schedules stretch with them."""
+    downscale: Annotated[int, option("N")] = 1
     """Reduce photos by this factor, by area."""
-    images: str = "images"
+    images: Annotated[str, option("FOLDER")] = "images"
     """Folder of the photos below SCENE, such as images_4."""
-    masks: str = "masks"
-    """Folder of the masks below SCENE, if it is there; `alpha` for the photos' own transparency; `none`."""
-    background: str | None = None
-    """Behind transparent photos and renderings: white (default of Blender scenes), black, R,G,B up to 1, or random."""
-    points: str | None = None
-    """PLY file of the points to start from, in place of the scene's own."""
-    format: str | None = None
-    """`colmap`, `nerfstudio` or `blender`, for a folder that holds more than one of them."""
-    max_hits: int | None = None
-    """K, hits a pixel textures, 0 to 8 (2); 0 trains without a texture."""
-    preset: str = "default"
-    """`default`, or `paper` to reproduce the publication."""
-    seed: int | None = None
-    """Of every random choice (0)."""
-    device: str | None = None
-    """`cuda` or `cpu`; CUDA where present by default."""
+    masks: Annotated[str, option("{FOLDER,alpha,none}")] = "masks"
+    """Folder of the masks below SCENE, if it is there; `alpha` takes the photos' own transparency."""
+    background: Annotated[
+        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else photos count as opaque")
+    ] = None
+    """Colour behind transparent photos, and behind renderings; R,G,B go up to 1, `random` is another each step."""
+    points: Annotated[str | None, option("FILE.ply", "the scene's own points")] = None
+    """Points to start from."""
+    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "the one that is there")] = None
+    """Kind of the scene, for a folder that holds more than one."""
+    max_hits: Annotated[int | None, option("K", "2")] = None
+    """Hits a pixel textures, 0 to 8; 0 trains without a texture."""
+    preset: Preset_ = "default"
+    """Settings to start from: nexwarp's own, or those of the publication (docs/paper.md)."""
+    settings: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """Change any setting of docs/options.md, such as texture.max_resolution=1024; VALUE is JSON or a bare word."""
+    seed: Annotated[int | None, option("N", "0")] = None
+    """Of every random choice."""
+    device: Device_ = None
+    """Where to train."""
     resume: bool = False
-    """Continue the run in --run."""
+    """Continue the run in --run: with its settings, whatever else is given must agree with them."""
     overwrite: bool = False
     """Replace the run in --run."""
     view: bool = False
     """Show the training in the browser (extra `viewer`); afterwards the result, until Ctrl-C."""
-    host: str = "127.0.0.1"
+    host: Host_ = "127.0.0.1"
     """Where --view listens; 0.0.0.0 lets other machines look."""
-    port: int = 8080
+    port: Port_ = 8080
     """Of --view; 0 for any free one."""
+    tensorboard: bool = False
+    """Also log into RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -118,6 +138,8 @@ class Train:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run)
+        if self.tensorboard:
+            check_tensorboard()
         if self.view:
             from nexwarp.viewer import check_server
 
@@ -128,6 +150,8 @@ class Train:
         with display.loading(console) as progress:
             scene = source.load(progress)
         if scene.background is not None and not self.resume:
+            if "background" in parse_settings(self.settings):
+                raise ValueError("--set: background: expected --background instead: the photos are put on it, too")
             config = dataclasses.replace(config, background=scene.background)
         size = scene.train[0].camera
         console.print(
@@ -143,7 +167,7 @@ class Train:
         with self._viewer(trainer, run, source.name, console) as viewer:
             if not self.resume:
                 create_run(run, source, config, device.type)
-            _train(trainer, run, console, viewer)
+            _train(trainer, run, console, viewer, tensorboard=self.tensorboard)
             _finish(trainer, scene, run, device, console)
             if viewer is not None:
                 viewer.finish(f"{trainer.iteration:,} iterations done")
@@ -197,17 +221,35 @@ class Train:
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
         given = {name: value for name, value in (given | {"seed": self.seed}).items() if value is not None}
         _check_max_hits(self.max_hits)
+        settings = self._settings(given)
         if self.resume:
             config = read_run(run)[1]
             for name, value in given.items():
                 if getattr(config, name) != value:
                     flag = f"--{name.replace('_', '-')}"
                     raise ValueError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
+            changed = _with_settings(config, settings)
+            for name in settings:
+                old, new = setting(config, name), setting(changed, name)
+                if old != new:
+                    raise ValueError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
             return config
         base = preset(self.preset)
         if self.scene == DEMO:
-            base = dataclasses.replace(base, **DEMO_SETTINGS)
-        return dataclasses.replace(base, **given)
+            base = with_settings(base, DEMO_SETTINGS)
+        return _with_settings(dataclasses.replace(base, **given), settings)
+
+    def _settings(self, given: dict[str, Any]) -> dict[str, Any]:
+        """What --set asks for; a setting has one flag alone."""
+        try:
+            settings = parse_settings(self.settings)
+        except ValueError as error:
+            raise ValueError(f"--set: {error}") from None
+        for name in settings:
+            if name == "preset" or name in given:
+                flag = f"--{name.replace('_', '-')}"
+                raise ValueError(f"--set: {name}: expected {flag} alone, got {name} with --set")
+        return settings
 
 
 @dataclass
@@ -216,10 +258,10 @@ class Eval:
 
     run: Run_
     """Run folder."""
-    scene: str | None = None
-    """Where the scene is now, if it moved."""
-    device: str | None = None
-    """`cuda` or `cpu`; CUDA where present by default."""
+    scene: Annotated[str | None, option("SCENE", "where it was trained from")] = None
+    """Folder of the scene, if it moved."""
+    device: Device_ = None
+    """Where to compute."""
 
     def __call__(self, console: Console) -> None:
         """Evaluate."""
@@ -245,24 +287,24 @@ class Render:
 
     run: Run_
     """Run folder."""
-    path: str | None = None
-    """`ellipse` (the default), `spiral`, `interpolate`, or FILE.json: nerfstudio's camera path or a transforms.json."""
-    video: Path | None = None
+    path: Annotated[str | None, option("{ellipse,spiral,interpolate,FILE.json}", "ellipse")] = None
+    """Camera path; FILE.json is nerfstudio's camera path or a transforms.json."""
+    video: Annotated[Path | None, option("FILE", "none")] = None
     """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9); needs the extra `video`."""
-    frames: int | None = None
-    """Frames of the path (120; a FILE.json says it itself); 0 for no path."""
-    fps: float | None = None
-    """Frames a second of the video (30, or what FILE.json says)."""
-    set: str | None = None
-    """Still views to render: `test`, `train` or `all`."""
+    frames: Annotated[int | None, option("N", "120, or what FILE.json says")] = None
+    """Frames of the path; 0 for no path."""
+    fps: Annotated[float | None, option("N", "30, or what FILE.json says")] = None
+    """Frames a second of the video."""
+    set: Annotated[str | None, option("{test,train,all}", "test where no path is asked for")] = None
+    """Still views to render."""
     buffers: bool = False
     """Also write all passes of each still view, or where there is none of each frame, as one OpenEXR file."""
-    size: str | None = None
-    """WIDTHxHEIGHT in pixels, such as 1920x1080; what is seen from top to bottom stays (the photos' size)."""
-    scale: float = 1.0
+    size: Annotated[str | None, option("WIDTHxHEIGHT", "that of the photos")] = None
+    """Pixels, such as 1920x1080; what is seen from top to bottom stays."""
+    scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size, instead of --size."""
-    device: str | None = None
-    """`cuda` or `cpu`; CUDA where present by default."""
+    device: Device_ = None
+    """Where to compute."""
 
     def __call__(self, console: Console) -> None:
         """Render."""
@@ -300,10 +342,10 @@ class Export:
 
     run: Run_
     """Run folder."""
-    format: str = "ply"
-    """`ply` or `cameras`."""
-    out: Path | None = None
-    """Folder to write to (RUN/export)."""
+    format: Annotated[str, option("{ply,cameras}")] = "ply"
+    """What to write."""
+    out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
+    """Folder to write to."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
@@ -317,12 +359,12 @@ class View:
 
     run: Run_
     """Run folder."""
-    host: str = "127.0.0.1"
+    host: Host_ = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets other machines look."""
-    port: int = 8080
+    port: Port_ = 8080
     """To listen on; 0 for any free one."""
-    device: str | None = None
-    """`cuda` or `cpu`; CUDA where present by default."""
+    device: Device_ = None
+    """Where to compute."""
 
     def __call__(self, console: Console) -> None:
         """Listen until Ctrl-C."""
@@ -374,12 +416,12 @@ class Info:
 class Warmup:
     """Compile ahead of time what train, eval and render need, into Warp's kernel cache."""
 
-    preset: str = "default"
-    """`default` or `paper`, as will be given to train."""
-    max_hits: int | None = None
-    """K, as will be given to train (2)."""
-    device: str | None = None
-    """`cuda` or `cpu`; CUDA where present by default."""
+    preset: Preset_ = "default"
+    """As will be given to train."""
+    max_hits: Annotated[int | None, option("K", "2")] = None
+    """As will be given to train."""
+    device: Device_ = None
+    """Where to compute."""
 
     def __call__(self, console: Console) -> None:
         """Compile."""
@@ -428,8 +470,27 @@ class Sfm:
         console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
 
 
+COMMANDS: dict[str, Any] = {
+    "train": Train,
+    "eval": Eval,
+    "render": Render,
+    "export": Export,
+    "view": View,
+    "info": Info,
+    "sfm": Sfm,
+    "warmup": Warmup,
+}
+
+
 def _name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
+
+
+def _with_settings(config: Config, settings: dict[str, Any]) -> Config:
+    try:
+        return with_settings(config, settings)
+    except ValueError as error:
+        raise ValueError(f"--set: {error}") from None
 
 
 def _check_max_hits(max_hits: int | None) -> None:
@@ -444,15 +505,18 @@ def _show(viewer: "Viewer", console: Console) -> None:
         viewer.show()
 
 
-def _train(trainer: Trainer, run: Path, console: Console, viewer: "Viewer | None" = None) -> None:
-    """Run the loop with its display; keep checkpoints on the way and when interrupted."""
+def _train(
+    trainer: Trainer, run: Path, console: Console, viewer: "Viewer | None" = None, *, tensorboard: bool = False
+) -> None:
+    """Run the loop with its display and log; keep checkpoints on the way and when interrupted."""
     total = trainer.config.iterations
     every = max(total // CHECKPOINTS, 1)
     shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
-    with shown, _deferred_interrupt() as interrupted:
+    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, _deferred_interrupt() as interrupted:
 
         def observe(step: Any) -> None:
             shown(step)
+            log(step)
             if viewer is not None:
                 viewer.between_steps(step.iteration, partial(_describe, step), interrupted)
             if step.iteration % every == 0 or step.iteration == total or interrupted():
@@ -542,18 +606,12 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
     wp.config.log_level = wp.LOG_ERROR
-    commands = {
-        "train": Train,
-        "eval": Eval,
-        "render": Render,
-        "export": Export,
-        "view": View,
-        "info": Info,
-        "sfm": Sfm,
-        "warmup": Warmup,
-    }
     command = tyro.extras.subcommand_cli_from_dict(
-        commands, prog="nexwarp", description="Nexels: neurally-textured surfels.", args=arguments
+        COMMANDS,
+        prog="nexwarp",
+        description="Nexels: neurally-textured surfels. Each command has a --help of its own.",
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
     console = Console()
     try:

@@ -1,8 +1,11 @@
 """Settings of a training run: dataclasses whose field docstrings say what they are, and the presets."""
 
 import dataclasses
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from difflib import get_close_matches
+from typing import Any, get_args, get_origin, get_type_hints
 
 from nexwarp.densify import DensifyConfig
 from nexwarp.kernels.types import MAX_HITS
@@ -13,6 +16,7 @@ from nexwarp.ops.checks import check_range
 REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
 MASK_MODES = ("ignore", "background")
+LARGEST = 2**53  # of numbers in settings: all integers up to there are floats too
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,13 @@ class LearningRates:
     """Of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """Of the MLP."""
+
+    def __post_init__(self) -> None:
+        for rate in dataclasses.fields(self):
+            value = getattr(self, rate.name)
+            ends = value if isinstance(value, tuple) else (value, value)
+            if not (min(ends) > 0 or ends == (0.0, 0.0)):
+                raise ValueError(f"{rate.name}: expected rates > 0, or 0 throughout, got {value}")
 
 
 @dataclass(frozen=True)
@@ -121,6 +132,9 @@ class Config:
         check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
+        check_range("sh_every", self.sh_every, 1)
+        for value in self.background or ():
+            check_range("background", value, 0.0, 1.0)
         if self.clamp_texture and self.texture.residual:
             raise ValueError("clamp_texture: expected False with texture.residual, got True")
         if self.mask_mode not in MASK_MODES:
@@ -162,18 +176,92 @@ def with_settings(config: Config, settings: dict[str, Any]) -> Config:
         settings: name -> value; a dot leads into a part, as in "texture.residual". Lists stand for tuples.
 
     Raises:
-        ValueError: there is no setting of that name, or its value is out of range.
+        ValueError: there is no setting of that name, or its value is of another type or out of range.
     """
+    changes: dict[str, dict[str, Any]] = {}
     for name, value in settings.items():
-        part, _, key = name.rpartition(".")
-        target = getattr(config, part, None) if part else config
-        if not (dataclasses.is_dataclass(target) and key in {f.name for f in dataclasses.fields(target)}):
-            known = sorted(f.name for f in dataclasses.fields(target if dataclasses.is_dataclass(target) else config))
-            raise ValueError(f"{name}: expected a setting, one of {', '.join(known)}")
-        value = tuple(value) if isinstance(value, list) else value
-        changed = dataclasses.replace(target, **{key: value})
-        config = dataclasses.replace(config, **{part: changed}) if part else changed
-    return config
+        part, key = _find_setting(config, name)
+        hints = get_type_hints(type(getattr(config, part) if part else config))
+        changes.setdefault(part, {})[key] = _typed(name, value, hints[key])
+    whole = changes.pop("", {})
+    for part, values in changes.items():
+        try:
+            whole[part] = dataclasses.replace(getattr(config, part), **values)
+        except ValueError as error:  # which names the setting without the part
+            raise ValueError(f"{part}.{error}") from None
+    return dataclasses.replace(config, **whole)
+
+
+def setting(config: Config, name: str) -> Any:
+    """Return the value of a setting, named as `with_settings` names it; ValueError when there is none."""
+    part, key = _find_setting(config, name)
+    return getattr(getattr(config, part) if part else config, key)
+
+
+def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
+    """Read settings as a person types them.
+
+    Args:
+        texts: KEY=VALUE each; VALUE is JSON, or else stands for itself as a string.
+
+    Returns:
+        What `with_settings` takes; names and types are checked there.
+
+    Raises:
+        ValueError: no KEY=VALUE, or a KEY twice.
+    """
+    settings: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (x.strip() for x in text.partition("="))
+        if not (name and equals and value):
+            raise ValueError(f"expected KEY=VALUE, got {text!r}")
+        if name in settings:
+            raise ValueError(f"{name}: expected it once, got it twice")
+        try:
+            settings[name] = json.loads(value)
+        except (ValueError, RecursionError):
+            settings[name] = value
+    return settings
+
+
+def _find_setting(config: Config, name: str) -> tuple[str, str]:
+    """Part, or "", and key of a setting."""
+    part, _, key = name.rpartition(".")
+    parts = {f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))}
+    known = [f.name for f in dataclasses.fields(config) if f.name not in parts]
+    known += [f"{p}.{f.name}" for p in sorted(parts) for f in dataclasses.fields(getattr(config, p))]
+    if name in known:
+        return part, key
+    close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part or name}.")]
+    raise ValueError(f"{name}: expected a setting, such as {', '.join(close or known[:4])}")
+
+
+def _typed(name: str, value: Any, annotation: Any) -> Any:
+    """Return a value as its annotation has it: int where float is meant and list for tuple will do."""
+    options = [annotation] if annotation in (int, float, bool, str) else _alternatives(annotation)
+    for option in options:
+        if option is float and type(value) in (int, float) and abs(value) <= LARGEST:
+            return float(value)
+        if option is int and type(value) is int and abs(value) <= LARGEST:
+            return value
+        if option in (bool, str, type(None)) and type(value) is option:
+            return value
+        if get_origin(option) is tuple and isinstance(value, (list, tuple)) and len(value) == len(get_args(option)):
+            return tuple(_typed(name, x, kind) for x, kind in zip(value, get_args(option), strict=True))
+    expected = " or ".join(_described(option) for option in options)
+    raise ValueError(f"{name}: expected {expected}, got {json.dumps(value, default=repr)[:60]}")
+
+
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    """Members of a union; anything else alone."""
+    return (annotation,) if get_origin(annotation) is tuple else get_args(annotation)
+
+
+def _described(kind: Any) -> str:
+    if get_origin(kind) is tuple:
+        return f"a list of {len(get_args(kind))} numbers"
+    names = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+    return names[kind]
 
 
 PRESETS: dict[str, Config] = {

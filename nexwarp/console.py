@@ -18,6 +18,7 @@ from rich.progress import (
 from rich.table import Table
 
 from nexwarp import trainer
+from nexwarp.logs import peak_memory
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
@@ -72,14 +73,8 @@ class TrainingDisplay:
 
 def memory(device: torch.device) -> str:
     """Peak memory so far: of the GPU in use, else of this process."""
-    if device.type == "cuda":
-        return f"{torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB GPU"
-    try:
-        import resource
-
-        return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GiB"
-    except ImportError:  # not on Windows
-        return ""
+    used = peak_memory(device)
+    return "" if used is None else f"{used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
 
 
 @contextmanager

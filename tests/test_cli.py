@@ -32,7 +32,15 @@ SMALL = Config(
     densify=DensifyConfig(every=3),  # so that 20 iterations have rounds
 )
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
-RUN_FILES = {"config.json", "model.safetensors", "cameras.json", "metrics.json", "renders", "checkpoint"}
+RUN_FILES = {
+    "config.json",
+    "model.safetensors",
+    "cameras.json",
+    "metrics.json",
+    "metrics.jsonl",
+    "renders",
+    "checkpoint",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -242,7 +250,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, c
         interrupt_after(patch, owner, method, calls)
         assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 130
     assert capsys.readouterr().err == "nexwarp: interrupted; continue with --resume\n"
-    assert {f.name for f in run.iterdir()} == {"config.json", "checkpoint"}
+    assert {f.name for f in run.iterdir()} == {"config.json", "metrics.jsonl", "checkpoint"}
     assert read(run / "checkpoint", "state.json")["iteration"] == calls
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0

@@ -17,6 +17,7 @@ LAYERS = [
     {"config"},
     {"initial"},
     {"trainer"},
+    {"logs"},
     {"runs", "console", "warmup", "sfm"},
     {"outputs"},
     {"cli"},

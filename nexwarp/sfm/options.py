@@ -1,7 +1,9 @@
 """Settings of a reconstruction."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+import tyro
 
 Cameras = Literal["auto", "single", "folder", "image"]
 CameraModel = Literal[
@@ -17,24 +19,20 @@ class SfmOptions:
     """How photos are turned into cameras and points."""
 
     cameras: Cameras = "auto"
-    """Which photos share a camera: those of one size and one EXIF lens and focal length (auto), all of them (single),
-    those of a folder (folder), none (image)."""
+    """Photos that share a camera: of one size, lens and EXIF focal length (auto), all, of a folder, or none (image)."""
     camera_model: CameraModel = "auto"
-    """COLMAP's camera model of the photos as they are; auto is opencv for a camera of 5 photos or more, else
-    simple_radial. The scene gets undistorted photos and PINHOLE cameras in any case."""
+    """COLMAP's lens model of the photos; auto is opencv for a camera of 5 photos or more, else simple_radial."""
     matching: Matching = "auto"
-    """Which photos are compared: every pair (exhaustive), or neighbours by name (sequential), for a walk with the
-    camera or a film; auto is exhaustive up to 150 photos."""
-    overlap: int = 10
-    """In sequential matching, how many of its successors a photo is compared with, next to those 2, 4, 8, ... further
-    on. The last photos are also compared with the first."""
-    max_features: int = 8192
+    """Compare every pair (exhaustive) or neighbours by name (sequential); auto is exhaustive up to 150 photos."""
+    overlap: Annotated[int, tyro.conf.arg(metavar="N")] = 10
+    """In sequential matching, successors that a photo is compared with, next to those 2, 4, 8, ... further on."""
+    max_features: Annotated[int, tyro.conf.arg(metavar="N")] = 8192
     """SIFT features a photo; fewer are quicker, more make more points."""
-    max_image_size: int = 3200
-    """Longer side in pixels at which features are searched; larger photos are reduced for that alone."""
-    threads: int | None = None
-    """CPU threads; all cores by default. With 1 the same photos give the same scene, bit for bit."""
-    seed: int = 0
+    max_image_size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 3200
+    """Longer side at which features are searched; larger photos are reduced for that alone."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
+    """CPU threads; with 1 the same photos give the same scene, bit for bit."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of every random choice."""
 
     def check(self) -> None:
