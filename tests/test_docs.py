@@ -1,0 +1,372 @@
+"""The documents against the code: docs/options.md is made from it, docs/format.md describes what a run really holds.
+
+python -m tests.test_docs --write      # writes docs/options.md
+"""
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import json
+import re
+import struct
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import cli
+from nexwarp.checkpoint import load_cameras, save_model
+from nexwarp.config import PRESETS, Config, preset, setting, with_settings
+from nexwarp.data import write_demo
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+# The publication's symbol of a setting, and the section that gives its value; "code": only the authors' code does.
+SYMBOLS: dict[str, tuple[str, str]] = {
+    "preset": ("", ""),
+    "iterations": ("", "Optimization"),
+    "max_surfels": ("P", "Adaptive Density Control"),
+    "max_hits": ("K", "Rendering"),
+    "sh_degree": ("S = (d + 1)^2", "Results"),
+    "sh_every": ("", "code"),
+    "coarse": ("", ""),
+    "background": ("", "code"),
+    "mask_mode": ("", ""),
+    "border": ("", ""),
+    "border_every": ("", ""),
+    "low_pass": ("", ""),
+    "clamp_texture": ("", "code"),
+    "clamp_image": ("", "code"),
+    "filter_points": ("", ""),
+    "orient_points": ("", ""),
+    "seed": ("", "code"),
+    "losses.dssim": ("λ_D-SSIM", "Losses"),
+    "losses.alpha": ("λ_alpha", "Losses"),
+    "losses.texture": ("λ_texture", "Losses"),
+    "losses.opacity": ("λ_opacity", "Losses"),
+    "losses.grid": ("λ_grid", "Losses"),
+    "losses.empty": ("", ""),
+    "losses.depth": ("", ""),
+    "losses.border": ("", ""),
+    "rates.means": ("", "code"),
+    "rates.quats": ("", "code"),
+    "rates.scales": ("", "code"),
+    "rates.opacities": ("", "code"),
+    "rates.gammas": ("", "code"),
+    "rates.sh0": ("", "code"),
+    "rates.shN": ("", "code"),
+    "rates.grid": ("", "code"),
+    "rates.mlp": ("", "code"),
+    "texture.levels": ("L", "Results"),
+    "texture.table_size": ("T", "Results"),
+    "texture.features": ("F", "Results"),
+    "texture.min_resolution": ("s_0", "code"),
+    "texture.max_resolution": ("s_(L-1)", "code"),
+    "texture.width": ("", "Results"),
+    "texture.hidden_layers": ("", "Results"),
+    "texture.sh_degree": ("S = (d + 1)^2", "Results"),
+    "texture.residual": ("", ""),
+    "texture.down_weighting": ("Δ", "Representation"),
+    "densify.start": ("", "Adaptive Density Control"),
+    "densify.stop": ("", "Adaptive Density Control"),
+    "densify.every": ("", "Adaptive Density Control"),
+    "densify.fraction": ("", "Adaptive Density Control"),
+    "densify.prune_opacity": ("", "Adaptive Density Control"),
+    "densify.prune_at_cap": ("", "code"),
+}
+
+INTRODUCTION = """\
+# Options
+
+Made from the code by `python -m tests.test_docs --write`; a test fails when the two disagree.
+
+Every command has `--help`. Bad input gives one line on stderr and exit code 2; Ctrl-C exits with 130.
+"""
+
+SETTINGS = """\
+## Settings
+
+What a training depends on beside its scene: `nexwarp.config.Config`. `--preset` picks the values to start from, the
+flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
+
+    nexwarp train SCENE --preset paper --set texture.max_resolution=1024
+    nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
+
+VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY, a value of another type or
+out of range is refused before anything is written. The settings of a run are in its `config.json`; with `--resume`
+they come from there, and what is given must agree.
+
+`demo` has settings of its own, for a short training on a CPU, with either preset: DEMO.
+
+Symbol and section are the publication's; "code" is what only the authors' code has. Where there is neither, the
+publication has no such thing, and `paper` turns it off or it is of no effect there. Values that differ are bold.
+"""
+
+
+# docs/options.md
+
+
+def field_docs(owner: type) -> dict[str, str]:
+    """Docstrings of a dataclass's fields, on one line each."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
+    docs = {}
+    for line, following in itertools.pairwise(definition.body):
+        if isinstance(line, ast.AnnAssign) and isinstance(following, ast.Expr):
+            docs[line.target.id] = " ".join(following.value.value.split())
+    return docs
+
+
+def options(command: type) -> Iterator[tuple[str, str, str]]:
+    """What a command takes: how it is written, its default, what it means."""
+    docs, hints = field_docs(command), get_type_hints(command, include_extras=True)
+    for f in dataclasses.fields(command):
+        extras = getattr(hints[f.name], "__metadata__", ())
+        parts = [p for p in (f.type, getattr(hints[f.name], "__origin__", None)) if dataclasses.is_dataclass(p)]
+        if parts:
+            yield from options(parts[0])
+            continue
+        (shown,) = [e for e in extras if hasattr(e, "metavar")] or [None]
+        name = f"--{((shown and shown.name) or f.name).replace('_', '-')}"
+        choices = getattr(hints[f.name], "__args__", ()) if shown is None else ()
+        metavar = shown.metavar if shown else "{" + ",".join(choices) + "}" if choices else ""
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            yield metavar, "required", docs[f.name]
+            continue
+        hint = shown.help_behavior_hint if shown else None
+        default = hint.removeprefix("(default: ").strip("()") if hint else "off" if f.default is False else f.default
+        yield f"{name} {metavar}".strip(), str(default), docs[f.name]
+
+
+def setting_names(config: Config) -> Iterator[tuple[str, str]]:
+    """Names of all settings, and what they mean."""
+    parts = []
+    for name, text in field_docs(type(config)).items():
+        if dataclasses.is_dataclass(getattr(config, name)):
+            parts.append(name)
+        else:
+            yield name, text
+    for part in parts:
+        for name, text in field_docs(type(getattr(config, part))).items():
+            yield f"{part}.{name}", text
+
+
+def cell(text: Any) -> str:
+    return str(text).replace("|", "\\|")
+
+
+def options_page() -> str:
+    """The text of docs/options.md."""
+    page = [INTRODUCTION]
+    for name, command in cli.COMMANDS.items():
+        rows = list(options(command))
+        needed = " ".join(option for option, default, _ in rows if default == "required")
+        page.append(f"## nexwarp {name} {needed}".rstrip() + f"\n\n{inspect.getdoc(command)}\n")
+        page.append("| option | default | what |\n|---|---|---|")
+        page += [f"| `{cell(option)}` | {cell(default)} | {cell(text)} |" for option, default, text in rows]
+        page.append("")
+    demo = ", ".join(f"`{name}` {json.dumps(value)}" for name, value in cli.DEMO_SETTINGS.items())
+    page.append(SETTINGS.replace("DEMO", demo))
+    page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
+    ours, paper = preset("default"), preset("paper")
+    for name, text in setting_names(ours):
+        default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
+        symbol, section = SYMBOLS[name]
+        theirs = theirs if theirs == default else f"**{theirs}**"
+        page.append(f"| `{name}` | {default} | {theirs} | {cell(text)} | {symbol} | {section} |")
+    return "\n".join(page) + "\n"
+
+
+def test_the_options_page_is_that_of_the_code():
+    page = (DOCS / "options.md").read_text(encoding="utf-8")
+    assert page == options_page(), "docs/options.md is out of date: python -m tests.test_docs --write"
+
+
+def test_every_setting_has_its_symbol():
+    assert [name for name, _ in setting_names(Config())] == list(SYMBOLS)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_the_options_page_says_what_help_says(name, capsys, monkeypatch):
+    """The same options, defaults and words, so that the page's own reading of the code is right."""
+    monkeypatch.setenv("COLUMNS", "600")
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    out = capsys.readouterr().out
+    shown = " ".join(out.replace("│", " ").split())
+    rows = list(options(cli.COMMANDS[name]))
+    found = set(re.findall(r"^[ │]+(--[a-z][a-z-]*)", out, re.M))
+    assert found == {option.split()[0] for option, _, _ in rows if option.startswith("--")}
+    for option, default, text in rows:
+        ending = {"required": " (required)", "off": " (default: False)", "repeatable": " (repeatable)"}
+        assert f"{option} {text}{ending.get(default, f' (default: {default})')}" in shown, option
+    assert "{None}" not in out
+
+
+def test_settings_on_the_page_can_be_set():
+    """What the tables print is what --set takes: each preset is the other one with the page's values."""
+    ours, paper = PRESETS["default"], PRESETS["paper"]
+    values = {name: json.loads(json.dumps(setting(paper, name))) for name in SYMBOLS}
+    assert with_settings(ours, values) == paper
+
+
+# docs/format.md
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A small run."""
+    folder = tmp_path_factory.mktemp("docs")
+    scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
+    flags = [x for change in changes for x in ("--set", change)]
+    flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
+    assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
+    torch.set_num_threads(threads)
+    return folder / "run"
+
+
+def section(title: str) -> str:
+    """Text of docs/format.md below a heading, up to the next of its kind."""
+    page = (DOCS / "format.md").read_text(encoding="utf-8")
+    return page.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
+
+
+def named(text: str) -> list[str]:
+    """First cells of a text's tables."""
+    return re.findall(r"^\| `([^`]+)` \|", text, re.M)
+
+
+def header(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    data = (run / "model.safetensors").read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    tensors = json.loads(data[8 : 8 + size])
+    metadata = tensors.pop("__metadata__")
+    assert set(metadata) == {"nexwarp"}
+    return tensors, json.loads(metadata["nexwarp"])
+
+
+def flat(data: dict[str, Any], *parts: str) -> set[str]:
+    """Keys, those of the named parts with a dot."""
+    inner = {f"{part}.{key}" for part in parts for key in data[part]}
+    return {key for key in data if key not in parts} | inner
+
+
+def test_files(run):
+    listed = named((DOCS / "format.md").read_text(encoding="utf-8").split("\n## ", 1)[0])
+    optional = {"tensorboard/", "camera_path_N.json", "export/"}
+    assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == set(listed) - optional
+    assert {f.name for f in (run / "checkpoint").iterdir()} == set(named(section("checkpoint/")))
+    assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}
+
+
+def test_tensors(run):
+    """Names, types and shapes of the table are those of the file."""
+    tensors, meta = header(run)
+    rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
+    shape = meta["texture"]
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "3": 3, "1": 1, "2": 2, "4": 4}
+    sizes |= {"L": shape["levels"], "T": shape["table_size"], "F": shape["features"]}
+    expected = {}
+    for name, dtype, dimensions in rows:
+        if ".I." in name:
+            widths = [sizes["L"] * sizes["F"], *[shape["width"]] * shape["hidden_layers"], 48]
+            for i, (inner, outer) in enumerate(itertools.pairwise(widths)):
+                expected[name.replace("I", str(2 * i))] = (dtype, [outer, inner])
+        else:
+            expected[name] = (dtype, [sizes[d.strip()] for d in dimensions.split(",")])
+    assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
+
+
+def test_metadata(run):
+    _, meta = header(run)
+    text = section("model.safetensors").split("a JSON object:", 1)[1]
+    assert set(named(text)) == flat(meta, "texture")
+
+
+def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
+    """The document's program, executed: pixels of a test view, to rounding."""
+    (program,) = re.findall(r"```python\n(.*?)```", section("model.safetensors"), re.S)
+    reader: dict[str, Any] = {}
+    exec(program, reader)
+    cameras = json.loads((run / "cameras.json").read_text())["test"]
+    name = next(iter(cameras))
+    camera = load_cameras(run / "cameras.json")["test"][name]
+    model = nw.load(run)
+    with torch.no_grad():  # more to be seen than after so few steps
+        model.texture.grid.normal_(0, 2)
+        model.surfels.log_scales += 0.7
+        model.surfels.raw_gammas.uniform_(-3, 1)
+        model.surfels.logit_opacities.uniform_(-2, 5)
+        model.surfels.shN.normal_(0, 0.2)
+    pixels = [(3, 5), (24, 18), (40, 30), (47, 0), (11, 27), (30, 9)]
+    # As trained; with the texture in place of the plain colours; with a K of 1; and where the texture is not used.
+    for changes in (
+        {},
+        {"residual": False},
+        {"residual": False, "clamp_texture": True},
+        {"max_hits": 1},
+        {"max_hits": 0},
+    ):
+        changes = {"residual": True, "clamp_texture": False, "max_hits": 2} | changes
+        model.texture.residual = model.texture.config["residual"] = changes.pop("residual")
+        model.meta |= changes
+        file = save_model(tmp_path, model)
+        stored = nw.load(file)
+        tensors, meta = reader["read"](file)
+        drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        with torch.no_grad():
+            image = nw.render(stored.surfels, stored.texture, camera, **stored.render_options).image
+            plain = nw.render(stored.surfels, None, camera, **stored.render_options).image
+        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in (image, plain))
+        np.testing.assert_allclose(drawn, expected, atol=2e-4)
+        assert (abs(expected - untextured).max() > 0.05) == (changes["max_hits"] > 0)
+
+
+def test_json_files(run):
+    config = json.loads((run / "config.json").read_text())
+    assert flat(config, "scene") == set(named(section("config.json")))
+    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(SYMBOLS)
+    cameras = json.loads((run / "cameras.json").read_text())
+    assert set(cameras) == {"train", "test"}
+    for camera in [*cameras["train"].values(), *cameras["test"].values()]:
+        assert set(camera) == set(named(section("cameras.json")))
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert list(metrics) and set(metrics) == set(named(section("metrics.json")))
+    for line in (run / "metrics.jsonl").read_text().splitlines():
+        assert set(json.loads(line)) == set(named(section("metrics.jsonl")))
+
+
+def test_checkpoint(run):
+    data = (run / "checkpoint" / "tensors.safetensors").read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    groups = {name.split(".")[0] for name in json.loads(data[8 : 8 + size]) if name != "__metadata__"}
+    assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
+
+
+def test_links():
+    """Every link from one document to another leads somewhere."""
+    for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def main(arguments: list[str]) -> int:
+    """Write docs/options.md."""
+    if arguments != ["--write"]:
+        print("usage: python -m tests.test_docs --write", file=sys.stderr)
+        return 2
+    (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
