@@ -1,4 +1,4 @@
-"""The documents against the code: docs/options.md is made from it, docs/format.md describes what a run really holds.
+"""The documents against the code: options.md is made from it, format.md tells what a run holds, commands can be typed.
 
 python -m tests.test_docs --write      # writes docs/options.md
 """
@@ -9,6 +9,8 @@ import inspect
 import itertools
 import json
 import re
+import shlex
+import shutil
 import struct
 import sys
 import textwrap
@@ -352,9 +354,66 @@ def test_checkpoint(run):
     assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
 
 
+# docs/paper.md, docs/migrating.md, and what is said to be typed anywhere
+
+PAGES = [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Arguments of every nexwarp command in a page's indented blocks."""
+    pattern = rf"\bnexwarp ((?:{'|'.join(cli.COMMANDS)})\b[^#;\n]*)"
+    blocks = re.findall(r"^    .*$", page.read_text(encoding="utf-8"), re.M)
+    return [shlex.split(command) for line in blocks for command in re.findall(pattern, line)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_can_be_typed(page, monkeypatch):
+    """Every command is understood, and every setting of a training exists and takes its value."""
+    understood = []
+    for command in cli.COMMANDS.values():
+        monkeypatch.setattr(command, "__call__", lambda self, console: understood.append(self))
+    for arguments in commands(page):
+        assert cli.main(arguments) == 0, arguments
+        command = understood.pop()
+        if isinstance(command, cli.Train):
+            config = dataclasses.replace(command, resume=False)._config(Path("nowhere"))
+            assert config.preset == command.preset
+
+
+def test_the_paper_page_has_commands_for_all_scenes():
+    page = (DOCS / "paper.md").read_text(encoding="utf-8")
+    scenes = " ".join(re.findall(r"for s in ([^;]+);", page)).split() + re.findall(r"data/custom/(\w+) ", page)
+    assert len(scenes) == len(set(scenes)) == 15
+    typed = commands(DOCS / "paper.md")
+    assert len(typed) == 12 and all("--preset" in arguments for arguments in typed)
+
+
+def test_the_paper_page_lists_all_that_differs():
+    page = (DOCS / "paper.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `([a-z_.]+)` \|", page, re.M)
+    ours, paper = preset("default"), preset("paper")
+    differ = {name for name in SYMBOLS if setting(ours, name) != setting(paper, name)} - {"preset"}
+    assert set(listed) == differ and len(listed) == len(differ)
+
+
+def test_examples(run, tmp_path, monkeypatch, capsys):
+    """The Python in the pages runs as it stands."""
+    (tmp_path / "runs" / "one").mkdir(parents=True)
+    shutil.copy(run / "metrics.json", tmp_path / "runs" / "one")
+    monkeypatch.chdir(tmp_path)
+    (means,) = re.findall(r"```python\n(.*?)```", (DOCS / "paper.md").read_text(encoding="utf-8"), re.S)
+    exec(means, {})
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
+    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "migrating.md").read_text(encoding="utf-8"), re.S)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
+
+
 def test_links():
     """Every link from one document to another leads somewhere."""
-    for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]:
+    for page in [*PAGES, DOCS.parent / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
