@@ -1,7 +1,7 @@
 """Run folders: what a training leaves behind, and how it is found again.
 
-A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `renders/` and
-`checkpoint/`.
+A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `metrics.jsonl`,
+`renders/` and `checkpoint/`: docs/format.md.
 """
 
 import ctypes
