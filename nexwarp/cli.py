@@ -493,7 +493,7 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
     """Write the model, then evaluate what was written."""
-    file = save_model(run, trainer.model())
+    file = save_model(run, trainer.finish())
     sets = {"train": scene.train, "test": scene.test}
     save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
     model = load(run).to(device)

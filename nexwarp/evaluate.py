@@ -1,18 +1,40 @@
 """Evaluation on held-out views, by the field's conventions (see `nexwarp.metrics`)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.data import View
 from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
+
+NEVER = 1e30  # a footprint that no texture survives
+ALPHA_MIN = 1.0 / 255.0  # weights below this are not seen in 8 bits
+
+
+@torch.no_grad()
+def seen_footprints(surfels: Surfels, cameras: Iterable[Camera], *, options: dict[str, Any]) -> torch.Tensor:
+    """Return each surfel's `footprints` (N,): depth / focal of the closest textured hit of some views.
+
+    Args:
+        surfels: the surfels.
+        cameras: of the training views.
+        options: keyword arguments of `nexwarp.render`.
+    """
+    found = surfels.means.new_full((len(surfels),), NEVER)
+    for camera in cameras:
+        out = render(surfels, None, camera.to(surfels.device), **options)
+        seen = out.weights >= ALPHA_MIN
+        pixels = torch.where(seen, out.depths / camera.focal, NEVER)
+        found.scatter_reduce_(0, out.ids.clamp_min(0).long().flatten(), pixels.flatten(), "amin")
+    return found
 
 
 @torch.no_grad()

@@ -107,9 +107,8 @@ def render(
     else:
         weights = hits.weights
         positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
-        texels = texture.colors(
-            positions, hits.depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture
-        )
+        depths = _seen_depths(hits, surfels.footprints, camera.focal)
+        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
     image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
@@ -117,6 +116,14 @@ def render(
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.
     object.__setattr__(rendering, "_passes", passes)
     return rendering
+
+
+def _seen_depths(hits: ops.Hits, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
+    """Depths (H, W, K) for the down-weighting: those of the hits, none closer than training saw the surfel."""
+    if footprints is None or len(footprints) == 0:
+        return hits.depths
+    closest = focal * footprints[hits.ids.clamp_min(0).long()]
+    return torch.where(hits.ids >= 0, torch.maximum(hits.depths, closest), hits.depths)
 
 
 def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:
