@@ -107,7 +107,7 @@ def render(
     else:
         weights = hits.weights
         positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
-        depths = _seen_depths(hits, surfels.footprints, camera.focal)
+        depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
     image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
@@ -118,12 +118,19 @@ def render(
     return rendering
 
 
-def _seen_depths(hits: ops.Hits, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
-    """Depths (H, W, K) for the down-weighting: those of the hits, none closer than training saw the surfel."""
+def seen_depths(ids: torch.Tensor, depths: torch.Tensor, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
+    """Return depths for the texture's down-weighting: those of the hits, none closer than training saw the surfel.
+
+    Args:
+        ids: (H, W, K) surfels, -1 in empty slots.
+        depths: (H, W, K) their z-depths.
+        footprints: (N,), of `Surfels`.
+        focal: of the camera, in pixels.
+    """
     if footprints is None or len(footprints) == 0:
-        return hits.depths
-    closest = focal * footprints[hits.ids.clamp_min(0).long()]
-    return torch.where(hits.ids >= 0, torch.maximum(hits.depths, closest), hits.depths)
+        return depths
+    closest = focal * footprints[ids.clamp_min(0).long()]
+    return torch.where(ids >= 0, torch.maximum(depths, closest), depths)
 
 
 def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:
