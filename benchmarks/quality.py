@@ -95,6 +95,9 @@ HITS = tuple(Row(f"K = {k}", settings={"max_hits": k}) for k in (0, 1, 3, 4))
 # Each undoes one change of the default preset against the paper.
 CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
+    Row("texture from closer than seen", settings={"footprints": False}),
+    Row("no look beyond the frame", settings={"border": 0.0}),
+    Row("no depths of points", settings={"losses.depth": 0.0}),
     Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
     Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),
     Row("all points", settings={"filter_points": False}),
@@ -231,7 +234,7 @@ def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, model
     config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
     trainer = Trainer(scene, config, device)
     trainer.run()
-    model = trainer.model()
+    model = trainer.finish()
     folder = ROOT / ".quality" if models is None else models
     folder = folder / f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}".replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)
@@ -245,6 +248,7 @@ def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, model
         "megabytes": megabytes,
         "seconds": trainer.seconds,
         "train_psnr": _train_psnr(trainer),
+        "zoom_psnr": _zoom_psnr(trainer),
     }
     with torch.no_grad():
         pictured = [(view, to_uint8(_image(trainer, view.camera, device)).cpu()) for view in scene.test]
@@ -262,6 +266,25 @@ def _train_psnr(trainer: Trainer) -> float:
     return statistics.fmean(
         psnr(to_uint8(_image(trainer, view.camera, trainer.device)).cpu(), to_uint8(view.image)) for view in views
     )
+
+
+@torch.no_grad()
+def _zoom_psnr(trainer: Trainer) -> float:
+    """Of the middles of the test views, looked at with 4 times the focal length, reduced again, against themselves."""
+    figures = []
+    for view in trainer.scene.test:
+        c, factor = view.camera, 4
+        width, height = c.width // factor, c.height // factor
+        left, top = (c.width - width) // 2, (c.height - height) // 2
+        K = c.K.clone()
+        K[:2] *= factor
+        close = Camera(c.viewmat, K, c.width * factor, c.height * factor, c.near)
+        close = close.crop(left * factor, top * factor, width * factor, height * factor)
+        image = _image(trainer, close, trainer.device).clamp(0, 1).permute(2, 0, 1)
+        reduced = torch.nn.functional.avg_pool2d(image, factor).permute(1, 2, 0)
+        plain = _image(trainer, c, trainer.device)[top : top + height, left : left + width]
+        figures.append(psnr(to_uint8(reduced).cpu(), to_uint8(plain).cpu()))
+    return statistics.fmean(figures)
 
 
 def _train_gsplat(job: Job, scene: Scene, device: torch.device) -> tuple[Any, dict]:
@@ -346,7 +369,8 @@ def train(given: argparse.Namespace) -> int:
             with given.out.open("a") as file:
                 file.write(json.dumps(result) + "\n")
             shown = ", ".join(f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None)
-            facts = f"train {result.get('train_psnr', float('nan')):.2f} dB, {result['seconds']:.0f} s"
+            facts = ", ".join(f"{k[:-5]} {result[k]:.2f} dB" for k in ("train_psnr", "zoom_psnr") if k in result)
+            facts += f", {result['seconds']:.0f} s"
             print(f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {shown}, {facts}", flush=True)
     return 1 if failed else 0
 

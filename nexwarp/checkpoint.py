@@ -13,7 +13,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.files import written_aside
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.ops.checks import check_finite, check_range
+from nexwarp.ops.checks import check_finite, check_range, check_tensors
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
@@ -57,6 +57,8 @@ def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     for name, x in model.texture.state_dict().items():
         tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
+    if model.surfels.footprints is not None:
+        tensors["footprints"] = model.surfels.footprints
     tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
     meta = {**model.meta, "format_version": FORMAT_VERSION, "frame": FRAME, "texture": model.texture.config}
     path = Path(folder) / MODEL_FILE
@@ -101,6 +103,9 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
+        if "footprints" in tensors:
+            check_tensors({"footprints": (tensors["footprints"], (len(surfels),))}, dtype=torch.float32)
+            surfels.footprints = tensors["footprints"]
         _check_options(meta)
         for name, x in tensors.items():
             check_finite(name, x)

@@ -4,7 +4,7 @@ import dataclasses
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -95,6 +95,8 @@ class Train:
     """Folder of the photos below SCENE, such as images_4."""
     masks: Annotated[str, option("{FOLDER,alpha,none}")] = "masks"
     """Folder of the masks below SCENE, if it is there; `alpha` takes the photos' own transparency."""
+    mask_mode: Annotated[str | None, option("{ignore,background}", "ignore")] = None
+    """What masks leave out: learn nothing there, or learn that nothing is there."""
     background: Annotated[
         str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else photos count as opaque")
     ] = None
@@ -219,7 +221,8 @@ class Train:
     def _config(self, run: Path) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given = {name: value for name, value in (given | {"seed": self.seed}).items() if value is not None}
+        given |= {"seed": self.seed, "mask_mode": self.mask_mode}
+        given = {name: value for name, value in given.items() if value is not None}
         _check_max_hits(self.max_hits)
         settings = self._settings(given)
         if self.resume:
@@ -260,20 +263,22 @@ class Eval:
     """Run folder."""
     scene: Annotated[str | None, option("SCENE", "where it was trained from")] = None
     """Folder of the scene, if it moved."""
+    metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
+    """Figures to give; flip and lpips need the extras `flip` and `lpips`."""
     device: Device_ = None
     """Where to compute."""
 
     def __call__(self, console: Console) -> None:
         """Evaluate."""
         device = pick_device(self.device)
-        source, _, _ = read_run(self.run)
+        source, config, _ = read_run(self.run)
         model = load(self.run).to(device)
         if self.scene is not None:
             source = dataclasses.replace(source, path=self.scene)
         with display.loading(console) as progress:
             scene = source.load(progress)
-        metrics = _evaluate(model, scene, self.run, console)
-        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        options = {"mask_mode": config.mask_mode, "metrics": self.metrics}
+        rows = _figures(_evaluate(model, scene, self.run, console, options), self.metrics)
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
 
 
@@ -550,7 +555,7 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
     """Write the model, then evaluate what was written."""
-    file = save_model(run, trainer.model())
+    file = save_model(run, trainer.finish())
     sets = {"train": scene.train, "test": scene.test}
     save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
     model = load(run).to(device)
@@ -566,8 +571,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
     }
     rows = {}
     if scene.test:
-        metrics = _evaluate(model, scene, run, console, facts)
-        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        rows = _figures(_evaluate(model, scene, run, console, {"mask_mode": trainer.config.mask_mode}, facts))
     rows |= {
         "surfels": f"{facts['surfels']:,}",
         "model file": f"{facts['megabytes']:.1f} MB",
@@ -580,8 +584,21 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
         console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
 
 
+def _figures(results: dict[str, Any], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
+    """Rows of a table: the metrics of the test views."""
+    shown = {name: "not available" if results[name] is None else f"{results[name]:.4f}" for name in metrics}
+    if "psnr" in shown:
+        shown["psnr"] = f"{results['psnr']:.2f} dB"
+    return {f"test {name.upper()}": value for name, value in shown.items()}
+
+
 def _evaluate(
-    model: Model, scene: Scene, run: Path, console: Console, facts: dict[str, Any] | None = None
+    model: Model,
+    scene: Scene,
+    run: Path,
+    console: Console,
+    options: dict[str, Any],
+    facts: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Evaluate a model on its test views and write metrics.json, keeping the facts that an older one holds."""
     if not scene.test:
@@ -594,6 +611,7 @@ def _evaluate(
             options=model.render_options,
             renders=run / "renders",
             progress=done,
+            **options,
         )
     metrics = {**(read_metrics(run) if facts is None else facts), **results}
     write_json(run / METRICS_FILE, metrics)

@@ -96,6 +96,8 @@ class Config:
     """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
     background: tuple[float, float, float] | None = None
     """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
+    footprints: bool = True
+    """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
     mask_mode: str = "ignore"
     """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08
@@ -270,6 +272,7 @@ PRESETS: dict[str, Config] = {
         preset="paper",
         background=(0.0, 0.0, 0.0),
         border=0.0,
+        footprints=False,
         clamp_image=True,
         filter_points=False,
         orient_points=False,

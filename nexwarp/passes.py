@@ -12,7 +12,7 @@ from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.pictures import load_exr, save_exr
-from nexwarp.render import render
+from nexwarp.render import render, seen_depths
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
@@ -175,8 +175,9 @@ def _slot_colors(
         return colors
     if texture is not None:
         positions, rays = _unproject(depths, camera)
+        depths = seen_depths(ids, depths, surfels.footprints, camera.focal)
         colors = texture.colors(positions, depths, rays, camera.focal, sh_degree=sh_degree, clamp=clamp)
-    if texture is None or getattr(texture, "residual", False):
+    if texture is None or texture.residual:
         plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
         colors = colors + plain[ids.clamp_min(0).long()]
     return colors.masked_fill(empty, 0.0)

@@ -107,9 +107,8 @@ def render(
     else:
         weights = hits.weights
         positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
-        texels = texture.colors(
-            positions, hits.depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture
-        )
+        depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
+        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
     image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
@@ -117,6 +116,21 @@ def render(
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.
     object.__setattr__(rendering, "_passes", passes)
     return rendering
+
+
+def seen_depths(ids: torch.Tensor, depths: torch.Tensor, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
+    """Return depths for the texture's down-weighting: those of the hits, none closer than training saw the surfel.
+
+    Args:
+        ids: (H, W, K) surfels, -1 in empty slots.
+        depths: (H, W, K) their z-depths.
+        footprints: (N,), of `Surfels`.
+        focal: of the camera, in pixels.
+    """
+    if footprints is None or len(footprints) == 0:
+        return depths
+    closest = focal * footprints[ids.clamp_min(0).long()]
+    return torch.where(ids >= 0, torch.maximum(depths, closest), depths)
 
 
 def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:

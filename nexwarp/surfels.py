@@ -38,7 +38,13 @@ class Surfels(nn.Module):
 
     Activated properties, which carry the graph to them: `means`, `quats` (N, 4) wxyz unit, surfel to world, `normals`
     (N, 3) their z axes, `scales` (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
+
+    Buffer: `footprints` (N,) world units, depth / focal of the closest look that a training view had at each surfel's
+    texture, huge where none had any; None until that is known. A rendering from closer gets the detail of that look:
+    else texture levels which no photo resolved come out stronger than training ever saw them.
     """
+
+    footprints: torch.Tensor | None
 
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
         """Take the raw values by parameter name, as `state_dict` gives them."""
@@ -58,6 +64,7 @@ class Surfels(nn.Module):
         check_coefficients("shN", raw["shN"].shape[1] + 1)
         for name in shapes:
             self.register_parameter(name, nn.Parameter(raw[name]))
+        self.register_buffer("footprints", None, persistent=False)
 
     @classmethod
     def from_activated(

@@ -19,6 +19,7 @@ from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
 from nexwarp.config import Config
 from nexwarp.data import Scene, View
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
+from nexwarp.evaluate import seen_footprints
 from nexwarp.initial import initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses
 from nexwarp.render import Rendering, render
@@ -92,6 +93,7 @@ class Trainer:
     def step(self) -> Progress:
         """Do one iteration: a view, its rendering, the losses, Adam, and density control when it is due."""
         self.iteration += 1
+        self.surfels.footprints = None  # of surfels that are about to change
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
         view = self._view(self._next_view(), 2 if coarse else 1)
@@ -172,6 +174,13 @@ class Trainer:
         if index not in self.points:
             self.points[index] = points.to(self.device)
         return self.points[index]
+
+    def finish(self) -> Model:
+        """Return the model as it is now, with the footprints that the training views have of its surfels."""
+        if self.config.footprints and self.config.max_hits:
+            cameras, options = self.views.cameras, self.render_options()
+            self.surfels.footprints = seen_footprints(self.surfels, cameras, options=options)
+        return self.model()
 
     def model(self) -> Model:
         """Return the model as it is now."""

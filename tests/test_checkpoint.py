@@ -99,6 +99,18 @@ def test_surfels_come_back_exactly_and_the_texture_in_half_precision(tmp_path):
     assert loaded.texture.config == model.texture.config
 
 
+def test_footprints_come_back_exactly(tmp_path):
+    model = make_model()
+    assert nw.load(save_model(tmp_path, model)).surfels.footprints is None
+    model.surfels.footprints = torch.rand(len(model.surfels))
+    loaded = nw.load(save_model(tmp_path, model))
+    assert torch.equal(loaded.surfels.footprints, model.surfels.footprints)
+    assert loaded.surfels.to(torch.float64).footprints.dtype == torch.float64
+    model.surfels.footprints = torch.rand(len(model.surfels) + 1)
+    with pytest.raises(ValueError, match=r"the tensors do not make a model \(footprints: expected shape"):
+        nw.load(save_model(tmp_path, model))
+
+
 def test_saving_what_was_loaded_changes_nothing(tmp_path):
     file = save_model(tmp_path, make_model())
     written = file.read_bytes()

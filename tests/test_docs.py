@@ -40,6 +40,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "sh_every": ("", "code"),
     "coarse": ("", ""),
     "background": ("", "code"),
+    "footprints": ("", ""),
     "mask_mode": ("", ""),
     "border": ("", ""),
     "border_every": ("", ""),
@@ -306,6 +307,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     with torch.no_grad():  # more to be seen than after so few steps
         model.texture.grid.normal_(0, 2)
         model.surfels.log_scales += 0.7
+        model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)

@@ -19,13 +19,16 @@ PASSES = [f.name for f in fields(Buffers) if f.name not in ("camera", "backgroun
 
 def make(count: int = 24, max_hits: int = 2, textured: bool = True, device: torch.device | str = "cpu") -> Buffers:
     scene = random_scene(count, device=device)
-    texture = make_texture(device=device) if textured else None
-    return render_buffers(make_surfels(scene), texture, make_camera(scene), max_hits, BACKGROUND)
+    texture = make_texture(device=device, residual=textured == "residual") if textured else None
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    if textured == "residual":
+        surfels.footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
+    return render_buffers(surfels, texture, camera, max_hits, BACKGROUND)
 
 
-@pytest.mark.parametrize(("max_hits", "textured"), [(2, True), (2, False), (8, True), (0, False)])
+@pytest.mark.parametrize(("max_hits", "textured"), [(2, True), (2, False), (8, True), (0, False), (2, "residual")])
 def test_buffers_add_up_from_the_file_alone(
-    tmp_path: Path, device: torch.device, max_hits: int, textured: bool
+    tmp_path: Path, device: torch.device, max_hits: int, textured: bool | str
 ) -> None:
     save_buffers(tmp_path / "a.exr", make(max_hits=max_hits, textured=textured, device=device))
     b = load_buffers(tmp_path / "a.exr")

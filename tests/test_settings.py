@@ -1,183 +1,235 @@
-"""Settings by name: what --set takes and refuses, what a run keeps of it, and what --resume makes of it."""
+"""Settings by name, and what training makes of masks, backgrounds and the frame's edge."""
 
 import dataclasses
-import json
-from pathlib import Path
-from typing import Any
+import re
+from collections.abc import Iterator
 
 import pytest
-from PIL import Image
+import torch
 
 import nexwarp as nw
-from benchmarks.inputs import write_blender
-from nexwarp import cli
-from nexwarp.config import PRESETS, Config, LearningRates, parse_settings, preset, setting, with_settings
-from nexwarp.data import write_demo
+from nexwarp.config import Config, TextureConfig, with_settings
+from nexwarp.data import Scene, View
+from nexwarp.data.demo import write_demo
+from nexwarp.evaluate import evaluate
+from nexwarp.trainer import Trainer, mean_colour
+from tests.tolerances import assert_close
 
-SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
-FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=9, points=100)
+TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 
 
 @pytest.fixture(scope="module")
-def run(scene, tmp_path_factory) -> Path:
-    run = tmp_path_factory.mktemp("runs") / "run"
-    extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "border=0"]
-    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, *extra]) == 0
-    return run
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("tiny") / "tiny"
+    return nw.load_scene(write_demo(folder, width=48, height=36, views=10, points=200))
 
 
-def refused(capsys: pytest.CaptureFixture, arguments: list[str], *words: str) -> None:
-    """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
-    capsys.readouterr()
-    assert cli.main(arguments) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
-    assert all(word in err for word in words), err
+@pytest.fixture(scope="module", autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """Tensors are tiny here, and torch's threads would wait for each other on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
-# In Python
+def make_trainer(scene: Scene, **settings) -> Trainer:
+    values = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
+    return Trainer(scene, Config(**values), "cpu")
 
 
-def test_every_setting_can_be_set_to_what_it_is():
-    """By its name, through JSON, for both presets: the same config, with the same types."""
-    for config in PRESETS.values():
-        data = config.as_dict()
-        parts = {name: value for name, value in data.items() if isinstance(value, dict)}
-        flat = {name: value for name, value in data.items() if name not in parts}
-        flat |= {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        texts = [f"{name}={json.dumps(value)}" for name, value in flat.items()]
-        again = with_settings(Config(), parse_settings(texts))
-        assert again == config and repr(again) == repr(config)
-        assert all(setting(again, name) == setting(config, name) for name in flat)
+# Settings by name
 
 
-def test_types():
-    """Integers do for numbers and lists for tuples; what is stored has the field's own type."""
-    config = with_settings(Config(), {"texture.max_resolution": 1024, "rates.grid": [1, 0.5], "background": [0, 0, 1]})
-    assert type(config.texture.max_resolution) is float and config.rates.grid == (1.0, 0.5)
-    assert config.background == (0.0, 0.0, 1.0) and type(config.background[0]) is float
-    assert with_settings(config, {"background": None}).background is None
+def test_settings_reach_into_parts() -> None:
+    config = with_settings(Config(), {"max_hits": 3, "texture.residual": False, "rates.mlp": [1e-3, 1e-3]})
+    expected = dataclasses.replace(
+        Config(),
+        max_hits=3,
+        texture=dataclasses.replace(Config().texture, residual=False),
+        rates=dataclasses.replace(Config().rates, mlp=(1e-3, 1e-3)),
+    )
+    assert config == expected
+    assert Config.from_dict(config.as_dict()) == config
 
 
-def test_settings_are_checked_together():
-    """The order in which they are given does not matter, where one value allows another."""
-    for names in (("clamp_texture", "texture.residual"), ("texture.residual", "clamp_texture")):
-        values = {"clamp_texture": True, "texture.residual": False}
-        assert with_settings(Config(), {name: values[name] for name in names}).clamp_texture
+@pytest.mark.parametrize("name", ["texture.residul", "texture.levels.x", "colour", "seed.x", "losses.", ".residual"])
+def test_unknown_settings_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{re.escape(name)}: expected a setting, such as "):
+        with_settings(Config(), {name: 3})
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("settings", "message"),
     [
-        ("max_resolution=1", "max_resolution: expected a setting, such as texture.max_resolution"),
-        ("texture.nope=1", "texture.nope: expected a setting, such as texture."),
-        ("texture=1", "texture: expected a setting"),
-        ("texture.__init__=1", "texture.__init__: expected a setting"),
-        ("scaled=1", "scaled: expected a setting"),
-        ("a.b.c=1", "a.b.c: expected a setting"),
-        ("texture.levels=16.0", "texture.levels: expected an integer, got 16.0"),
-        ("max_hits=true", "max_hits: expected an integer, got true"),
-        ("texture.residual=1", "texture.residual: expected true or false, got 1"),
-        ("texture.residual=False", 'texture.residual: expected true or false, got "False"'),
-        ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
-        ("border=1e999", "border: expected a number, got Infinity"),
-        (f"iterations=1{'0' * 4000}", "iterations: expected an integer, got 1000"),
-        ("mask_mode=3", "mask_mode: expected text, got 3"),
-        ("mask_mode=both", "mask_mode: expected one of ignore, background, got 'both'"),
-        ("rates.means=[1e-3]", "rates.means: expected a list of 2 numbers, got [0.001]"),
-        ("rates.means=0.1", "rates.means: expected a list of 2 numbers, got 0.1"),
-        ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
-        ("rates.quats=-1", "rates.quats: expected rates > 0"),
-        ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
-        ("background=[[0], 0, 0]", "background: expected a number, got [0]"),
-        ("densify.every=0", "densify.every: expected at least 1, got 0"),
-        ("losses.dssim=2", "losses.dssim: expected at least 0 and at most 1, got 2"),
-        ("sh_every=0", "sh_every: expected at least 1, got 0"),
-        ("border", "expected KEY=VALUE, got 'border'"),
-        ("border=", "expected KEY=VALUE, got 'border='"),
-        ("=1", "expected KEY=VALUE, got '=1'"),
+        ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
+        ({"border": 0.7}, "border: expected at least 0 and at most 0.5, got 0.7"),
+        ({"clamp_texture": True}, "clamp_texture: expected False with texture.residual, got True"),
+        ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
     ],
 )
-def test_refused(text, message):
-    with pytest.raises(ValueError) as caught:
-        with_settings(Config(), parse_settings([text]))
-    assert str(caught.value).startswith(message) and len(str(caught.value)) < 200
+def test_values_out_of_range_are_refused(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        with_settings(Config(), settings)
 
 
-def test_a_setting_is_given_once():
-    with pytest.raises(ValueError, match=r"^border: expected it once, got it twice$"):
-        parse_settings(["border=0", "border=0.1"])
+# The camera of a window
 
 
-def test_rates_of_zero_are_allowed():
-    """They keep a parameter as it starts: the paper's ablation without gamma."""
-    assert LearningRates(gammas=0.0, means=(0.0, 0.0)).gammas == 0.0
+def test_a_window_sees_what_the_camera_sees_there(scene: Scene) -> None:
+    camera = scene.train[0].camera
+    window = camera.crop(5, -3, 20, 30)
+    assert (window.width, window.height, window.near) == (20, 30, camera.near)
+    pixels, depths = camera.project(scene.points)
+    shifted, same = window.project(scene.points)
+    assert_close(shifted, pixels - torch.tensor([5.0, -3.0]), kind="value", name="pixels")
+    assert torch.equal(depths, same)
+    again = nw.Camera(window.viewmat, window.K, 20, 30, camera.near)
+    assert (again.cx, again.cy, again.fx) == pytest.approx((window.cx, window.cy, window.fx))
+    assert camera.crop(0, 0, camera.width, camera.height).cx == camera.cx
 
 
-# nexwarp train --set
+# Beyond the frame
 
 
-def test_a_run_keeps_what_was_set(run):
-    stored = json.loads((run / "config.json").read_text())["config"]
-    config = Config.from_dict(stored)
-    changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "border": 0}
-    changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
-    assert config == with_settings(preset("default"), changes)
-    assert nw.load(run).texture.grid.shape == (4, 256, 2)
+def test_beyond_the_frame_the_photos_edge_goes_on(scene: Scene) -> None:
+    trainer = make_trainer(scene, border=0.25)
+    for _ in range(20):
+        view = trainer._view(0, 1)
+        shifted = trainer._beyond_the_frame(view)
+        left = round(view.camera.cx - shifted.camera.cx)
+        top = round(view.camera.cy - shifted.camera.cy)
+        assert abs(left) <= 12 and abs(top) <= 9
+        for row in (0, 17, 35):
+            for column in (0, 20, 47):
+                r, c = row + top, column + left
+                inside = 0 <= r < 36 and 0 <= c < 48
+                expected = view.photo[min(max(r, 0), 35), min(max(c, 0), 47)]
+                assert torch.equal(shifted.photo[row, column], expected)
+                assert bool(shifted.counts[row, column]) == inside
+                assert bool(shifted.beyond[row, column]) != inside
 
 
-def test_resume_agrees_or_is_refused(run, scene, capsys):
-    resume = ["train", str(scene), "--run", str(run), "--resume", "--device", "cpu"]
-    assert cli.main([*resume, "--set", "texture.levels=4", "--set", "mask_mode=background"]) == 0
-    before = (run / "config.json").read_bytes()
-    expected = "--set: texture.levels: expected 4 as in the run to resume, got 8"
-    refused(capsys, [*resume, "--set", "texture.levels=8"], expected)
-    refused(capsys, [*resume, "--set", "texture.nope=8"], "--set: texture.nope: expected a setting")
-    refused(capsys, [*resume, "--set", "preset=paper"], "--set: preset: expected --preset alone")
-    assert (run / "config.json").read_bytes() == before
+def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
+    mask = torch.ones(36, 48, dtype=torch.bool)
+    mask[:, 40:] = False
+    hidden = dataclasses.replace(scene, train=[dataclasses.replace(v, mask=mask) for v in scene.train])
+    trainer = make_trainer(hidden, border=0.25)
+    for _ in range(10):
+        shifted = trainer._beyond_the_frame(trainer._view(0, 1))
+        left = round(scene.train[0].camera.cx - shifted.camera.cx)
+        column = 47 - max(left, 0)  # shows the photo's last column
+        if left <= 0:
+            continue
+        assert not shifted.beyond[:, column + 1 :].any() and not shifted.counts[:, column:].any()
 
 
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--set", "nope=1"], ["--set: nope: expected a setting"]),
-        (["--set", "border"], ["--set: expected KEY=VALUE, got 'border'"]),
-        (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
-        (["--set", "texture.table_size=1000"], ["table_size", "power of two"]),
-        (["--set", "preset=paper"], ["--set: preset: expected --preset alone"]),
-        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed alone"]),
-        (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
-        (["--set", "clamp_texture=true"], ["clamp_texture: expected False with texture.residual"]),
-    ],
-)
-def test_bad_flags_leave_nothing_behind(scene, tmp_path, capsys, flags, words):
-    run = tmp_path / "runs" / "new"
-    refused(capsys, ["train", str(scene), "--run", str(run), "--device", "cpu", *flags], *words)
-    assert not run.parent.exists()
+# Backgrounds
 
 
-def test_a_scene_on_a_background_takes_it_from_its_flag(scene, tmp_path, capsys):
-    """Photos that were put on white must not be compared with renderings on another colour."""
-    path = write_blender(scene, tmp_path / "blender")
-    for file in path.rglob("*.png"):
-        with Image.open(file) as photo:
-            photo.putalpha(200)
-            photo.save(file)
-    flags = ["train", str(path), "--run", str(tmp_path / "run"), *FLAGS]
-    refused(capsys, [*flags, "--set", "background=[0, 0, 0]"], "--set: background: expected --background instead")
-    assert not (tmp_path / "run").exists()
+def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
+    photos = torch.stack([view.image for view in scene.train]).double() / 255
+    assert mean_colour(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
+    assert make_trainer(scene).render_options()["background"] == mean_colour(scene.train)
+    black = make_trainer(scene, background=(0.0, 0.0, 0.0))
+    assert black.render_options()["background"] == (0.0, 0.0, 0.0)
+    white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
+    assert make_trainer(white).render_options()["background"] == (1.0, 1.0, 1.0)
 
 
-def test_the_demo_keeps_what_makes_a_preset():
-    """Its own settings are those of a short run on a CPU; the paper's texture stays the paper's."""
-    train = cli.Train("demo", preset="paper")
-    config, paper = train._config(Path("nowhere")), preset("paper")
-    assert (config.preset, config.iterations, config.texture.levels) == ("paper", 1200, 12)
-    for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "border"):
-        assert setting(config, name) == setting(paper, name)
-    assert dataclasses.replace(train, preset="default")._config(Path("nowhere")).texture.residual
+def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
+    alpha = torch.full((36, 48), 255, dtype=torch.uint8)
+    alpha[:10] = 51
+    views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
+    random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
+    trainer = make_trainer(random)
+    seen = [trainer._view(0, 1) for _ in range(3)]
+    assert len({tuple(view.background.tolist()) for view in seen}) == 3
+    photo = views[0].image.float() / 255
+    for view in seen:
+        expected = photo[:10] + 0.8 * (view.background - 1.0)
+        assert_close(view.photo[:10], expected, kind="value", name="transparent")
+        assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
+    assert trainer.render_options()["background"] == (1.0, 1.0, 1.0)
+
+
+# Masks
+
+SQUARE = slice(10, 26), slice(14, 34)
+
+
+def with_intruder(scene: Scene, masked: bool) -> Scene:
+    """A red square before every training photo, and masks that leave it out."""
+    mask = torch.ones(36, 48, dtype=torch.bool)
+    mask[SQUARE] = False
+
+    def spoilt(view: View) -> View:
+        image = view.image.clone()
+        image[SQUARE] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+        return dataclasses.replace(view, image=image, mask=mask if masked else None)
+
+    return dataclasses.replace(scene, train=[spoilt(view) for view in scene.train])
+
+
+def redness(trainer: Trainer) -> float:
+    """How much redder than their photos the test views are, in the middle, 0 to 1."""
+    views = trainer.scene.test
+    with torch.no_grad():
+        images = [
+            nw.render(trainer.surfels, trainer.texture, v.camera, **trainer.render_options()).image for v in views
+        ]
+    pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
+    return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
+
+
+@pytest.mark.timeout(120)
+def test_what_masks_leave_out_does_not_appear(scene: Scene) -> None:
+    """An intruder that moves with the camera, before every photo; learnt without masks, left out with them."""
+    settings = {"iterations": 100, "max_surfels": 400}
+    results = []
+    for masked in (False, True):
+        trainer = make_trainer(with_intruder(scene, masked), **settings)
+        trainer.run()
+        results.append(redness(trainer))
+    without, with_masks = results
+    assert without > 0.08
+    assert abs(with_masks) < 0.2 * without
+
+
+def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    views = [dataclasses.replace(view, mask=mask) for view in scene.train]
+    halves = dataclasses.replace(scene, train=views)
+    alphas = {}
+    for mode in ("ignore", "background"):
+        trainer = make_trainer(halves, iterations=60, mask_mode=mode, border=0.0)
+        trainer.run()
+        with torch.no_grad():
+            view = trainer._view(0, 1)
+            options = trainer.render_options()
+            outs = [nw.render(trainer.surfels, trainer.texture, v.camera, **options) for v in scene.train]
+        alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
+        if mode == "background":
+            assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
+            assert view.counts is None and torch.equal(view.empty, ~mask)
+    assert alphas["background"] < 0.75 * alphas["ignore"]
+
+
+def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
+    trainer = make_trainer(scene)
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    view = dataclasses.replace(scene.test[0], mask=mask)
+    spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
+    options = trainer.render_options()
+
+    def judge(*views: View, mode: str = "ignore") -> dict:
+        metrics = ("psnr", "ssim", "flip")
+        return evaluate(trainer.surfels, trainer.texture, views, options=options, mask_mode=mode, metrics=metrics)
+
+    one, other = judge(view), judge(spoilt)
+    assert one["psnr"] == other["psnr"]
+    assert judge(view, mode="background")["psnr"] == judge(spoilt, mode="background")["psnr"] != one["psnr"]
+    with pytest.raises(ValueError, match=r"^metrics: expected some of psnr, ssim, flip, lpips, got 'mse'$"):
+        evaluate(trainer.surfels, trainer.texture, [view], options=options, metrics=("mse",))

@@ -267,7 +267,7 @@ def test_paper_is_the_paper():
     assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
     assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
-    assert (p.border, p.mask_mode) == (0.0, "ignore")
+    assert (p.border, p.mask_mode, p.footprints) == (0.0, "ignore", False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
         quats=1e-3,

@@ -53,6 +53,7 @@ def thread_kernels(
     low_passes: Sequence[bool] = (False, True),
     ssim_lanes: Sequence[int] = (1, LANES),
     cpu: bool = False,
+    fixed: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
@@ -72,6 +73,8 @@ def thread_kernels(
     for count in features:
         lookup = (hashgrid_rows_kernels if cpu else hashgrid_kernels)(real, storage, count)
         yield from (lookup.forward, lookup.backward)
+        if fixed and not cpu:
+            yield lookup.fixed_backward
     for low_pass in low_passes:
         lists = list_kernels(real, low_pass, tile_size)
         yield footprint_kernel(real, low_pass, tile_size)
@@ -85,6 +88,7 @@ def walk_kernels(
     *,
     low_passes: Sequence[bool] = (False, True),
     cpu: bool = False,
+    fixed: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels that walk along a tile's list, on CUDA in blocks of `collect.BLOCK_DIM`."""
     forward = collect_rows_kernel if cpu else collect_kernel
@@ -95,3 +99,5 @@ def walk_kernels(
             yield forward(real, hits, low_pass, tile_size)
             for watch in (False, True):
                 yield backward(real, hits, low_pass, tile_size, watch)
+                if fixed and not cpu:
+                    yield collect_backward_kernel(real, hits, low_pass, tile_size, watch, fixed=True)

@@ -31,6 +31,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.fixed import fixed_add, fixed_record_sum
 from nexwarp.kernels.lanes import any_lane, ballot, first_lane, from_lane, lane, lane_max, lane_sum, lanes, record_sum
 from nexwarp.kernels.loads import load_function
 from nexwarp.kernels.surfel import hit_functions
@@ -278,9 +279,12 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
 
 @functools.cache
 def collect_backward_kernel(
-    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False
+    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False, fixed: bool = False
 ) -> wp.Kernel:
-    """Make the backward kernel; with `watch` it also adds up weight * error a row, as `splat_error` does alone."""
+    """Make the backward kernel; with `watch` it also adds up weight * error a row, as `splat_error` does alone.
+
+    With `fixed` the sums are pairs of integers, see `kernels.fixed`, and so do not depend on any order.
+    """
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     h = hit_functions(real, low_pass)
@@ -290,6 +294,11 @@ def collect_backward_kernel(
     view = view_functions(real, tile_size)
     pixels = view.pixels
     sum1, sum3, add_record = lane_sum(real), lane_sum(vec3), record_sum(real)
+    put_record, put3, put1 = fixed_record_sum(real), fixed_add(vec3), fixed_add(real)
+    pairs = wp.array2d(dtype=wp.int64)
+    rows_of_records = pairs if fixed else wp.array2d(dtype=vec4)
+    rows_of_centers = pairs if fixed else wp.array(dtype=vec3)
+    rows_of_errors = pairs if fixed else wp.array(dtype=real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -326,9 +335,10 @@ def collect_backward_kernel(
         grad_alphas: wp.array(dtype=real),
         errors: wp.array(dtype=real),
         # outputs
-        grad_records: wp.array2d(dtype=vec4),
-        grad_centers: wp.array(dtype=vec3),
-        error_sums: wp.array(dtype=real),
+        grad_records: rows_of_records,
+        grad_centers: rows_of_centers,
+        error_sums: rows_of_errors,
+        bad: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
         tile = thread // pixels
@@ -435,15 +445,22 @@ def collect_backward_kernel(
                     row = int(i)
                     if k < rows.shape[0]:
                         row = rows[k]
-                    add_record(grad_records, row, g0, g1, g2, g3)
+                    if wp.static(fixed):
+                        put_record(grad_records, row, g0, g1, g2, g3, bad)
+                    else:
+                        add_record(grad_records, row, g0, g1, g2, g3)
                     if wp.static(low_pass):
                         gc = sum3(gc)
                     if wp.static(watch):
                         share = sum1(share)
                     if me == 0:
-                        if wp.static(watch):
+                        if wp.static(watch and fixed):
+                            put1(error_sums, row, share, bad)
+                        if wp.static(watch and not fixed):
                             wp.atomic_add(error_sums, row, share)
-                        if wp.static(low_pass):
+                        if wp.static(low_pass and fixed):
+                            put3(grad_centers, row, gc, bad)
+                        if wp.static(low_pass and not fixed):
                             wp.atomic_add(grad_centers, row, gc)
 
     return collect_backward

@@ -6,7 +6,8 @@ it is. A point with depth 0 (an empty hit slot) gets zeros and gives no gradient
 
 The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may
 be half precision while their gradients are summed in float32. The backward kernel adds to the table by atomics; a CPU
-has none: see `hashgrid_rows`.
+has none: see `hashgrid_rows`. Its fixed-point form adds up integers, one an entry and feature (L, T * F), in units that
+the caller chooses: the same bits in whatever order.
 """
 
 import functools
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.fixed import fixed_units
 from nexwarp.kernels.loads import load_function
 from nexwarp.kernels.simd import lane_functions
 from nexwarp.kernels.types import types
@@ -188,6 +190,7 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
     load = load_function(features, storage)
     options = {"fast_math": real is wp.float32}
     pairs = features == 2 and real is wp.float32
+    add_units = fixed_units(real)
 
     @wp.func
     def cell(x: vec3):
@@ -277,4 +280,48 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         if grad_points.shape[0] > 0:
             grad_points[p] = total
 
-    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    def hashgrid_fixed_backward(
+        first: wp.int32,
+        table: wp.array2d(dtype=row),
+        positions: wp.array(dtype=vec3),
+        depths: wp.array(dtype=real),
+        resolutions: wp.array(dtype=real),
+        focal: wp.array(dtype=real),
+        mask: wp.uint32,
+        grad_encoded: wp.array2d(dtype=storage),
+        unscale: wp.array(dtype=real),
+        scale_of_sums: wp.array(dtype=wp.float64),
+        # outputs
+        grad_table: wp.array2d(dtype=wp.int64),
+        grad_points: wp.array(dtype=vec4),
+        bad: wp.array(dtype=wp.int32),
+    ):
+        p = first + wp.tid()
+        depth = depths[p]
+        if not (depth > ZERO):
+            if grad_points.shape[0] > 0:
+                grad_points[p] = vec4()
+            return
+        total = vec4()
+        for level in range(resolutions.shape[0]):
+            grad = vec()
+            for k in range(wp.static(features)):
+                grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
+            scale = resolutions[level]
+            x = positions[p] * scale
+            base = cell(x)
+            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+            x -= base
+            gx, gy, gz, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+                x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0], grad
+            )
+            for j in range(8):
+                slot = int(hash_slot(corner, j, mask))
+                for k in range(wp.static(features)):
+                    add_units(grad_table, level, slot * wp.static(features) + k, gc[j, k], scale_of_sums[0], bad)
+            total += vec4(gx * scale, gy * scale, gz * scale, gd)
+        if grad_points.shape[0] > 0:
+            grad_points[p] = total
+
+    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward, fixed_backward=hashgrid_fixed_backward)

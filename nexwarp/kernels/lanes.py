@@ -74,7 +74,7 @@ _SUM = """
 # In each step a lane hands over the half of its values that the other lane of a pair will own, and adds what it gets
 # to its own half: 16 exchanges instead of the 80 of sixteen separate sums. Lane 2 k ends with the sum of value k, so
 # that sixteen lanes add to sixteen neighbouring addresses at once.
-_ADD_RECORD = """
+GATHER_RECORD = """
     REAL v[16];
     for (int k = 0; k < 4; ++k) {
         v[k] = a.c[k];
@@ -82,6 +82,10 @@ _ADD_RECORD = """
         v[8 + k] = c.c[k];
         v[12 + k] = d.c[k];
     }
+"""
+
+_ADD_RECORD = """
+    GATHER
     REAL* target = reinterpret_cast<REAL*>(&wp::index(records, row, 0));
 #if defined(__CUDA_ARCH__)
     const int lane = threadIdx.x & 31;
@@ -99,6 +103,9 @@ _EXCHANGE = """
         v[k] = (lane & (2 * HALF) ? v[k + HALF] : v[k]) + given;
     }
 """
+
+# Written out: the compiler does not unroll a loop over halves, and then keeps v in memory.
+EXCHANGES = "".join(_EXCHANGE.replace("HALF", str(half)) for half in (8, 4, 2, 1))
 
 _SUM_VECTOR = """
 #if defined(__CUDA_ARCH__)
@@ -168,10 +175,7 @@ def record_sum(real: type) -> wp.Function:
     vec4 = wp.types.vector(length=4, dtype=real)
     name = "float" if real is wp.float32 else "double"
 
-    # Written out: the compiler does not unroll a loop over halves, and then keeps v in memory.
-    exchanges = "".join(_EXCHANGE.replace("HALF", str(half)) for half in (8, 4, 2, 1))
-
-    @wp.func_native(_ADD_RECORD.replace("EXCHANGES", exchanges).replace("REAL", name))
+    @wp.func_native(_ADD_RECORD.replace("GATHER", GATHER_RECORD).replace("EXCHANGES", EXCHANGES).replace("REAL", name))
     def add_record(records: wp.array2d(dtype=vec4), row: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4): ...
 
     return add_record

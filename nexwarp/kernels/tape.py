@@ -248,7 +248,7 @@ def collect(
         found = [hits.plain, hits.base, hits.ids, hits.weights, hits.alphas, hits.stops]
         grads = [hits.plain.grad, hits.base.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
         kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
-        outputs = [records.grad, centers.grad, None]
+        outputs = [records.grad, centers.grad, None, None]
         _silent(kernel, threads, [*inputs, None, *found, *grads, None], outputs, BLOCK_DIM)
 
     tape.record_func(backward, [records, centers, hits.plain, hits.base, hits.depths, hits.weights, hits.alphas])

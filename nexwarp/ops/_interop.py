@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 from nexwarp.kernels import launch as launching
+from nexwarp.kernels.fixed import HIGH, LOW
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
 STORAGES = {**REALS, torch.float16: wp.float16}
@@ -84,3 +85,19 @@ def launch(
 def grad_like(tensor: torch.Tensor, needed: bool) -> torch.Tensor | None:
     """Zeros to add gradients to, or None when nobody needs them."""
     return torch.zeros_like(tensor, memory_format=torch.contiguous_format) if needed else None
+
+
+def sums_in_fixed_point(like: torch.Tensor) -> bool:
+    """Whether sums by atomics must not depend on their order: on CUDA, under torch's deterministic algorithms."""
+    return like.is_cuda and torch.are_deterministic_algorithms_enabled()
+
+
+def sums_like(like: torch.Tensor, shape: tuple[int, ...], fixed: bool) -> torch.Tensor:
+    """Zeros to add floats to: of the dtype of `like`, or, in fixed point, a pair of integers each (..., 2)."""
+    return like.new_zeros(*shape, 2, dtype=torch.int64) if fixed else like.new_zeros(shape)
+
+
+def from_fixed_point(pairs: torch.Tensor, bad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Values (...) of pairs (..., 2) of integers; NaN throughout when a term raised the flag `bad` (1,)."""
+    values = (pairs[..., 0].double() / HIGH + pairs[..., 1].double() / LOW).to(dtype)
+    return torch.where(bad.bool(), torch.nan, values)

@@ -16,7 +16,7 @@ from nexwarp.kernels.collect import (
 )
 from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel, row_lanes
 from nexwarp.kernels.types import MAX_HITS, types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import array, from_fixed_point, launch, real_of, sums_in_fixed_point, sums_like
 from nexwarp.ops.checks import check_tensors
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
@@ -232,9 +232,11 @@ class _Collect(torch.autograd.Function):
             return array(tensor.contiguous().view(-1, slots) if max_hits else tensor.new_empty(1, 1), dtype)
 
         rows, count = _rows(tiles, records)
-        grad_rows = records.new_zeros(count, 4, 4)
+        # Where rows are by surfel, many warps add to one: in fixed point, if their order must not matter.
+        fixed = sums_in_fixed_point(records)
+        grad_rows = sums_like(records, (count, 4, 4), fixed)
         # Centres carry a gradient only through the low-pass.
-        grad_center_rows = centers.new_zeros(count if low_pass else 1, 3)
+        grad_center_rows = sums_like(centers, (count if low_pass else 1, 3), fixed)
         inputs = [
             *_inputs(records, centers, limits, tiles, camera),
             array(tiles.reaches, t.vec2),
@@ -252,13 +254,24 @@ class _Collect(torch.autograd.Function):
             array(grad_alphas.contiguous().view(-1), real),
             array(None if watch.errors is None else watch.errors.view(-1), real),
         ]
-        error_rows = None if watch.errors is None else records.new_zeros(count)
-        outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
+        error_rows = None if watch.errors is None else sums_like(records, (count,), fixed)
         variant = (real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
-        if _rows_a_thread(records):
-            _walk(records, collect_rows_backward_kernel(*variant), tiles, inputs, outputs, row_lanes(tiles.tile_size))
+        if fixed:
+            bad = torch.zeros(1, dtype=torch.int32, device=records.device)
+            sums = (grad_rows, grad_center_rows, error_rows)
+            outputs = [None if x is None else array(x.view(len(x), -1), wp.int64) for x in sums]
+            kernel = collect_backward_kernel(*variant, fixed=True)
+            _walk(records, kernel, tiles, inputs, [*outputs, array(bad, wp.int32)])
+            grad_rows, grad_center_rows, error_rows = (
+                None if x is None else from_fixed_point(x, bad, records.dtype) for x in sums
+            )
         else:
-            _walk(records, collect_backward_kernel(*variant), tiles, inputs, outputs)
+            outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
+            if _rows_a_thread(records):
+                kernel = collect_rows_backward_kernel(*variant)
+                _walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
+            else:
+                _walk(records, collect_backward_kernel(*variant), tiles, inputs, [*outputs, None])
         if error_rows is not None:
             watch.sums = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
         grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)

@@ -12,7 +12,7 @@ from nexwarp.kernels.hashgrid_rows import LANES as ROW
 from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import STORAGES, array, launch, real_of
+from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point
 
 # Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
 HALF_GRADIENT = 64.0
@@ -213,7 +213,8 @@ def _lookup_backward(
     real = real_of(positions)
     levels, _, features = table.shape
     count = len(positions)
-    grad_grid = torch.zeros_like(table, dtype=positions.dtype)
+    fixed = sums_in_fixed_point(positions)
+    grad_grid = torch.zeros_like(table, dtype=torch.int64 if fixed else positions.dtype)
     # On a CPU a run of levels has its slots, since its thread owns their tables; on CUDA a thread takes all levels.
     rows = _rows_a_thread(positions)
     run = -(-levels // RUNS)
@@ -221,16 +222,27 @@ def _lookup_backward(
     grad_points = positions.new_empty((runs if rows else 1) if need_points else 0, count, 4)
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
     arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real), *([run] * rows)]
-    outputs = [
-        array(grad_grid, wp.types.vector(length=features, dtype=real)),
-        array(grad_points if rows else grad_points.view(-1, 4), types(real).vec4),
-    ]
+    points_out = array(grad_points if rows else grad_points.view(-1, 4), types(real).vec4)
     threads = (runs, -(-count // ROW)) if rows else count
-    launch(positions, kernels.backward, threads, arguments, outputs)
+    if fixed:
+        units = _units(grad_encoded, unscale)
+        bad = torch.zeros(1, dtype=torch.int32, device=table.device)
+        outputs = [array(grad_grid.view(levels, -1), wp.int64), points_out, array(bad, wp.int32)]
+        launch(positions, kernels.fixed_backward, threads, [*arguments, array(units, wp.float64)], outputs)
+        grad_grid = torch.where(bad.bool(), torch.nan, (grad_grid.double() / units).to(positions.dtype))
+    else:
+        outputs = [array(grad_grid, wp.types.vector(length=features, dtype=real)), points_out]
+        launch(positions, kernels.backward, threads, arguments, outputs)
     if not need_points:
         return grad_grid, None, None
     points = grad_points.sum(0) if rows else grad_points[0]
     return grad_grid, points[:, :3], points[:, 3]
+
+
+def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
+    """(1,) float64 power of two that makes 2^46 units of the largest gradient: 2^17 of those may meet in one entry."""
+    largest = torch.linalg.vector_norm(grad_encoded.float(), float("inf")).double() * unscale.double()
+    return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 
 
 def _colors(
