@@ -100,6 +100,8 @@ class Train:
     """`default`, or `paper` to reproduce the publication."""
     seed: int | None = None
     """Of every random choice (0)."""
+    deterministic: bool | None = None
+    """Give the same bits in every run also on CUDA; slower. A CPU always does."""
     device: str | None = None
     """`cuda` or `cpu`; CUDA where present by default."""
     resume: bool = False
@@ -199,7 +201,7 @@ class Train:
     def _config(self, run: Path) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given |= {"seed": self.seed, "mask_mode": self.mask_mode}
+        given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic}
         given = {name: value for name, value in given.items() if value is not None}
         _check_max_hits(self.max_hits)
         if self.resume:
