@@ -4,6 +4,8 @@ import os
 
 # Before torch is imported: its idle OpenMP threads would otherwise spin on the cores that the CPU kernels need.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Before cuBLAS is used: without it torch has no deterministic matrix products on CUDA. The size is that of its default.
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load

@@ -116,6 +116,8 @@ class Train:
     """Change any setting of docs/options.md, such as texture.max_resolution=1024; VALUE is JSON or a bare word."""
     seed: Annotated[int | None, option("N", "0")] = None
     """Of every random choice."""
+    deterministic: bool = False
+    """Give the same bits in every run also on CUDA; slower. A CPU always does."""
     device: Device_ = None
     """Where to train."""
     resume: bool = False
@@ -221,7 +223,7 @@ class Train:
     def _config(self, run: Path) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given |= {"seed": self.seed, "mask_mode": self.mask_mode}
+        given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic or None}
         given = {name: value for name, value in given.items() if value is not None}
         _check_max_hits(self.max_hits)
         settings = self._settings(given)

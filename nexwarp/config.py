@@ -116,6 +116,8 @@ class Config:
     """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
     seed: int = 0
     """Of every random choice."""
+    deterministic: bool = False
+    """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
     losses: LossWeights = field(default_factory=LossWeights)
     """Factors of the loss terms."""
     rates: LearningRates = field(default_factory=LearningRates)

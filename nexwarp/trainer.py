@@ -7,6 +7,7 @@ import random
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,10 @@ class Trainer:
 
     def step(self) -> Progress:
         """Do one iteration: a view, its rendering, the losses, Adam, and density control when it is due."""
+        with _deterministic(self.config.deterministic and self.device.type == "cuda"):
+            return self._step()
+
+    def _step(self) -> Progress:
         self.iteration += 1
         self.surfels.footprints = None  # of surfels that are about to change
         config = self.config
@@ -449,6 +454,22 @@ def _densify_schedule(config: Config) -> DensifyConfig:
     d = config.densify
     every = max(config.scaled(d.every), min(d.every, 10))
     return dataclasses.replace(d, start=config.scaled(d.start), stop=config.scaled(d.stop), every=every)
+
+
+@contextmanager
+def _deterministic(wanted: bool) -> Iterator[None]:
+    """Let torch's operations, and ours with them, give the same bits whatever the order of threads."""
+    if not wanted or torch.are_deterministic_algorithms_enabled():
+        yield
+        return
+    fill = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # all of it is written before it is read
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
+        torch.utils.deterministic.fill_uninitialized_memory = fill
 
 
 def mean_colour(views: list[View]) -> tuple[float, float, float]:

@@ -40,7 +40,6 @@ class Build(NamedTuple):
 def needed(config: Config, device: torch.device) -> list[Build]:
     """Return the catalogue's kernels that settings need on a device."""
     textured, cpu = config.max_hits > 0, device.type == "cpu"
-    fixed = torch.are_deterministic_algorithms_enabled()
     alone = thread_kernels(
         wp.float32,
         wp.float32 if cpu else wp.float16,
@@ -51,10 +50,11 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         low_passes=(config.low_pass,),
         ssim_lanes=(LANES if cpu else 1,),
         cpu=cpu,
-        fixed=fixed,
+        fixed=config.deterministic,
     )
     low_passes = (config.low_pass,)
-    walks = walk_kernels(wp.float32, TILE_SIZE, (config.max_hits,), low_passes=low_passes, cpu=cpu, fixed=fixed)
+    hits, fixed = (config.max_hits,), config.deterministic
+    walks = walk_kernels(wp.float32, TILE_SIZE, hits, low_passes=low_passes, cpu=cpu, fixed=fixed)
     return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 
 

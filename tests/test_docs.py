@@ -50,6 +50,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "filter_points": ("", ""),
     "orient_points": ("", ""),
     "seed": ("", "code"),
+    "deterministic": ("", ""),
     "losses.dssim": ("λ_D-SSIM", "Losses"),
     "losses.alpha": ("λ_alpha", "Losses"),
     "losses.texture": ("λ_texture", "Losses"),

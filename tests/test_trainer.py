@@ -119,6 +119,20 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
     assert first.order != other.order
 
 
+@pytest.mark.cuda
+def test_deterministic_runs_are_the_same_on_cuda(scene):
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    runs = []
+    for _ in range(3):
+        trainer = Trainer(scene, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
+        trainer.run()
+        runs.append(trainer)
+    assert not torch.are_deterministic_algorithms_enabled()
+    for other in runs[1:]:
+        assert_same_state(other, runs[0])
+
+
 @pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
 def test_a_checkpoint_that_does_not_fit_is_refused(scene, tmp_path, damage):
     trainer = Trainer(scene, small(), "cpu")

@@ -100,6 +100,7 @@ SETTINGS = {
     **PRESETS,
     "no texture": Config(max_hits=0),
     "K = 3": Config(max_hits=3),
+    "deterministic": Config(deterministic=True),
     "options": Config(low_pass=True, clamp_texture=True, sh_degree=1, texture=TextureConfig(residual=False)),
 }
 
