@@ -14,7 +14,8 @@ from scipy.ndimage import map_coordinates
 
 from nexwarp import cli
 from nexwarp.data import load_scene
-from nexwarp.data.colmap import ColmapModel, pycolmap_module, read_model
+from nexwarp.data.capture import Capture
+from nexwarp.data.colmap import pycolmap_module, read_model
 from nexwarp.data.demo import TARGET, _look_at
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.raytrace import render
@@ -82,7 +83,7 @@ def noise(seed: int) -> np.ndarray:
     return small.repeat(4, axis=0).repeat(4, axis=1)
 
 
-def assert_cameras_agree(model: ColmapModel, truth: dict[str, np.ndarray], within: float) -> None:
+def assert_cameras_agree(model: Capture, truth: dict[str, np.ndarray], within: float) -> None:
     """Fail unless a similarity takes the cameras to the true ones.
 
     Centres within this share of their distance from what they see, axes within as many radians.
@@ -104,12 +105,13 @@ def assert_cameras_agree(model: ColmapModel, truth: dict[str, np.ndarray], withi
 
 
 def test_cameras_come_back(made, arc):
-    model = read_model(made)
+    model = read_model(made, made / "images")
     assert [photo.name for photo in model.photos] == sorted(arc.images)
     assert_cameras_agree(model, arc.viewmats, within=0.01)
     for photo in model.photos:
-        assert (photo.width, photo.height) == (WIDTH, HEIGHT)
-        assert photo.K[0, 0] == photo.K[1, 1] == pytest.approx(FOCAL, rel=0.02)
+        assert (photo.lens.width, photo.lens.height) == (WIDTH, HEIGHT)
+        assert photo.lens.model == "SIMPLE_PINHOLE"
+        assert photo.lens.params[0] == pytest.approx(FOCAL, rel=0.02)
 
 
 def test_the_scene_loads_and_holds_the_photos(made, photos, arc):
@@ -137,11 +139,11 @@ def test_points_lie_where_their_features_are(made):
 
 def test_the_report_is_about_the_scene(made):
     report = json.loads((made / "sfm.json").read_text())
-    model = read_model(made)
+    model = read_model(made, made / "images")
     assert report["photos"] == len(report["registered"]) == VIEWS and not report["left_out"] and not report["advice"]
-    assert report["points"] == len(model.points)
-    assert report["mean_track_length"] == pytest.approx(model.track_lengths.mean())
-    assert report["mean_reprojection_error"] == pytest.approx(model.reprojection_errors.mean(), rel=1e-4)
+    assert report["points"] == len(model.cloud.positions)
+    assert report["mean_track_length"] == pytest.approx(model.cloud.track_lengths.mean())
+    assert report["mean_reprojection_error"] == pytest.approx(model.cloud.reprojection_errors.mean(), rel=1e-4)
     assert report["mean_reprojection_error"] < 0.5
     assert report["pairs"] == VIEWS * (VIEWS - 1) // 2 and report["matching"] == "exhaustive"
     assert [camera["model"] for camera in report["cameras"]] == ["SIMPLE_PINHOLE"]
@@ -171,7 +173,7 @@ def test_distortion_is_found_and_taken_out(arc, tmp_path):
     report = reconstruct(folder, tmp_path / "scene", SfmOptions(camera_model="simple_radial"))
     assert len(report.registered) == VIEWS
     assert report.cameras[0]["params"][3] == pytest.approx(K1, abs=0.03)
-    assert_cameras_agree(read_model(tmp_path / "scene"), arc.viewmats, within=0.01)
+    assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
     scene = load_scene(tmp_path / "scene")
     shape = scene.train[0].image.shape
     assert shape[:2] != (HEIGHT, WIDTH) and report.sizes == [(shape[1], shape[0])]
@@ -196,9 +198,9 @@ def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
     assert [camera["exif_focal"] for camera in report["cameras"]] == [False, True]
     assert [camera["photos"] for camera in report["cameras"]] == [4, 3]
     truth = {f"camera {i % 2}/{Path(n).stem}.JPG": v for i, (n, v) in enumerate(arc.viewmats.items())}
-    model = read_model(tmp_path / "scene")
+    model = read_model(tmp_path / "scene", tmp_path / "scene" / "images")
     assert_cameras_agree(model, truth, within=0.01)
-    assert len({photo.K[0, 0] for photo in model.photos}) == 2
+    assert len({photo.lens.params[0] for photo in model.photos}) == 2
 
 
 # What is compared
