@@ -2,6 +2,8 @@
 
 import argparse
 import asyncio
+import base64
+import io
 import os
 import sys
 import time
@@ -10,11 +12,13 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
+from PIL import Image
 
 from nexwarp.files import written_aside
 
 FOLDER = Path(__file__).resolve().parent
 NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
+JPEG_QUALITY = 88
 MINUTES = 30  # for one cell, at most
 NO_DRIVER = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"  # written by Warp's C code, always
 
@@ -42,6 +46,7 @@ def execute(source: Path, target: Path) -> None:
         if cell.cell_type == "code":
             cell.outputs = [output for output in cell.outputs if not _no_driver(output)]
             for output in cell.outputs:
+                _shrink(output)
                 if output.get("name") == "stderr":
                     raise RuntimeError(f"{source.name}: expected nothing on stderr, got {output.text}")
     notebook.metadata = {key: notebook.metadata[key] for key in ("kernelspec", "language_info")}
@@ -54,6 +59,19 @@ def _no_driver(output: nbformat.NotebookNode) -> bool:
     """Whether an output is no more than Warp's note that the machine has no GPU."""
     lines = output.text.strip().splitlines() if output.get("name") == "stderr" else [""]
     return all(line.startswith(NO_DRIVER) for line in lines)
+
+
+def _shrink(output: nbformat.NotebookNode) -> None:
+    """Make a PNG a JPEG where that takes less than half: photos, not plots."""
+    png = output.get("data", {}).get("image/png")
+    if png is None:
+        return
+    jpeg = io.BytesIO()
+    Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB").save(jpeg, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    text = base64.b64encode(jpeg.getvalue()).decode()
+    if len(text) < len(png) / 2:
+        del output.data["image/png"]
+        output.data["image/jpeg"] = text
 
 
 def main(arguments: list[str] | None = None) -> int:
