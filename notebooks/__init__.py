@@ -1,0 +1,1 @@
+"""Notebooks that show what nexwarp does; `python -m notebooks` executes them."""
