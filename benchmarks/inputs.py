@@ -152,10 +152,8 @@ def write_blender(demo: Path, folder: Path, centred: bool = False) -> Path:
 
 def main(arguments: list[str] | None = None) -> int:
     """Train every form of the demo with the settings of `nexwarp train demo` and print a table."""
-    import dataclasses
-
     from nexwarp.cli import DEMO_SETTINGS
-    from nexwarp.config import preset
+    from nexwarp.config import preset, with_settings
     from nexwarp.evaluate import evaluate
     from nexwarp.trainer import Trainer
 
@@ -175,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
         "opencv": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV", BARREL)),
         "fisheye": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV_FISHEYE", FISHEYE)),
     }
-    config = dataclasses.replace(preset("default"), **DEMO_SETTINGS)
+    config = with_settings(preset("default"), DEMO_SETTINGS)
     reference = load_scene(demo)
     for name in given[1:] or forms:
         folder = base / name

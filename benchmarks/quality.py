@@ -160,7 +160,8 @@ def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] =
         viewmat[:3, 3] = factor * viewmat[:3, 3] - viewmat[:3, :3] @ offset
         c = v.camera
         camera = Camera(viewmat.float(), c.K, c.width, c.height, c.near * factor)
-        return dataclasses.replace(v, camera=camera)
+        points = None if v.points is None else (factor * v.points.double() + offset).float()
+        return dataclasses.replace(v, camera=camera, points=points)
 
     return dataclasses.replace(
         scene,

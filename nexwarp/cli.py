@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -30,7 +30,7 @@ from nexwarp.checkpoint import (
     save_model,
     write_json,
 )
-from nexwarp.config import Config, LearningRates, TextureConfig, preset
+from nexwarp.config import Config, LearningRates, preset, with_settings
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, NexwarpError, SceneError, SettingError, StorageError
 from nexwarp.evaluate import evaluate
@@ -63,7 +63,9 @@ DEMO_SETTINGS: dict[str, Any] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
-    "texture": TextureConfig(levels=12, table_size=2**15, width=32),
+    "texture.levels": 12,
+    "texture.table_size": 2**15,
+    "texture.width": 32,
     "rates": LearningRates(
         means=(5e-4, 5e-6),
         quats=5e-3,
@@ -101,6 +103,8 @@ class Train:
     """Folder of the photos below SCENE, such as images_4."""
     masks: str = "masks"
     """Folder of the masks below SCENE, if it is there; `alpha` for the photos' own transparency; `none`."""
+    mask_mode: str | None = None
+    """What masks leave out: `ignore` learns nothing there (default), `background` learns that nothing is there."""
     background: str | None = None
     """Behind transparent photos and renderings: white (default of Blender scenes), black, R,G,B up to 1, or random."""
     points: str | None = None
@@ -226,7 +230,8 @@ class Train:
     def _config(self, run: Path, resume: bool) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given = {name: value for name, value in (given | {"seed": self.seed}).items() if value is not None}
+        given |= {"seed": self.seed, "mask_mode": self.mask_mode}
+        given = {name: value for name, value in given.items() if value is not None}
         _check_max_hits(self.max_hits)
         if resume:
             config = read_run(run)[1]
@@ -237,7 +242,7 @@ class Train:
             return config
         base = preset(self.preset)
         if self.scene == DEMO:
-            base = dataclasses.replace(base, **DEMO_SETTINGS)
+            base = with_settings(base, DEMO_SETTINGS)
         return dataclasses.replace(base, **given)
 
 
@@ -249,20 +254,22 @@ class Eval:
     """Run folder."""
     scene: str | None = None
     """Where the scene is now, if it moved."""
+    metrics: tuple[str, ...] = ("psnr", "ssim")
+    """Which of psnr, ssim, flip and lpips; the last two need the extras `flip` and `lpips`."""
     device: str | None = None
     """`cuda` or `cpu`; CUDA where present by default."""
 
     def __call__(self, console: Console) -> None:
         """Evaluate."""
         device = pick_device(self.device)
-        source, _, _ = read_run(self.run)
+        source, config, _ = read_run(self.run)
         model = load(self.run).to(device)
         if self.scene is not None:
             source = dataclasses.replace(source, path=self.scene)
         with display.loading(console) as progress:
             scene = source.load(progress)
-        metrics = _evaluate(model, scene, self.run, console)
-        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        options = {"mask_mode": config.mask_mode, "metrics": self.metrics}
+        rows = _figures(_evaluate(model, scene, self.run, console, options), self.metrics)
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
 
 
@@ -397,7 +404,7 @@ class Info:
         else:
             rows["model"] = "none yet: the training has not finished"
         if metrics := read_metrics(self.run):
-            rows |= {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+            rows |= _figures(metrics, [name for name in ("psnr", "ssim") if name in metrics])
         console.print(display.results_table(rows, str(self.run)))
 
 
@@ -596,8 +603,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
     }
     rows = {}
     if scene.test:
-        metrics = _evaluate(model, scene, run, console, facts)
-        rows = {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+        rows = _figures(_evaluate(model, scene, run, console, {"mask_mode": trainer.config.mask_mode}, facts))
     rows |= {
         "surfels": f"{facts['surfels']:,}",
         "model file": f"{facts['megabytes']:.1f} MB",
@@ -610,8 +616,21 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
         console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
 
 
+def _figures(results: dict[str, Any], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
+    """Rows of a table: the metrics of the test views."""
+    shown = {name: "not available" if results[name] is None else f"{results[name]:.4f}" for name in metrics}
+    if "psnr" in shown:
+        shown["psnr"] = f"{results['psnr']:.2f} dB"
+    return {f"test {name.upper()}": value for name, value in shown.items()}
+
+
 def _evaluate(
-    model: Model, scene: Scene, run: Path, console: Console, facts: dict[str, Any] | None = None
+    model: Model,
+    scene: Scene,
+    run: Path,
+    console: Console,
+    options: dict[str, Any],
+    facts: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Evaluate a model on its test views and write metrics.json, keeping the facts that an older one holds."""
     if not scene.test:
@@ -624,6 +643,7 @@ def _evaluate(
             options=model.render_options,
             renders=run / "renders",
             progress=done,
+            **options,
         )
     metrics = {**(read_metrics(run) if facts is None else facts), **results}
     write_json(run / METRICS_FILE, metrics)

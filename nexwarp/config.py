@@ -12,6 +12,7 @@ from nexwarp.ops.checks import check_range
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
+MASK_MODES = ("ignore", "background")
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,9 @@ class Config:
     coarse: float = 0.0
     """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
     background: tuple[float, float, float] | None = None
-    """Colour behind everything; None takes the mean colour of the training photos."""
+    """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
+    mask_mode: str = "ignore"
+    """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08
     """Largest shift, in shares of the frame, of steps that look beyond it, where the photo's edge goes on; 0: none."""
     border_every: int = 4
@@ -118,6 +121,10 @@ class Config:
         check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
+        if self.clamp_texture and self.texture.residual:
+            raise ValueError("clamp_texture: expected False with texture.residual, got True")
+        if self.mask_mode not in MASK_MODES:
+            raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""

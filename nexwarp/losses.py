@@ -30,6 +30,8 @@ class LossWeights:
     grid: float = 0.01
     """Squared values of the hash grid, each level over its resolution cubed."""
 
+    empty: float = 0.1
+    """Opacity where a mask says that there is nothing."""
     depth: float = 0.1
     """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
     border: float = 0.1
@@ -37,7 +39,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "depth", "border"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -52,6 +54,7 @@ def training_losses(
     resolutions: torch.Tensor | None,
     loss_weights: LossWeights,
     mask: torch.Tensor | None = None,
+    empty: torch.Tensor | None = None,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of the training loss, already multiplied by their factors: their sum is the loss.
 
@@ -66,6 +69,8 @@ def training_losses(
         loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
         mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
             and the texture are 0. None is True everywhere.
+        empty: (H, W) bool, True where nothing is to be seen but `target`, which is the background there: the terms of
+            the texture and of its weight do not count.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
@@ -74,6 +79,9 @@ def training_losses(
     if mask is not None:
         check_tensors({"mask": (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
         image, textured, weights = _masked(image, textured, weights, target, mask)
+    if empty is not None:
+        check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
+        _, textured, weights = _masked(image, textured, weights, target, ~empty)
     l1_term, texture_term, alpha_term = photometric_terms(
         image,
         textured,
@@ -147,12 +155,12 @@ def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
     return photometric_terms(None, None, weights, None, alpha=1.0)[2]
 
 
-def border_loss(image: torch.Tensor, target: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
-    """Sum over the pixels that are not `inside` (H, W) of the L1 of (H, W, 3) images, over the number of all pixels."""
+def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor) -> torch.Tensor:
+    """Sum over the pixels `beyond` (H, W) the frame of the L1 of (H, W, 3) images, over the number of all pixels."""
     shape = ("H", "W", 3)
     check_tensors({"image": (image, shape), "target": (target, shape)})
-    check_tensors({"inside": (inside, image.shape[:2])}, dtype=torch.bool, device=image.device)
-    return ((image - target).abs().mean(-1) * ~inside).mean()
+    check_tensors({"beyond": (beyond, image.shape[:2])}, dtype=torch.bool, device=image.device)
+    return ((image - target).abs().mean(-1) * beyond).mean()
 
 
 def depth_loss(

@@ -14,8 +14,8 @@ PIXELS_PER_DEGREE = 67.02064514160156  # what FLIP's authors assume: 0.7 m from 
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
-    "C2 = 0.03^2, mean over all pixels and channels. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to "
-    "[-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the map. "
+    "C2 = 0.03^2, mean over all pixels and channels. Both over the pixels that count where there is a mask. "
+    "LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the map. "
     "A set's figure is the mean over its images."
 )
 
@@ -35,16 +35,28 @@ def to_uint8(image: torch.Tensor) -> torch.Tensor:
     return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
-def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two (H, W, 3) images, uint8 or float in [0, 1]; inf if equal."""
+def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two (H, W, 3) images, uint8 or float in [0, 1]; inf if equal.
+
+    Args:
+        image: what is judged.
+        target: what it should be.
+        mask: (H, W) bool, True where pixels count; None is everywhere.
+    """
     image, target = _unit_images(image, target)
-    error = (image.double() - target.double()).square().mean()
+    error = _counting((image.double() - target.double()).square(), mask).mean()
     return (-10.0 * torch.log10(error)).item()
 
 
-def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1]."""
-    return ssim_map(image, target).mean(dtype=torch.float64).item()
+def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1]; `mask` as in `psnr`.
+
+    Windows of pixels that count reach into those that do not, where the image is taken to be the target.
+    """
+    if mask is not None:
+        image, target = _unit_images(image, target)
+        image = torch.where(_check_mask(mask, image)[..., None], image, target)
+    return _counting(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -111,6 +123,20 @@ def _unit_images(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tenso
     if target.device != image.device:
         raise ValueError(f"target: expected a tensor on {image.device}, got one on {target.device}")
     return to_uint8(image).float() / 255.0, to_uint8(target).float() / 255.0
+
+
+def _check_mask(mask: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    if mask.dtype != torch.bool or mask.shape != image.shape[:2]:
+        expected = f"bool of shape {tuple(image.shape[:2])}"
+        raise ValueError(f"mask: expected {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
+    if not bool(mask.any()):
+        raise ValueError("mask: expected pixels that count, got none")
+    return mask.to(image.device)
+
+
+def _counting(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """The values (H, W, C) of the pixels that count."""
+    return values if mask is None else values[_check_mask(mask, values)]
 
 
 def _blur(planes: torch.Tensor) -> torch.Tensor:

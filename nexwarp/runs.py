@@ -159,8 +159,9 @@ def read_metrics(run: Path) -> dict[str, Any]:
     path = run / METRICS_FILE
     try:
         metrics = dict(json.loads(path.read_text())) if path.is_file() else {}
-        if metrics and not all(isinstance(metrics.get(name), (int, float)) for name in ("psnr", "ssim")):
-            raise ValueError("psnr, ssim: expected numbers")
+        for name in ("psnr", "ssim"):
+            if not isinstance(metrics.get(name, 0.0), (int, float)):
+                raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
         return metrics
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the metrics of a nexwarp run ({error})") from None

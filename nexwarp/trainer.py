@@ -84,7 +84,8 @@ class Trainer:
         self.order: list[int] = []
         self.points: dict[int, torch.Tensor] = {}
         self.views = _Views(scene.train, self.device)
-        self.background = mean_colour(scene.train) if config.background is None else config.background
+        self.background = config.background or scene.background or mean_colour(scene.train)
+        self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
         self.loss_log, self.checked = LossLog(), 0
         self.good: tuple[dict[str, torch.Tensor], dict[str, Any]] | None = None
@@ -191,21 +192,17 @@ class Trainer:
         self.iteration += 1
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
-        index = self._next_view()
-        camera, target = self.views.get(index, 2 if coarse else 1)
+        view = self._view(self._next_view(), 2 if coarse else 1)
         self._schedule_rates()
-        inside = None
         if config.border > 0 and self.iteration % config.border_every == 0:
-            camera, target, inside = self._beyond_the_frame(camera, target)
-        out = render(self.surfels, self.texture if config.max_hits else None, camera, **self.render_options())
-        losses = self._losses(out, target, inside)
-        points = self._points(index)
-        if points is not None:
-            losses["depth"] = config.losses.depth * depth_loss(out.depths, out.weights, *camera.project(points))
+            view = self._beyond_the_frame(view)
+        options = self.render_options() | {"background": view.background}
+        out = render(self.surfels, self.texture if config.max_hits else None, view.camera, **options)
+        losses = self._losses(out, view)
         watch = None
         if self.densifier.active(self.iteration):
-            errors = (out.image.detach() - target).abs().mean(dim=-1)
-            watch = out.watch_error(errors if inside is None else errors * inside)
+            errors = (out.image.detach() - view.photo).abs().mean(dim=-1)
+            watch = out.watch_error(errors if view.counts is None else errors * view.counts)
         sum(losses.values()).backward()
         if watch is not None:
             self.densifier.accumulate(watch.sums)
@@ -213,7 +210,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
-        return Progress(self.iteration, len(self.surfels), losses, out.image, target)
+        return Progress(self.iteration, len(self.surfels), losses, out.image, view.photo)
 
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments of `nexwarp.render` at this point of the run."""
@@ -227,32 +224,51 @@ class Trainer:
             "clamp_texture": config.clamp_texture,
         }
 
-    def _beyond_the_frame(self, camera: Camera, photo: torch.Tensor) -> tuple[Camera, torch.Tensor, torch.Tensor]:
+    def _view(self, index: int, factor: int) -> "_Target":
+        """What a step is to show, from view `index` reduced by `factor`."""
+        camera, photo = self.views.get(index, factor, self.order[:-3:-1])
+        background: Any = self.background
+        if self.scene.random_background:
+            background = torch.rand(3, generator=self.generator).to(self.device, non_blocking=True)
+            alpha = self.views.alpha(index, factor)
+            if alpha is not None:
+                photo = photo + (1 - alpha)[..., None] * (background - self.behind)
+        mask = self.views.mask(index, factor)
+        if mask is None or self.config.mask_mode == "ignore":
+            return _Target(index, camera, photo, background, counts=mask)
+        behind = background if isinstance(background, torch.Tensor) else self.behind
+        return _Target(index, camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
+
+    def _beyond_the_frame(self, view: "_Target") -> "_Target":
         """Shift the window at random; where it leaves the photo, the photo's edge goes on.
 
         What no photo shows would otherwise be left to chance, and every test view shows some of it at its edges.
-
-        Returns:
-            Camera, target and where it is the photo's own (H, W).
         """
+        camera, device = view.camera, self.device
         sizes = (camera.height, camera.width)
         shifts = (2 * torch.rand(2, generator=self.generator) - 1) * self.config.border * torch.tensor(sizes)
         top, left = (round(x) for x in shifts.tolist())
-        rows, columns = (
-            torch.arange(first, first + size, device=self.device)
-            for first, size in zip((top, left), sizes, strict=True)
+        rows = torch.arange(top, top + sizes[0], device=device)
+        columns = torch.arange(left, left + sizes[1], device=device)
+        inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))
+        rows, columns = rows.clamp(0, sizes[0] - 1)[:, None], columns.clamp(0, sizes[1] - 1)
+        known = None if view.counts is None else view.counts[rows, columns]
+        return dataclasses.replace(
+            view,
+            camera=camera.crop(left, top, camera.width, camera.height),
+            photo=view.photo[rows, columns],
+            counts=inside if known is None else inside & known,
+            empty=None if view.empty is None else view.empty[rows, columns],
+            beyond=~inside if known is None else ~inside & known,
         )
-        inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))[None]
-        target = photo[rows.clamp(0, sizes[0] - 1)][:, columns.clamp(0, sizes[1] - 1)]
-        return camera.crop(left, top, camera.width, camera.height), target, inside
 
     def _points(self, index: int) -> torch.Tensor | None:
         """Points (M, 3) that a view's depths are compared with; None when there are none, or nobody asks."""
-        seen = getattr(self.scene.train[index], "seen", None)
-        if self.config.losses.depth == 0 or self.config.max_hits == 0 or seen is None or len(seen) == 0:
+        points = self.scene.train[index].points
+        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None or len(points) == 0:
             return None
         if index not in self.points:
-            self.points[index] = self.scene.points[seen.long()].to(self.device)
+            self.points[index] = points.to(self.device)
         return self.points[index]
 
     def model(self) -> Model:
@@ -392,21 +408,27 @@ class Trainer:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
-    def _losses(self, out: Rendering, target: torch.Tensor, inside: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        textured = self.config.max_hits > 0
+    def _losses(self, out: Rendering, view: "_Target") -> dict[str, torch.Tensor]:
+        textured, factors = self.config.max_hits > 0, self.config.losses
         losses = training_losses(
             image=out.image.clamp(0, 1) if self.config.clamp_image else out.image,
             textured=out.textured,
             weights=out.weights,
-            target=target,
+            target=view.photo,
             opacities=self.surfels.opacities,
             grid=self.texture.grid if textured else None,
             resolutions=self.texture.resolutions if textured else None,
-            loss_weights=self.config.losses,
-            mask=inside,
+            loss_weights=factors,
+            mask=view.counts,
+            empty=view.empty,
         )
-        if inside is not None and self.config.losses.border > 0:
-            losses["border"] = self.config.losses.border * border_loss(out.image, target, inside)
+        if view.beyond is not None and factors.border > 0:
+            losses["border"] = factors.border * border_loss(out.image, view.photo, view.beyond)
+        if view.empty is not None and factors.empty > 0:
+            losses["empty"] = factors.empty * (out.alpha * view.empty).mean()
+        points = self._points(view.index)
+        if points is not None:
+            losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, *view.camera.project(points))
         return losses
 
     def _schedule_rates(self) -> None:
@@ -415,6 +437,29 @@ class Trainer:
             first, last = group["ends"]
             rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
             group["lr"] = self.rate_factor * rate
+
+
+@dataclass(frozen=True)
+class _Target:
+    """What a step is to show.
+
+    Attributes:
+        index: of the training view.
+        camera: to render with.
+        photo: (H, W, 3) float, what to compare with.
+        background: as `render` takes it.
+        counts: (H, W) bool, where the photo counts; None is everywhere.
+        empty: (H, W) bool, where there is nothing but the background; None is nowhere.
+        beyond: (H, W) bool, what lies beyond the photo's frame; None is nothing.
+    """
+
+    index: int
+    camera: Camera
+    photo: torch.Tensor
+    background: Any
+    counts: torch.Tensor | None = None
+    empty: torch.Tensor | None = None
+    beyond: torch.Tensor | None = None
 
 
 class _Views:

@@ -229,3 +229,79 @@ def test_wrong_inputs_name_the_argument() -> None:
         LossWeights(dssim=1.5)
     with pytest.raises(ValueError, match="grid: expected at least 0, got -1"):
         LossWeights(grid=-1)
+
+
+# What does not count, what is empty, what lies beyond the frame, and depths
+
+
+def scene_of_losses() -> dict[str, torch.Tensor]:
+    """Inputs of `training_losses`; leaves but for the target."""
+    image, target = images()
+    shape = image.shape[:2]
+    leaves = {"image": image, "textured": 0.6 * image, "weights": torch.rand(*shape, 2, dtype=torch.float64)}
+    return {name: x.clone().requires_grad_() for name, x in leaves.items()} | {"target": target}
+
+
+def terms_of(tensors: dict[str, torch.Tensor], **options: torch.Tensor) -> dict[str, torch.Tensor]:
+    factors = LossWeights(opacity=0.0, grid=0.0)
+    rest = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
+    return losses.training_losses(**tensors, **rest, loss_weights=factors, **options)
+
+
+def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
+    tensors = scene_of_losses()
+    mask = torch.rand(13, 17) < 0.7
+    terms = terms_of(tensors, mask=mask)
+    sum(terms.values()).backward()
+    for name in ("image", "textured", "weights"):
+        gradient = tensors[name].grad
+        assert not gradient[~mask].any() and gradient[mask].any(), name
+    spoilt = {name: torch.where(mask[..., None], x, 0.1 * x) for name, x in tensors.items() if name != "weights"}
+    again = terms_of({**tensors, **spoilt, "target": tensors["target"]}, mask=mask)
+    for name in ("l1", "dssim", "texture"):
+        assert_close(again[name], terms[name], kind="value", name=name)
+
+
+def test_a_mask_that_is_true_everywhere_changes_nothing() -> None:
+    tensors = scene_of_losses()
+    plain, masked = terms_of(tensors), terms_of(tensors, mask=torch.ones(13, 17, dtype=torch.bool))
+    for name, term in plain.items():
+        assert_close(masked[name], term, kind="value", name=name)
+
+
+def test_where_nothing_is_only_the_image_counts() -> None:
+    tensors = scene_of_losses()
+    empty = torch.rand(13, 17) < 0.4
+    terms = terms_of(tensors, empty=empty)
+    expected = terms_of(tensors)
+    for name in ("l1", "dssim"):
+        assert_close(terms[name], expected[name], kind="value", name=name)
+    sum(terms.values()).backward()
+    for name in ("textured", "weights"):
+        assert not tensors[name].grad[empty].any() and tensors[name].grad[~empty].any(), name
+
+
+def test_border_loss_by_hand() -> None:
+    image, target = torch.full((2, 4, 3), 0.5), torch.full((2, 4, 3), 0.2)
+    beyond = torch.zeros(2, 4, dtype=torch.bool)
+    beyond[:, 3] = True
+    assert losses.border_loss(image, target, beyond).item() == pytest.approx(0.3 * 2 / 8)
+
+
+def test_depth_loss_by_hand() -> None:
+    """Two slots of weights 0.3 and 0.1 at depths 2 and 4: 2.5 in the mean; what is outside or behind gives 0."""
+    depths, weights = torch.zeros(3, 4, 2), torch.zeros(3, 4, 2)
+    depths[1, 2], weights[1, 2] = torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1])
+    pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [float("nan"), 1.0], [2.5, 1.5]])
+    expected = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0])
+    assert losses.depth_loss(depths, weights, pixels, expected).item() == pytest.approx(0.25 / 5, abs=1e-5)
+    untouched = losses.depth_loss(depths, weights, torch.tensor([[0.5, 0.5]]), torch.tensor([3.0]))
+    assert untouched.item() == pytest.approx(1.0)
+
+
+def test_depth_loss_against_finite_differences() -> None:
+    depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    pixels = torch.tensor([[0.5, 0.5], [3.2, 2.8], [1.5, 9.0], [0.7, 0.2]], dtype=torch.float64)
+    expected = torch.tensor([1.5, 4.0, 2.0, 3.9], dtype=torch.float64)
+    assert gradcheck(lambda d, w: losses.depth_loss(d, w, pixels, expected), [depths, weights])

@@ -156,3 +156,72 @@ def test_lpips_is_left_out_when_the_weights_do_not_come(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=offline))
     with pytest.warns(RuntimeWarning, match="no network"):
         assert metrics.lpips_vgg(torch.zeros(8, 9, 3), torch.zeros(8, 9, 3)) is None
+
+
+# Masks, and FLIP
+
+
+def test_a_mask_leaves_the_rest_out() -> None:
+    image, target = images()
+    mask = torch.zeros(48, 61, dtype=torch.bool)
+    mask[10:30, 20:50] = True
+    spoilt = torch.where(mask[..., None], image, 255 - image)
+    assert metrics.psnr(spoilt, target, mask) == metrics.psnr(image[10:30, 20:50], target[10:30, 20:50])
+    assert metrics.psnr(spoilt, target) < metrics.psnr(spoilt, target, mask) - 5
+    assert metrics.ssim(spoilt, target, mask) == metrics.ssim(image, target, mask)
+    inner = metrics.ssim_map(torch.where(mask[..., None], image, target), target)[10:30, 20:50]
+    assert metrics.ssim(image, target, mask) == pytest.approx(inner.mean().item(), abs=1e-6)
+    everywhere = torch.ones_like(mask)
+    assert metrics.psnr(image, target, everywhere) == pytest.approx(metrics.psnr(image, target), abs=1e-9)
+    assert metrics.ssim(image, target, everywhere) == pytest.approx(metrics.ssim(image, target), abs=1e-9)
+
+
+@pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
+def test_masks_that_do_not_fit_are_refused(metric: Callable[..., float]) -> None:
+    image, target = images()
+    with pytest.raises(ValueError, match=r"^mask: expected bool of shape \(48, 61\), got torch.uint8 of shape"):
+        metric(image, target, torch.ones(48, 61, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"^mask: expected pixels that count, got none$"):
+        metric(image, target, torch.zeros(48, 61, dtype=torch.bool))
+
+
+def hunt_lab(red: float, green: float, blue: float) -> tuple[float, float, float]:
+    """CIE L*a*b* of a linear sRGB colour, its chroma dimmed with its lightness (Hunt)."""
+    xyz = (
+        0.4124564 * red + 0.3575761 * green + 0.1804375 * blue,
+        0.2126729 * red + 0.7151522 * green + 0.0721750 * blue,
+        0.0193339 * red + 0.1191920 * green + 0.9503041 * blue,
+    )
+    white = (0.950428545, 1.0, 1.088900371)
+    x, y, z = (
+        (v / w) ** (1 / 3) if v / w > 0.008856 else 7.787 * v / w + 4 / 29 for v, w in zip(xyz, white, strict=True)
+    )
+    lightness = 116 * y - 16
+    return lightness, 0.01 * lightness * 500 * (x - y), 0.01 * lightness * 200 * (y - z)
+
+
+def test_flip_of_black_and_white_by_hand() -> None:
+    """Constant pictures have no edges: only the colour difference counts (FLIP paper, Sec. 4.1)."""
+    black, white = torch.zeros(40, 50, 3), torch.ones(40, 50, 3)
+
+    def distance(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+        return (abs(a[0] - b[0]) + math.hypot(a[1] - b[1], a[2] - b[2])) ** 0.7
+
+    largest = distance(hunt_lab(0, 1, 0), hunt_lab(0, 0, 1))
+    between = distance(hunt_lab(0, 0, 0), hunt_lab(1, 1, 1))
+    expected = 0.95 + 0.05 * (between - 0.4 * largest) / (0.6 * largest)
+    assert metrics.flip(black, white) == pytest.approx(expected, abs=1e-4)
+    assert metrics.flip(white, black) == pytest.approx(expected, abs=1e-4)
+    assert metrics.flip(white, white) == 0.0
+
+
+def test_flip_sees_what_the_eye_would() -> None:
+    image, target = images()
+    slight = (target.float() + 2).clamp(0, 255).byte()
+    assert 0 < metrics.flip(slight, target) < metrics.flip(image, target) < 1
+
+
+def test_flip_is_left_out_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.warns(RuntimeWarning, match=r"^FLIP is left out: .*nexwarp\[flip\]"):
+        assert metrics.flip(*images()) is None

@@ -145,7 +145,8 @@ def test_a_checkpoint_that_does_not_fit_is_refused(scene, tmp_path, damage):
 
 
 def test_it_learns(scene):
-    trainer = Trainer(scene, small(iterations=80, max_surfels=400), "cpu")
+    # On black: on the photos' mean colour a run starts with less to learn.
+    trainer = Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
     before, losses = mean_psnr(trainer, scene.train), []
     trainer.run(lambda progress: losses.append(progress.loss()))
     epoch = len(scene.train)
@@ -164,7 +165,9 @@ def test_progress_tells_what_happened(scene):
         assert p.loss() == pytest.approx(sum(x.item() for x in p.losses.values()), rel=1e-6)
         error = (p.image.detach().double().clamp(0, 1) - p.target.double()).square().mean().item()
         assert p.psnr() == pytest.approx(-10 * math.log10(error), abs=1e-4)
-    assert set(seen[0].losses) == {"l1", "dssim", "texture", "alpha", "opacity", "grid"}
+    always = {"l1", "dssim", "texture", "alpha", "opacity", "grid", "depth"}
+    for p in seen:
+        assert set(p.losses) == always | ({"border"} if p.iteration % 4 == 0 else set())
     counts = [p.surfels for p in seen]
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
     assert counts[2] == 63 == int(1.05 * counts[0])
@@ -241,7 +244,7 @@ def test_rounds_stretch_with_the_run(scene, iterations, rounds):
 
 
 def test_views_are_drawn_without_replacement(scene):
-    trainer, drawn = Trainer(scene, small(iterations=24), "cpu"), []
+    trainer, drawn = Trainer(scene, small(iterations=24, border=0.0), "cpu"), []
     photos = [view.image.float() / 255 for view in scene.train]
 
     def note(progress: Any) -> None:
@@ -263,7 +266,8 @@ def test_paper_is_the_paper():
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
     assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
     assert p.coarse == 0.0
-    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01)
+    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
+    assert (p.border, p.mask_mode) == (0.0, "ignore")
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
         quats=1e-3,
@@ -283,6 +287,9 @@ def test_paper_is_the_paper():
         max_resolution=256.0,
         width=64,
         hidden_layers=2,
+        sh_degree=None,
+        residual=False,
+        down_weighting=True,
     )
     assert p.densify == DensifyConfig(
         start=500, stop=25_000, every=100, fraction=0.05, prune_opacity=0.005, prune_at_cap=False
@@ -293,6 +300,7 @@ def test_default_prunes_at_the_cap_and_filters_points():
     p = preset("default")
     assert p == Config() and p.densify.prune_at_cap and p.filter_points and not p.clamp_image
     assert p.texture.min_resolution is None and p.texture.max_resolution is None
+    assert p.texture.residual and p.background is None and p.border > 0 and p.losses.depth > 0
 
 
 def test_unknown_preset_is_refused():
@@ -353,7 +361,8 @@ def rescaled(scene: Scene, factor: float) -> Scene:
         c = view.camera
         viewmat = c.viewmat.clone()
         viewmat[:3, 3] *= factor
-        return dataclasses.replace(view, camera=nw.Camera(viewmat, c.K, c.width, c.height, near=c.near * factor))
+        camera = nw.Camera(viewmat, c.K, c.width, c.height, near=c.near * factor)
+        return dataclasses.replace(view, camera=camera, points=view.points * factor)
 
     return dataclasses.replace(
         scene,
@@ -390,7 +399,7 @@ def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
 
 def test_given_resolutions_are_kept(scene):
     config = small(texture=dataclasses.replace(TEXTURE, min_resolution=3.0, max_resolution=50.0))
-    assert texture_shape(scene, config) == dataclasses.asdict(config.texture)
+    assert texture_shape(scene, config) == dataclasses.asdict(config.texture) | {"sh_degree": 3}
 
 
 def directions(count: int) -> torch.Tensor:

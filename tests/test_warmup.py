@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from nexwarp import cli, warmup
-from nexwarp.config import PRESETS, Config
+from nexwarp.config import PRESETS, Config, TextureConfig
 from nexwarp.data import write_demo
 from nexwarp.densify import Densifier
 from nexwarp.kernels import launch as launching
@@ -100,7 +100,7 @@ SETTINGS = {
     **PRESETS,
     "no texture": Config(max_hits=0),
     "K = 3": Config(max_hits=3),
-    "options": Config(low_pass=True, clamp_texture=True, sh_degree=1),
+    "options": Config(low_pass=True, clamp_texture=True, sh_degree=1, texture=TextureConfig(residual=False)),
 }
 
 

@@ -19,6 +19,7 @@ class Photo:
         lens: the camera as it took the photo, whose size may differ from the file's by a factor.
         mask: the mask's file where the scene names it.
         face: which face of a panorama this is, see `nexwarp.data.lens.FACES`.
+        points: (M, 3) float32 world positions of the points that were triangulated from it; None when unknown.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Photo:
     lens: Lens
     mask: Path | None = None
     face: str | None = None
+    points: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

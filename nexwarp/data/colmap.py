@@ -67,8 +67,9 @@ def read_model(path: Path, images: Path) -> Capture:
     registered = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
     if not registered:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
-    photos = sorted((_photo(image, folder, images) for image in registered), key=lambda photo: photo.name)
-    return Capture(folder, photos, _points(reconstruction, folder))
+    cloud, seen = _points(reconstruction, folder), _seen(reconstruction)
+    photos = [_photo(image, folder, images, seen.get(image.image_id, {})) for image in registered]
+    return Capture(folder, sorted(photos, key=lambda photo: photo.name), cloud)
 
 
 def _check_cameras_size(path: Path, cameras: Any) -> None:
@@ -78,7 +79,7 @@ def _check_cameras_size(path: Path, cameras: Any) -> None:
         raise ValueError(f"{path}: truncated, expected {expected} bytes, got {path.stat().st_size}")
 
 
-def _photo(image: Any, folder: Path, images: Path) -> Photo:
+def _photo(image: Any, folder: Path, images: Path, seen: dict[int, np.ndarray]) -> Photo:
     try:
         name, camera = image.name, image.camera
     except UnicodeDecodeError as error:
@@ -91,7 +92,17 @@ def _photo(image: Any, folder: Path, images: Path) -> Photo:
         lens = Lens(camera.model.name, tuple(map(float, camera.params)), int(camera.width), int(camera.height))
     except ValueError as error:
         raise ValueError(f"{folder}: {name}: the COLMAP camera of this image is not usable: {error}") from error
-    return Photo(name, images / name, viewmat, lens)
+    points = np.array(list(seen.values()), dtype=np.float32).reshape(-1, 3)
+    return Photo(name, images / name, viewmat, lens, points=points)
+
+
+def _seen(reconstruction: Any) -> dict[int, dict[int, np.ndarray]]:
+    """Image id -> id -> position of the points that were triangulated from it, by ascending id."""
+    seen: dict[int, dict[int, np.ndarray]] = {}
+    for index, point in sorted(reconstruction.points3D.items()):
+        for element in point.track.elements:
+            seen.setdefault(element.image_id, {})[index] = point.xyz
+    return seen
 
 
 def _points(reconstruction: Any, folder: Path) -> Cloud | None:

@@ -40,6 +40,8 @@ class View:
         alpha: (H, W) uint8, 255 where the photo is opaque; None when all of it is, or when the scene has no
             background for transparent photos. On another background B the photo is
             image + (1 - alpha / 255) (B - background), in sRGB.
+        points: (M, 3) float32 world positions of the sparse points that were triangulated from the photo; None when
+            unknown. They may lie outside the image where a lens was undistorted.
     """
 
     camera: Camera
@@ -47,6 +49,7 @@ class View:
     mask: torch.Tensor | None
     name: str
     alpha: torch.Tensor | None = None
+    points: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ class ViewReader:
             )
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
-        return View(camera, image, mask, photo.name, alpha)
+        points = None if photo.points is None else torch.from_numpy(photo.points)
+        return View(camera, image, mask, photo.name, alpha, points)
 
     def _pixels(self, job: Job, maps: Maps | None) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         """Image, alpha and mask, reduced; by way of a map where the lens needs one."""

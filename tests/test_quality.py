@@ -1,0 +1,119 @@
+"""The quality benchmark: its scenes, its results and its tables; one training from end to end."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks import quality
+from benchmarks.quality import ARC, GSPLAT, ROWS, Job, arc, jobs_of, markdown, moved, read_results
+from nexwarp.config import preset, with_settings
+from nexwarp.data import Scene
+from nexwarp.data.demo import write_demo
+from tests.tolerances import assert_close
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scenes")
+    write_demo(path / "tiny", width=48, height=36, views=12, points=200)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    return nw.load_scene(folder / "tiny")
+
+
+def test_every_row_is_a_setting() -> None:
+    for row in ROWS.values():
+        if row.preset is not None:
+            config = with_settings(preset(row.preset), row.settings)
+            assert (config != preset(row.preset)) == bool(row.settings), row.name
+
+
+@pytest.mark.parametrize("table", quality.TABLES)
+def test_tables_are_made_of_known_rows(table: str) -> None:
+    jobs = list(jobs_of(table, ("fox", "saharov"), (0, 1), 100, 40))
+    assert len(jobs) == len(set(jobs)) > 0
+    assert all(job.row in ROWS and job.iterations == 100 for job in jobs)
+    assert {job.seed for job in jobs} == {0, 1}
+    assert all(job.variant in ("", *quality.VARIANTS) for job in jobs)
+
+
+def test_arc_holds_out_neighbours(scene: Scene) -> None:
+    names = sorted(view.name for view in (*scene.train, *scene.test))
+    part = arc(scene)
+    held = [view.name for view in part.test]
+    start = names.index(held[0])
+    assert held == names[start : start + ARC]
+    assert sorted(view.name for view in part.train) == [name for name in names if name not in held]
+
+
+def test_moved_scenes_look_the_same(scene: Scene) -> None:
+    """Every point falls on the same pixel, its depth scaled."""
+    other = moved(scene, factor=100.0, shift=(30.0, -20.0, 10.0))
+    assert other.scale == pytest.approx(100 * scene.scale)
+    for one, two in zip(scene.train, other.train, strict=True):
+        pixels, depths = one.camera.project(scene.points.double().to(one.camera.K.dtype))
+        again, scaled = two.camera.project(other.points)
+        assert (pixels - again).abs().max() < 0.01
+        assert_close(scaled / 100, depths, kind="gradient", name="depths")
+        assert two.camera.near == pytest.approx(100 * one.camera.near)
+        seen, _ = two.camera.project(two.points)
+        assert (seen - one.camera.project(one.points)[0]).abs().max() < 0.01
+
+
+def result(row: str, seed: int, **figures: float) -> dict:
+    job = dataclasses.asdict(Job("fox", "", row, 40, seed, 100))
+    figures = {"psnr": 30.0, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0, "seconds": 5.0} | figures
+    return job | figures | {"jobs": 1, "peak_mib": 100}
+
+
+def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
+    lines = [
+        result("default", 0, psnr=30.0),
+        result("default", 1, psnr=99.0),
+        result("default", 1, psnr=31.0),  # done again: the later one counts
+        result(GSPLAT, 0, psnr=33.0, jobs=4),
+    ]
+    file = tmp_path / "results.jsonl"
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    results = read_results([file, tmp_path / "absent.jsonl"])
+    assert len(results) == 3
+    text = markdown(results)
+    rows = [line for line in text.splitlines() if line.startswith(("| default", f"| {GSPLAT}"))]
+    assert rows[0].startswith(f"| {GSPLAT} | 33.00 |")
+    assert (
+        rows[1]
+        == "| default | 30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  | 2.0 +- 0.0 | 5 +- 0 | 100 +- 0 | 2 |"
+    )
+    assert "## fox, 40 primitives, 100 iterations" in text
+
+
+def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    threads = torch.get_num_threads()
+    settings = {"texture.levels": 4, "texture.table_size": 1024}
+    command = ["train", "--row", f"mine:default:{json.dumps(settings)}", "--scenes", "tiny", "--seeds", "0"]
+    command += ["--size", "60", "--iterations", "4", "--data", str(folder), "--out", str(tmp_path / "out.jsonl")]
+    command += ["--pictures", str(tmp_path / "pictures"), "--models", str(tmp_path / "models")]
+    assert quality.main(command) == 0
+    (line,) = (tmp_path / "out.jsonl").read_text().splitlines()
+    found = json.loads(line)
+    assert (found["scene"], found["row"], found["settings"]) == ("tiny", "mine", settings)
+    assert set(found["views"]) == {view.name for view in nw.load_scene(folder / "tiny").test}
+    mean = sum(view["psnr"] for view in found["views"].values()) / len(found["views"])
+    assert found["psnr"] == pytest.approx(mean) and found["primitives"] <= 60 and found["flip"] > 0
+    assert len(list((tmp_path / "pictures").iterdir())) == len(found["views"])
+    (model,) = (tmp_path / "models").glob("*/model.safetensors")
+    assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
+    assert nw.load(model).texture.residual
+    assert quality.main(command) == 0
+    assert "0 of 1 trainings to do" in capsys.readouterr().out
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 1
+    assert quality.main(["table", str(tmp_path / "out.jsonl"), "--out", str(tmp_path / "table.md")]) == 0
+    assert "| mine |" in (tmp_path / "table.md").read_text()
+    torch.set_num_threads(threads)

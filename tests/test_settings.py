@@ -1,0 +1,235 @@
+"""Settings by name, and what training makes of masks, backgrounds and the frame's edge."""
+
+import dataclasses
+import re
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.config import Config, TextureConfig, with_settings
+from nexwarp.data import Scene, View
+from nexwarp.data.demo import write_demo
+from nexwarp.evaluate import evaluate
+from nexwarp.trainer import Trainer, mean_colour
+from tests.tolerances import assert_close
+
+TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("tiny") / "tiny"
+    return nw.load_scene(write_demo(folder, width=48, height=36, views=10, points=200))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """Tensors are tiny here, and torch's threads would wait for each other on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def make_trainer(scene: Scene, **settings) -> Trainer:
+    values = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
+    return Trainer(scene, Config(**values), "cpu")
+
+
+# Settings by name
+
+
+def test_settings_reach_into_parts() -> None:
+    config = with_settings(Config(), {"max_hits": 3, "texture.residual": False, "rates.mlp": [1e-3, 1e-3]})
+    expected = dataclasses.replace(
+        Config(),
+        max_hits=3,
+        texture=dataclasses.replace(Config().texture, residual=False),
+        rates=dataclasses.replace(Config().rates, mlp=(1e-3, 1e-3)),
+    )
+    assert config == expected
+    assert Config.from_dict(config.as_dict()) == config
+
+
+@pytest.mark.parametrize("name", ["texture.residul", "texture.levels.x", "colour", "seed.x", "losses.", ".residual"])
+def test_unknown_settings_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{re.escape(name)}: expected a setting, one of "):
+        with_settings(Config(), {name: 3})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
+        ({"border": 0.7}, "border: expected at least 0 and at most 0.5, got 0.7"),
+        ({"clamp_texture": True}, "clamp_texture: expected False with texture.residual, got True"),
+        ({"losses.depth": -1.0}, "depth: expected at least 0, got -1.0"),
+    ],
+)
+def test_values_out_of_range_are_refused(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        with_settings(Config(), settings)
+
+
+# The camera of a window
+
+
+def test_a_window_sees_what_the_camera_sees_there(scene: Scene) -> None:
+    camera = scene.train[0].camera
+    window = camera.crop(5, -3, 20, 30)
+    assert (window.width, window.height, window.near) == (20, 30, camera.near)
+    pixels, depths = camera.project(scene.points)
+    shifted, same = window.project(scene.points)
+    assert_close(shifted, pixels - torch.tensor([5.0, -3.0]), kind="value", name="pixels")
+    assert torch.equal(depths, same)
+    again = nw.Camera(window.viewmat, window.K, 20, 30, camera.near)
+    assert (again.cx, again.cy, again.fx) == pytest.approx((window.cx, window.cy, window.fx))
+    assert camera.crop(0, 0, camera.width, camera.height).cx == camera.cx
+
+
+# Beyond the frame
+
+
+def test_beyond_the_frame_the_photos_edge_goes_on(scene: Scene) -> None:
+    trainer = make_trainer(scene, border=0.25)
+    for _ in range(20):
+        view = trainer._view(0, 1)
+        shifted = trainer._beyond_the_frame(view)
+        left = round(view.camera.cx - shifted.camera.cx)
+        top = round(view.camera.cy - shifted.camera.cy)
+        assert abs(left) <= 12 and abs(top) <= 9
+        for row in (0, 17, 35):
+            for column in (0, 20, 47):
+                r, c = row + top, column + left
+                inside = 0 <= r < 36 and 0 <= c < 48
+                expected = view.photo[min(max(r, 0), 35), min(max(c, 0), 47)]
+                assert torch.equal(shifted.photo[row, column], expected)
+                assert bool(shifted.counts[row, column]) == inside
+                assert bool(shifted.beyond[row, column]) != inside
+
+
+def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
+    mask = torch.ones(36, 48, dtype=torch.bool)
+    mask[:, 40:] = False
+    hidden = dataclasses.replace(scene, train=[dataclasses.replace(v, mask=mask) for v in scene.train])
+    trainer = make_trainer(hidden, border=0.25)
+    for _ in range(10):
+        shifted = trainer._beyond_the_frame(trainer._view(0, 1))
+        left = round(scene.train[0].camera.cx - shifted.camera.cx)
+        column = 47 - max(left, 0)  # shows the photo's last column
+        if left <= 0:
+            continue
+        assert not shifted.beyond[:, column + 1 :].any() and not shifted.counts[:, column:].any()
+
+
+# Backgrounds
+
+
+def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
+    photos = torch.stack([view.image for view in scene.train]).double() / 255
+    assert mean_colour(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
+    assert make_trainer(scene).render_options()["background"] == mean_colour(scene.train)
+    black = make_trainer(scene, background=(0.0, 0.0, 0.0))
+    assert black.render_options()["background"] == (0.0, 0.0, 0.0)
+    white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
+    assert make_trainer(white).render_options()["background"] == (1.0, 1.0, 1.0)
+
+
+def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
+    alpha = torch.full((36, 48), 255, dtype=torch.uint8)
+    alpha[:10] = 51
+    views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
+    random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
+    trainer = make_trainer(random)
+    seen = [trainer._view(0, 1) for _ in range(3)]
+    assert len({tuple(view.background.tolist()) for view in seen}) == 3
+    photo = views[0].image.float() / 255
+    for view in seen:
+        expected = photo[:10] + 0.8 * (view.background - 1.0)
+        assert_close(view.photo[:10], expected, kind="value", name="transparent")
+        assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
+    assert trainer.render_options()["background"] == (1.0, 1.0, 1.0)
+
+
+# Masks
+
+SQUARE = slice(10, 26), slice(14, 34)
+
+
+def with_intruder(scene: Scene, masked: bool) -> Scene:
+    """A red square before every training photo, and masks that leave it out."""
+    mask = torch.ones(36, 48, dtype=torch.bool)
+    mask[SQUARE] = False
+
+    def spoilt(view: View) -> View:
+        image = view.image.clone()
+        image[SQUARE] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+        return dataclasses.replace(view, image=image, mask=mask if masked else None)
+
+    return dataclasses.replace(scene, train=[spoilt(view) for view in scene.train])
+
+
+def redness(trainer: Trainer) -> float:
+    """How much redder than their photos the test views are, in the middle, 0 to 1."""
+    views = trainer.scene.test
+    with torch.no_grad():
+        images = [
+            nw.render(trainer.surfels, trainer.texture, v.camera, **trainer.render_options()).image for v in views
+        ]
+    pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
+    return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
+
+
+@pytest.mark.timeout(120)
+def test_what_masks_leave_out_does_not_appear(scene: Scene) -> None:
+    """An intruder that moves with the camera, before every photo; learnt without masks, left out with them."""
+    settings = {"iterations": 100, "max_surfels": 400}
+    results = []
+    for masked in (False, True):
+        trainer = make_trainer(with_intruder(scene, masked), **settings)
+        trainer.run()
+        results.append(redness(trainer))
+    without, with_masks = results
+    assert without > 0.08
+    assert abs(with_masks) < 0.2 * without
+
+
+def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    views = [dataclasses.replace(view, mask=mask) for view in scene.train]
+    halves = dataclasses.replace(scene, train=views)
+    alphas = {}
+    for mode in ("ignore", "background"):
+        trainer = make_trainer(halves, iterations=60, mask_mode=mode, border=0.0)
+        trainer.run()
+        with torch.no_grad():
+            view = trainer._view(0, 1)
+            options = trainer.render_options()
+            outs = [nw.render(trainer.surfels, trainer.texture, v.camera, **options) for v in scene.train]
+        alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
+        if mode == "background":
+            assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
+            assert view.counts is None and torch.equal(view.empty, ~mask)
+    assert alphas["background"] < 0.75 * alphas["ignore"]
+
+
+def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
+    trainer = make_trainer(scene)
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    view = dataclasses.replace(scene.test[0], mask=mask)
+    spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
+    options = trainer.render_options()
+
+    def judge(*views: View, mode: str = "ignore") -> dict:
+        metrics = ("psnr", "ssim", "flip")
+        return evaluate(trainer.surfels, trainer.texture, views, options=options, mask_mode=mode, metrics=metrics)
+
+    one, other = judge(view), judge(spoilt)
+    assert one["psnr"] == other["psnr"]
+    assert judge(view, mode="background")["psnr"] == judge(spoilt, mode="background")["psnr"] != one["psnr"]
+    with pytest.raises(ValueError, match=r"^metrics: expected some of psnr, ssim, flip, lpips, got 'mse'$"):
+        evaluate(trainer.surfels, trainer.texture, [view], options=options, metrics=("mse",))
