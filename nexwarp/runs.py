@@ -158,7 +158,9 @@ def read_metrics(run: Path) -> dict[str, Any]:
     """Read a run's metrics; nothing where there are none yet."""
     path = run / METRICS_FILE
     try:
-        metrics = dict(json.loads(path.read_text())) if path.is_file() else {}
+        metrics = json.loads(path.read_text()) if path.is_file() else {}
+        if not isinstance(metrics, dict):
+            raise ValueError(f"expected an object, got {type(metrics).__name__}")
         for name in ("psnr", "ssim"):
             if not isinstance(metrics.get(name, 0.0), (int, float)):
                 raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
