@@ -140,8 +140,12 @@ class Trainer:
             when, name, value = loss
             told = f"iteration {when}: the loss {name!r} is {value}"
         else:
-            told = f"iteration {since + 1} to {self.iteration}: not finite"
+            span = f"{since + 1} to " if since + 1 < self.iteration else ""
+            told = f"iteration {span}{self.iteration}: not finite"
         facts = [describe(name, tensors[name]) for name in bad]
+        if len(facts) > 1:
+            others = dict.fromkeys(name.rpartition(" ")[2] for name in bad)
+            facts[0] += f" (in all: {', '.join(others)})"
         report = {
             "iteration": self.iteration,
             "checked_before": since,
@@ -150,9 +154,7 @@ class Trainer:
             "surfels": len(self.surfels),
             "rate_factor": self.rate_factor,
         }
-        # The first names what went wrong, the others mostly what it spoilt.
-        more = f" and {len(facts) - 1} more" if len(facts) > 1 else ""
-        raise DivergedError("; ".join([told, *(f"{fact}{more}" for fact in facts[:1])]), report)
+        raise DivergedError("; ".join([told, *facts[:1]]), report)
 
     def _watched(self) -> dict[str, torch.Tensor]:
         watched: dict[str, torch.Tensor] = {}
@@ -168,12 +170,31 @@ class Trainer:
         """Return to the last good state with half the learning rates; raise when that was done before."""
         assert self.good is not None
         again = self.rate_factor < 1.0
+        fault = self._beginning(fault)
         self._restore(*self.good)
         self.rate_factor = LOWERED_RATES
         if again:
             told = f"{fault}; it had gone back and halved its learning rates before, so training gives up"
             raise DivergedError(told, fault.report | {"good_iteration": self.iteration}) from None
         warn(f"{fault}; going back to iteration {self.iteration:,} with half the learning rates")
+
+    def _beginning(self, fault: DivergedError) -> DivergedError:
+        """Repeat the steps since the last good state, looking after each: what is not finite spreads within a few.
+
+        Returns:
+            The first fault met; where it does not come again, the one given.
+        """
+        assert self.good is not None
+        until, rate_factor = self.iteration, self.rate_factor
+        self._restore(*self.good)
+        self.rate_factor = rate_factor
+        try:
+            while self.iteration < until:
+                self.loss_log.note(self.iteration + 1, self.step().losses)
+                self.check()
+        except DivergedError as first:
+            return first
+        return fault
 
     def _too_much(self, needed: str) -> str:
         camera = self.scene.train[0].camera

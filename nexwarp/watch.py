@@ -2,13 +2,12 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import torch
 
-OUT_OF_MEMORY = re.compile(
-    r"[Tt]ried to allocate ([\d.]+ ?[KMGT]?i?B(?:ytes)?|\d+ bytes)|Failed to allocate (\d+) bytes|out of memory", re.I
-)
+ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
+UNKNOWN = "more than there is"
 
 
 class LossLog:
@@ -50,19 +49,12 @@ def describe(name: str, tensor: torch.Tensor) -> str:
 
 def needed_memory(error: BaseException) -> str | None:
     """Return what an error of torch or Warp says of the memory that it did not get; None for other errors."""
-    for text in _messages(error):
-        match = OUT_OF_MEMORY.search(text)
-        if match and (isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "alloc" in text):
-            amount = match[1] or (match[2] and f"{match[2]} bytes")
-            return _readable(amount) if amount else "more than there is"
-    return "more than there is" if isinstance(error, (MemoryError, torch.OutOfMemoryError)) else None
-
-
-def _messages(error: BaseException) -> Iterator[str]:
-    seen: BaseException | None = error
-    while seen is not None:
-        yield str(seen)
-        seen = seen.__cause__ or seen.__context__
+    if not isinstance(error, (MemoryError, RuntimeError)):
+        return None
+    match = ALLOCATION.search(str(error))
+    if match is not None:
+        return _readable(match[1])
+    return UNKNOWN if isinstance(error, (MemoryError, torch.OutOfMemoryError)) else None
 
 
 def _readable(amount: str) -> str:
