@@ -1,9 +1,10 @@
 """Models and checkpoints on disk: safetensors and JSON only; every file is written aside, then renamed."""
 
+import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,21 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.files import written_aside
+from nexwarp.errors import CheckpointError, FormatError, MissingError
+from nexwarp.files import sync, write_atomically
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_finite, check_range, check_tensors
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
 FORMAT_VERSION = 1
+CHECKPOINT_VERSION = 1
 MODEL_FILE = "model.safetensors"
+# Newest first. The last one is there only while others are renamed.
+CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
 FRAME = "COLMAP world, cameras x right, y down, z forward"
+# What reading a damaged file of ours may raise.
+READ_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 RENDER_OPTIONS = ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
 
 
@@ -84,23 +91,23 @@ def load(path: str | os.PathLike[str]) -> Model:
     if path.is_dir():
         path = path / MODEL_FILE
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a run folder with a {MODEL_FILE}, or such a file")
+        raise MissingError(f"{path}: expected a run folder with a {MODEL_FILE}, or such a file")
     try:
         with safe_open(path, "pt") as file:
             header = (file.metadata() or {}).get("nexwarp")
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
+        raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
     if header is None:
-        raise ValueError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
+        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     try:
         meta = json.loads(header)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         meta = None
     if not isinstance(meta, dict):
-        raise ValueError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
+        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
     if meta.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
+        raise FormatError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
         if "footprints" in tensors:
@@ -111,9 +118,9 @@ def load(path: str | os.PathLike[str]) -> Model:
             check_finite(name, x)
         texture = NeuralTexture(**meta.pop("texture"))
         texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         reason = " ".join(str(error).split())  # torch's go over several lines
-        raise ValueError(f"{path}: the tensors do not make a model ({reason})") from None
+        raise FormatError(f"{path}: the tensors do not make a model ({reason})") from None
     return Model(surfels, texture, meta)
 
 
@@ -135,39 +142,95 @@ def _check_options(meta: dict[str, Any]) -> None:
 
 
 def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
-    """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all."""
-    from safetensors.torch import save_file
+    """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all.
 
-    folder, aside, old = run / "checkpoint", run / "checkpoint.tmp", run / "checkpoint.old"
+    The one before stays, as `run/checkpoint.old`. A kill or a power cut at any moment leaves at least one whole.
+
+    Raises:
+        OSError: it cannot be written; what was there is as it was.
+    """
+    from safetensors.torch import save
+
+    newest, old, older = (run / name for name in CHECKPOINTS)
+    aside = run / "checkpoint.tmp"
     shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir()
-    save_file({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, aside / "tensors.safetensors")
-    write_atomically(aside / "state.json", json.dumps(state).encode())
-    if folder.exists():  # else `old` is all there is, after a kill between the two renames
-        shutil.rmtree(old, ignore_errors=True)
-        folder.rename(old)
-    aside.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    try:
+        aside.mkdir()
+        content = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()})
+        write_atomically(aside / "tensors.safetensors", content)
+        record = {**state, "format_version": CHECKPOINT_VERSION, "tensors_sha256": hashlib.sha256(content).hexdigest()}
+        write_atomically(aside / "state.json", json.dumps({**record, "sha256": _digest(record)}).encode())
+        if newest.exists():  # else a kill came between the renames, and the others are all there is
+            if old.exists():
+                shutil.rmtree(older, ignore_errors=True)
+                old.rename(older)
+            newest.rename(old)
+        aside.rename(newest)
+        sync(run)
+    except BaseException:  # whatever comes next may need the room
+        shutil.rmtree(aside, ignore_errors=True)
+        raise
+    shutil.rmtree(older, ignore_errors=True)
 
 
-def load_checkpoint(run: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read what `save_checkpoint` wrote.
+def has_checkpoint(run: Path) -> bool:
+    """Whether there is a checkpoint, whole or not."""
+    return any((run / name).is_dir() for name in CHECKPOINTS)
+
+
+def load_checkpoint(
+    run: Path, warn: Callable[[str], None] = lambda _: None
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read the newest whole one of what `save_checkpoint` wrote, on the CPU.
+
+    Args:
+        run: run folder.
+        warn: is told of a damaged one that is passed over.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
-        ValueError: it is damaged.
+        ValueError: all there are are damaged, or of another version.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    damaged: list[CheckpointError] = []
+    for folder in (run / name for name in CHECKPOINTS):
+        if not folder.is_dir():
+            continue
+        try:
+            tensors, state = _read_checkpoint(folder)
+        except CheckpointError as error:
+            damaged.append(error)
+            continue
+        for error in damaged:
+            warn(f"{error}; going back to the one before it, {folder.name}")
+        return tensors, state
+    if damaged:
+        raise damaged[0]
+    raise MissingError(f"{run}: expected a checkpoint to resume from, found none")
 
-    # A kill between the two renames leaves only the older one, under its other name.
-    folder = next((f for f in (run / "checkpoint", run / "checkpoint.old") if f.is_dir()), None)
-    if folder is None:
-        raise FileNotFoundError(f"{run}: expected a checkpoint to resume from, found none")
+
+def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
     try:
-        return load_file(folder / "tensors.safetensors"), json.loads((folder / "state.json").read_text())
-    except (SafetensorError, OSError, ValueError) as error:  # bad JSON and bad UTF-8 are ValueErrors
-        raise ValueError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
+        record = json.loads((folder / "state.json").read_bytes())
+        version = record.get("format_version") if isinstance(record, dict) else None
+        if version != CHECKPOINT_VERSION:
+            raise ValueError(f"expected format version {CHECKPOINT_VERSION}, got {version}")
+        if record.pop("sha256", None) != _digest(record):
+            raise ValueError("state.json: its checksum does not agree")
+        content = (folder / "tensors.safetensors").read_bytes()
+        if hashlib.sha256(content).hexdigest() != record.pop("tensors_sha256"):
+            raise ValueError("tensors.safetensors: its checksum does not agree")
+        del record["format_version"]
+        return load(content), record
+    except (*READ_ERRORS, SafetensorError) as error:  # bad JSON and bad UTF-8 are ValueErrors
+        raise CheckpointError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    """Checksum of what JSON makes of a record, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> None:
@@ -200,17 +263,11 @@ def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
             for group, members in data.items()
         }
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: expected the run's cameras, found no such file") from None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path}: expected named cameras as JSON ({error})") from None
+        raise MissingError(f"{path}: expected the run's cameras, found no such file") from None
+    except READ_ERRORS as error:
+        raise FormatError(f"{path}: expected named cameras as JSON ({error})") from None
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write indented JSON atomically."""
     write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name and rename it, so that it is there whole or not at all."""
-    with written_aside(path) as temporary:
-        temporary.write_bytes(content)

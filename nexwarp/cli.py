@@ -3,7 +3,9 @@
 import dataclasses
 import signal
 import sys
+import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -17,9 +19,20 @@ from rich.console import Console
 
 from nexwarp import console as display
 from nexwarp import warmup
-from nexwarp.checkpoint import MODEL_FILE, Model, load, load_cameras, save_cameras, save_model, write_json
+from nexwarp.checkpoint import (
+    CHECKPOINTS,
+    MODEL_FILE,
+    Model,
+    has_checkpoint,
+    load,
+    load_cameras,
+    save_cameras,
+    save_model,
+    write_json,
+)
 from nexwarp.config import Config, parse_settings, preset, setting, with_settings
 from nexwarp.data import Scene
+from nexwarp.errors import DivergedError, NexwarpError, SceneError, SettingError, StorageError
 from nexwarp.evaluate import evaluate
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.logs import TrainingLog, check_tensorboard
@@ -29,6 +42,7 @@ from nexwarp.runs import (
     DEMO,
     METRICS_FILE,
     SceneSource,
+    check_room,
     create_run,
     keep_camera_path,
     keep_freed_memory,
@@ -36,9 +50,11 @@ from nexwarp.runs import (
     prepare_run,
     read_metrics,
     read_run,
+    tidy_run,
 )
 from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.trainer import Trainer
+from nexwarp.watch import needed_memory
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -61,7 +77,8 @@ DEMO_SETTINGS: dict[str, Any] = {
     "rates.grid": (2e-2, 2e-4),
     "rates.mlp": (3e-3, 3e-4),
 }
-CHECKPOINTS = 10
+CHECKPOINTS_A_RUN = 10
+DIVERGED_FILE = "diverged.json"
 
 
 def option(metavar: str, default: str | None = None) -> Any:
@@ -121,7 +138,9 @@ class Train:
     device: Device_ = None
     """Where to train."""
     resume: bool = False
-    """Continue the run in --run: with its settings, whatever else is given must agree with them."""
+    """Continue the run in --run, however it ended: with its settings; what else is given must agree with them."""
+    checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
+    """Iterations between checkpoints, of which the last two are kept."""
     overwrite: bool = False
     """Replace the run in --run."""
     view: bool = False
@@ -137,11 +156,13 @@ class Train:
         """Train."""
         source = self._source()
         run = self.run or Path("runs") / source.name
-        prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
-        if self.resume:
+        resume = prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
+        if self.checkpoint_every is not None and self.checkpoint_every < 1:
+            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
+        if resume:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
-        config = self._config(run)
+        config = self._config(run, resume)
         if self.tensorboard:
             check_tensorboard()
         if self.view:
@@ -149,13 +170,13 @@ class Train:
 
             check_server(self.host, self.port)
         if self.downscale < 1:
-            raise ValueError(f"--downscale: expected at least 1, got {self.downscale}")
+            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
         console.print(f"{source.name} on {_name(device)}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = source.load(progress)
-        if scene.background is not None and not self.resume:
+        if scene.background is not None and not resume:
             if "background" in parse_settings(self.settings):
-                raise ValueError("--set: background: expected --background instead: the photos are put on it, too")
+                raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
             config = dataclasses.replace(config, background=scene.background)
         size = scene.train[0].camera
         console.print(
@@ -165,14 +186,24 @@ class Train:
         if device.type == "cpu":
             keep_freed_memory()
         trainer = Trainer(scene, config, device)
-        if self.resume:
-            trainer.restore(run)
+        kept = sum((run / name).is_dir() for name in CHECKPOINTS) if resume else 0
+        # While one is written, the last two are there too.
+        check_room(run, max(4 - kept, 1) * trainer.checkpoint_size())
+        if resume:
+            tidy_run(run)
+        if resume and has_checkpoint(run):
+            trainer.restore(run, partial(_warn, console))
             console.print(f"resumed at iteration {trainer.iteration:,}")
+        elif self.resume:
+            console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
         with self._viewer(trainer, run, source.name, console) as viewer:
-            if not self.resume:
+            if not resume:
                 create_run(run, source, config, device.type)
-            _train(trainer, run, console, viewer, tensorboard=self.tensorboard)
-            _finish(trainer, scene, run, device, console)
+            _train(trainer, run, console, viewer, self.checkpoint_every, tensorboard=self.tensorboard)
+            try:
+                _finish(trainer, scene, run, device, console)
+            except OSError as error:
+                raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
             if viewer is not None:
                 viewer.finish(f"{trainer.iteration:,} iterations done")
                 _show(viewer, console)
@@ -217,27 +248,27 @@ class Train:
             ("--preset", "default", self.preset, config.preset),
         ):
             if given not in (default, expected):
-                raise ValueError(f"{flag}: expected {expected} as in the run to resume, got {given}")
+                raise SettingError(f"{flag}: expected {expected} as in the run to resume, got {given}")
         return dataclasses.replace(old, path=source.path)
 
-    def _config(self, run: Path) -> Config:
+    def _config(self, run: Path, resume: bool) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
         given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic or None}
         given = {name: value for name, value in given.items() if value is not None}
         _check_max_hits(self.max_hits)
         settings = self._settings(given)
-        if self.resume:
+        if resume:
             config = read_run(run)[1]
             for name, value in given.items():
                 if getattr(config, name) != value:
                     flag = f"--{name.replace('_', '-')}"
-                    raise ValueError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
+                    raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
             changed = _with_settings(config, settings)
             for name in settings:
                 old, new = setting(config, name), setting(changed, name)
                 if old != new:
-                    raise ValueError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
+                    raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
             return config
         base = preset(self.preset)
         if self.scene == DEMO:
@@ -415,7 +446,7 @@ class Info:
         else:
             rows["model"] = "none yet: the training has not finished"
         if metrics := read_metrics(self.run):
-            rows |= {"test PSNR": f"{metrics['psnr']:.2f} dB", "test SSIM": f"{metrics['ssim']:.4f}"}
+            rows |= _figures(metrics, [name for name in ("psnr", "ssim") if name in metrics])
         console.print(display.results_table(rows, str(self.run)))
 
 
@@ -502,7 +533,7 @@ def _with_settings(config: Config, settings: dict[str, Any]) -> Config:
 
 def _check_max_hits(max_hits: int | None) -> None:
     if max_hits is not None and not 0 <= max_hits <= MAX_HITS:
-        raise ValueError(f"--max-hits: expected 0 to {MAX_HITS}, got {max_hits}")
+        raise SettingError(f"--max-hits: expected 0 to {MAX_HITS}, got {max_hits}")
 
 
 def _show(viewer: "Viewer", console: Console) -> None:
@@ -512,26 +543,69 @@ def _show(viewer: "Viewer", console: Console) -> None:
         viewer.show()
 
 
+class _Stopped(KeyboardInterrupt):
+    """A signal that ends the program, in an orderly way."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
 def _train(
-    trainer: Trainer, run: Path, console: Console, viewer: "Viewer | None" = None, *, tensorboard: bool = False
+    trainer: Trainer,
+    run: Path,
+    console: Console,
+    viewer: "Viewer | None" = None,
+    every: int | None = None,
+    *,
+    tensorboard: bool = False,
 ) -> None:
-    """Run the loop with its display and log; keep checkpoints on the way and when interrupted."""
+    """Run the loop with its display and log; keep checkpoints on the way and when a signal asks to stop."""
     total = trainer.config.iterations
-    every = max(total // CHECKPOINTS, 1)
+    every = every or max(total // CHECKPOINTS_A_RUN, 1)
     shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
-    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, _deferred_interrupt() as interrupted:
+    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, _deferred_stop() as asked:
 
         def observe(step: Any) -> None:
             shown(step)
             log(step)
             if viewer is not None:
-                viewer.between_steps(step.iteration, partial(_describe, step), interrupted)
-            if step.iteration % every == 0 or step.iteration == total or interrupted():
-                trainer.save(run)
-            if interrupted():
-                raise KeyboardInterrupt
+                viewer.between_steps(step.iteration, partial(_describe, step), lambda: asked() is not None)
+            if step.iteration % every == 0 or step.iteration == total or asked() is not None:
+                _save(trainer, run)
+            if (number := asked()) is not None:
+                raise _Stopped(number)
 
-        trainer.run(observe)
+        try:
+            trainer.run(observe, partial(_warn, console))
+        except DivergedError as error:
+            # The trainer is in its last good state.
+            report = {"message": str(error), **error.report}
+            kept = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
+            try:
+                write_json(run / DIVERGED_FILE, report)
+                save_model(run, trainer.model())
+            except OSError as problem:
+                kept = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
+            raise DivergedError(f"{error}; {kept}", report) from None
+
+
+def _save(trainer: Trainer, run: Path) -> None:
+    """Keep a checkpoint; where the disk will not take it, at least the model, which is smaller."""
+    try:
+        trainer.save(run)
+    except OSError as error:
+        try:
+            save_model(run, trainer.model())
+            model = "the model as it is now is saved"
+        except OSError:
+            model = "the model cannot be saved either"
+        rest = "the last checkpoint is kept, --resume continues from it" if has_checkpoint(run) else "no checkpoint yet"
+        raise StorageError(f"{error}; training stops at iteration {trainer.iteration:,}: {model}, {rest}") from error
+
+
+def _warn(console: Console, text: str) -> None:
+    console.print(f"warning: {text}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _describe(step: Any) -> str:
@@ -539,20 +613,44 @@ def _describe(step: Any) -> str:
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Let a first Ctrl-C wait until it is asked for, between steps: no half step is saved. A second does not wait."""
+def _deferred_stop() -> Iterator[Callable[[], int | None]]:
+    """Let a first Ctrl-C, or a request to end, wait until it is asked for, between steps: no half step is saved.
+
+    The function tells the signal's number, or None. A second signal does not wait.
+    """
     asked: list[int] = []
 
     def handle(number: int, _frame: Any) -> None:
-        if asked:
-            raise KeyboardInterrupt
         asked.append(number)
+        if len(asked) > 1:
+            raise _Stopped(number)
 
-    before = signal.signal(signal.SIGINT, handle)
+    with _handled(handle, signal.SIGINT, *_endings()):
+        yield lambda: asked[0] if asked else None
+
+
+def _endings() -> list[int]:
+    """Signals that ask a program to end, those not ignored: after `nohup`, a closed terminal is no reason to."""
+    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    return [number for number in known if signal.getsignal(number) != signal.SIG_IGN]
+
+
+@contextmanager
+def _handled(handle: Callable[[int, Any], None], *numbers: int) -> Iterator[None]:
+    """Handle signals in a block; in a thread, which gets none, it does nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        yield lambda: bool(asked)
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, _frame: Any) -> None:
+    raise _Stopped(number)
 
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
@@ -604,7 +702,7 @@ def _evaluate(
 ) -> dict[str, Any]:
     """Evaluate a model on its test views and write metrics.json, keeping the facts that an older one holds."""
     if not scene.test:
-        raise ValueError(f"{scene.path}: expected test views, found none")
+        raise SceneError(f"{scene.path}: expected test views, found none")
     with display.counting(console, "evaluating", len(scene.test)) as done:
         results = evaluate(
             model.surfels,
@@ -621,30 +719,56 @@ def _evaluate(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; bad input gives one line on stderr and exit code 2."""
+    """Run a command and return its exit code.
+
+    0: done. 2: bad input, a full disk, a training that diverged: one line on stderr. 3: an error of nexwarp itself,
+    likewise. 128 and the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
+    """
     import warp as wp
 
     # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
     wp.config.log_level = wp.LOG_ERROR
+    given = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in given
     command = tyro.extras.subcommand_cli_from_dict(
         COMMANDS,
         prog="nexwarp",
-        description="Nexels: neurally-textured surfels. Each command has a --help of its own.",
-        args=arguments,
+        description="Nexels: neurally-textured surfels. Each command has a --help of its own. With --debug, any command "
+        "shows the full trace of an error.",
+        args=[argument for argument in given if argument != "--debug"],
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     console = Console()
     try:
-        command(console)
-    except (ValueError, OSError) as error:
-        message = " ".join(f"nexwarp: error: {error}".split())
-        Console(stderr=True, soft_wrap=True, highlight=False).print(message, markup=False)
-        return 2
-    except KeyboardInterrupt:
+        with _handled(_stop, *_endings()):
+            command(console)
+    except KeyboardInterrupt as stop:
+        number = getattr(stop, "number", signal.SIGINT)
         hint = "; continue with --resume" if isinstance(command, Train) else ""
-        Console(stderr=True).print(f"nexwarp: interrupted{hint}")
-        return 130
+        _complain(f"{'interrupted' if number == signal.SIGINT else 'terminated'}{hint}", None)
+        return 128 + number
+    except Exception as error:
+        trace = error if debug else None
+        if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
+            _complain(
+                f"error: out of memory: it needed {needed}; ask for less at a time, such as a smaller size", trace
+            )
+            return 2
+        if isinstance(error, (NexwarpError, ValueError, OSError)):
+            _complain(f"error: {error}", trace)
+            return 2
+        hint = "" if debug else "; --debug shows where"
+        _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
+        return 3
     return 0
+
+
+def _complain(text: str, trace: Exception | None) -> None:
+    """One line on stderr, and the trace of an error above it if there is one to show."""
+    if trace is not None:
+        traceback.print_exception(trace)
+    line = " ".join(f"nexwarp: {text}".split())
+    Console(stderr=True, soft_wrap=True, highlight=False).print(line, markup=False)
 
 
 if __name__ == "__main__":

@@ -186,10 +186,18 @@ def depth_loss(
     counts = (expected > 0) & (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     # Points behind the camera have coordinates of any size, or none.
     column, row = torch.where(counts[:, None], pixels, 0.0).long().unbind(-1)
-    shares = weights[row, column]
-    found = (shares * depths[row, column]).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
+    shares, places = _at(weights, row, column), _at(depths, row, column)
+    found = (shares * places).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
     errors = found / torch.where(counts, expected, 1.0) - 1
     return torch.where(counts, errors.abs(), 0.0).mean()
+
+
+def _at(values: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+    """values[row, column] of an (H, W, K) tensor."""
+    if values.device.type != "cpu":
+        return values[row, column]
+    # On a CPU, indexing adds its gradients, where there are many, by atomics in any order; this does not.
+    return values.flatten(0, 1).index_select(0, row * values.shape[1] + column)
 
 
 def opacity_loss(opacities: torch.Tensor) -> torch.Tensor:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nexwarp.errors import StorageError
 from nexwarp.files import written_aside
 from nexwarp.ops.checks import check_range
 
@@ -65,7 +66,11 @@ def save_exr(
         files.append(OpenEXR.Part(header, channels, name))
     with written_aside(path) as temporary:
         temporary.touch()  # an error of the operating system says more than OpenEXR's
-        OpenEXR.File(files).write(str(temporary))
+        try:
+            OpenEXR.File(files).write(str(temporary))
+        except RuntimeError as error:  # a full disk, for one
+            reason = str(error).replace(str(temporary), str(path))
+            raise StorageError(f"{path}: cannot be written ({reason})") from None
 
 
 def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

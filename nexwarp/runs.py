@@ -16,9 +16,11 @@ from typing import Any
 
 import torch
 
-from nexwarp.checkpoint import write_atomically, write_json
+from nexwarp.checkpoint import READ_ERRORS
 from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
+from nexwarp.files import is_leftover, remove_leftovers, write_atomically, written_aside
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
@@ -59,40 +61,75 @@ class SceneSource:
         return load_scene(demo_folder() if folder == DEMO else folder, **options)
 
 
-def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> None:
+def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> bool:
     """Refuse a run folder that must not be touched; change nothing.
+
+    Returns:
+        Whether there is a run to continue: a folder that was made, but got nothing before the process was killed, is
+        none, though resuming may start there.
 
     Raises:
         ValueError: the folder exists and neither flag is given, or both are, or it is no run, or it holds the scene.
         FileNotFoundError: there is nothing to resume.
     """
     if resume and overwrite:
-        raise ValueError("--resume, --overwrite: expected at most one of them, got both")
+        raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
-        raise ValueError(f"--run: expected a folder that does not hold the scene, got {run}")
+        raise SettingError(f"--run: expected a folder that does not hold the scene, got {run}")
     exists = run.exists() and (not run.is_dir() or any(run.iterdir()))
     if resume:
-        if not (run / CONFIG_FILE).is_file():
-            raise FileNotFoundError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
+        if (run / CONFIG_FILE).is_file():
+            return True
+        if not run.is_dir() or any(not is_leftover(file) for file in run.iterdir()):
+            raise MissingError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
     elif exists and not overwrite:
-        raise ValueError(
+        raise RunError(
             f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
         )
     elif exists and not (run / CONFIG_FILE).is_file():
-        raise ValueError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it")
+        raise RunError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it")
+    return False
 
 
 def create_run(run: Path, source: SceneSource, config: Config, device: str) -> None:
-    """Make an empty run folder (in place of an old one, see `prepare_run`) with its config."""
-    if run.exists():
-        shutil.rmtree(run)
-    run.mkdir(parents=True)
+    """Make an empty run folder (in place of an old one, see `prepare_run`) with its config.
+
+    An old one goes only once the new config is on the disk, and loses its own config last: whenever that is
+    interrupted, what is there is a run still.
+    """
     scene = dataclasses.asdict(source)
     if source.path != DEMO:
         scene["path"] = str(Path(source.path).resolve())
     if source.points is not None:
         scene["points"] = str(Path(source.points).resolve())
-    write_json(run / CONFIG_FILE, {"scene": scene, "device": device, "config": config.as_dict()})
+    data = {"scene": scene, "device": device, "config": config.as_dict()}
+    with written_aside(run / CONFIG_FILE, durable=True) as temporary:
+        temporary.write_bytes((json.dumps(data, indent=2) + "\n").encode())
+        for file in sorted(run.iterdir()):
+            if file.is_dir() and not file.is_symlink():
+                shutil.rmtree(file)
+            elif file.name not in (temporary.name, CONFIG_FILE):
+                file.unlink()
+
+
+def tidy_run(run: Path) -> None:
+    """Remove what killed processes left half-written in a run."""
+    shutil.rmtree(run / "checkpoint.tmp", ignore_errors=True)
+    remove_leftovers(run)
+
+
+def check_room(run: Path, size: int) -> None:
+    """Raise StorageError unless a run folder, there or not, can take files of that many bytes in all."""
+    folder = next(f for f in (run, *run.absolute().parents) if f.is_dir())
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError:  # of a file system that cannot tell
+        return
+    if free < size:
+        raise StorageError(
+            f"{run}: expected room for a model and its checkpoints, about {size / 2**20:,.0f} MiB, but the disk has "
+            f"{free / 2**20:,.0f} MiB left; make room, give another --run, or lower --max-surfels"
+        )
 
 
 def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
@@ -103,7 +140,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
     """
     path = run / CONFIG_FILE
     if not path.is_file():
-        raise FileNotFoundError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
+        raise MissingError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
         data = json.loads(path.read_text())
         scene = data["scene"]
@@ -113,17 +150,23 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
             if not isinstance(scene.get(name), (str, type(None))):
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None
+    except READ_ERRORS as error:
+        raise FormatError(f"{path}: expected the settings of a nexwarp run ({error})") from None
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
     """Read a run's metrics; nothing where there are none yet."""
     path = run / METRICS_FILE
     try:
-        return dict(json.loads(path.read_text())) if path.is_file() else {}
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
+        metrics = json.loads(path.read_text()) if path.is_file() else {}
+        if not isinstance(metrics, dict):
+            raise ValueError(f"expected an object, got {type(metrics).__name__}")
+        for name in ("psnr", "ssim"):
+            if not isinstance(metrics.get(name, 0.0), (int, float)):
+                raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
+        return metrics
+    except READ_ERRORS as error:
+        raise FormatError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
 
 
 def keep_camera_path(run: Path, content: bytes) -> str:
@@ -140,9 +183,9 @@ def pick_device(name: str | None) -> torch.device:
     if name is None:
         return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
     if name not in ("cuda", "cpu"):
-        raise ValueError(f"--device: expected cuda or cpu, got {name!r}")
+        raise SettingError(f"--device: expected cuda or cpu, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device: cuda was asked for, but torch finds no CUDA device; use --device cpu")
+        raise SettingError("--device: cuda was asked for, but torch finds no CUDA device; use --device cpu")
     return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
 
 

@@ -5,10 +5,12 @@ import hashlib
 import math
 import random
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,23 @@ from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
 from nexwarp.config import Config
 from nexwarp.data import Scene, View
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
+from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.initial import initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses
 from nexwarp.render import Rendering, render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
+from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
 AHEAD = 2  # photos to fetch meanwhile where they do not
+# Iterations between looks at whether all numbers are finite, and how many states a run keeps, one after another, to go
+# back to when they are not.
+CHECK_EVERY = 100
+SNAPSHOTS = 10
+LOWERED_RATES = 0.5
 
 
 @dataclass(frozen=True)
@@ -64,7 +73,7 @@ class Trainer:
             device: where to train.
         """
         if not scene.train:
-            raise ValueError(f"{scene.path}: expected at least one training view, got none")
+            raise SceneError(f"{scene.path}: expected at least one training view, got none")
         self.scene, self.config, self.device = scene, config, torch.device(device)
         _seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -79,17 +88,127 @@ class Trainer:
         self.views = _Views(scene.train, self.device)
         self.background = config.background or scene.background or mean_colour(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
+        self.rate_factor = 1.0
+        self.loss_log, self.checked = LossLog(), 0
+        self.good: tuple[dict[str, torch.Tensor], dict[str, Any]] | None = None
 
-    def run(self, observe: Callable[[Progress], None] | None = None) -> None:
-        """Train until `config.iterations`, calling `observe` after each step."""
-        while self.iteration < self.config.iterations:
-            start = time.perf_counter()
-            progress = self.step()
-            if self.iteration == self.config.iterations and self.device.type == "cuda":
-                torch.cuda.synchronize(self.device)
-            self.seconds += time.perf_counter() - start
-            if observe is not None:
-                observe(progress)
+    def run(
+        self, observe: Callable[[Progress], None] | None = None, warn: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Train until `config.iterations`, calling `observe` after each step.
+
+        Losses, parameters and Adam's moments are looked at every CHECK_EVERY iterations, before each checkpoint and at
+        the end. Where one is not finite, training goes back to the last good state, once, with half the learning
+        rates, and tells `warn`.
+
+        Raises:
+            DivergedError: something was not finite again; the trainer is in its last good state.
+            OutOfMemoryError: a step needs more memory than there is; the trainer is in the middle of that step.
+        """
+        total = self.config.iterations
+        if self.iteration < total:
+            self.good = self._state()
+        while self.iteration < total:
+            try:
+                start = time.perf_counter()
+                progress = self.step()
+                if self.iteration == total and self.device.type == "cuda":
+                    torch.cuda.synchronize(self.device)
+                self.seconds += time.perf_counter() - start
+                self.loss_log.note(self.iteration, progress.losses)
+                keep = self.iteration % max(total // SNAPSHOTS, 1) == 0
+                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == total:
+                    self.check()
+                if keep:
+                    self.good = self._state()
+                if observe is not None:
+                    observe(progress)
+            except DivergedError as fault:
+                self._go_back(fault, warn)
+            except (MemoryError, RuntimeError) as error:
+                if (needed := needed_memory(error)) is None:
+                    raise
+                raise OutOfMemoryError(self._too_much(needed)) from error
+
+    def check(self) -> None:
+        """Raise DivergedError unless all losses since the last check, all parameters and Adam's moments are finite."""
+        loss = self.loss_log.first_bad()
+        tensors = self._watched()
+        bad = not_finite(tensors)
+        since, self.checked = self.checked, self.iteration
+        if loss is None and not bad:
+            return
+        if loss is not None:
+            when, name, value = loss
+            told = f"iteration {when}: the loss {name!r} is {value}"
+        else:
+            span = f"{since + 1} to " if since + 1 < self.iteration else ""
+            told = f"iteration {span}{self.iteration}: not finite"
+        facts = [describe(name, tensors[name]) for name in bad]
+        if len(facts) > 1:
+            others = dict.fromkeys(name.rpartition(" ")[2] for name in bad)
+            facts[0] += f" (in all: {', '.join(others)})"
+        report = {
+            "iteration": self.iteration,
+            "checked_before": since,
+            "loss": None if loss is None else {"iteration": loss[0], "term": loss[1], "value": str(loss[2])},
+            "tensors": facts,
+            "surfels": len(self.surfels),
+            "rate_factor": self.rate_factor,
+        }
+        raise DivergedError("; ".join([told, *facts[:1]]), report)
+
+    def _watched(self) -> dict[str, torch.Tensor]:
+        watched: dict[str, torch.Tensor] = {}
+        for name, parameter in self._named_parameters():
+            state = self.optimizer.state.get(parameter, {})
+            # A gradient is gone by now, but what it did to the moments is not.
+            watched |= {f"gradient of {name}": state[key] for key in ("exp_avg",) if key in state}
+            watched |= {f"squared gradient of {name}": state[key] for key in ("exp_avg_sq",) if key in state}
+            watched[name] = parameter
+        return watched | {"densify.errors": self.densifier.errors}
+
+    def _go_back(self, fault: DivergedError, warn: Callable[[str], None]) -> None:
+        """Return to the last good state with half the learning rates; raise when that was done before."""
+        assert self.good is not None
+        again = self.rate_factor < 1.0
+        fault = self._beginning(fault)
+        self._restore(*self.good)
+        self.rate_factor = LOWERED_RATES
+        if again:
+            told = f"{fault}; it had gone back and halved its learning rates before, so training gives up"
+            raise DivergedError(told, fault.report | {"good_iteration": self.iteration}) from None
+        warn(f"{fault}; going back to iteration {self.iteration:,} with half the learning rates")
+
+    def _beginning(self, fault: DivergedError) -> DivergedError:
+        """Repeat the steps since the last good state, looking after each: what is not finite spreads within a few.
+
+        Returns:
+            The first fault met; where it does not come again, the one given.
+        """
+        assert self.good is not None
+        until, rate_factor = self.iteration, self.rate_factor
+        self._restore(*self.good)
+        self.rate_factor = rate_factor
+        try:
+            while self.iteration < until:
+                self.loss_log.note(self.iteration + 1, self.step().losses)
+                self.check()
+        except DivergedError as first:
+            return first
+        return fault
+
+    def _too_much(self, needed: str) -> str:
+        camera = self.scene.train[0].camera
+        place, used = "memory", ""
+        if self.device.type == "cuda":
+            free, total = torch.cuda.mem_get_info(self.device)
+            place, used = "GPU memory", f", with {(total - free) / 2**30:.1f} of {total / 2**30:.1f} GiB in use"
+        return (
+            f"out of {place} at iteration {self.iteration}: it needed {needed}{used}, for {len(self.surfels):,} "
+            f"surfels and photos of {camera.width}x{camera.height}; lower --max-surfels (now "
+            f"{self.config.max_surfels:,}) or --max-hits (now {self.config.max_hits}), or raise --downscale"
+        )
 
     def step(self) -> Progress:
         """Do one iteration: a view, its rendering, the losses, Adam, and density control when it is due."""
@@ -199,7 +318,27 @@ class Trainer:
         return Model(self.surfels, self.texture, meta)
 
     def save(self, run: Path) -> None:
-        """Write a checkpoint: everything that shapes the future of the run."""
+        """Write a checkpoint: everything that shapes the future of the run.
+
+        Raises:
+            DivergedError: something in it is not finite.
+            OSError: it cannot be written; those before it are as they were.
+        """
+        self.check()
+        if self.good is None or self.good[1]["iteration"] != self.iteration:
+            self.good = self._state()
+        save_checkpoint(run, *self.good)
+
+    def checkpoint_size(self) -> int:
+        """Bytes that a checkpoint takes at most, with as many surfels as the budget allows; the model takes less."""
+        each = sum(p.numel() for p in self.surfels.parameters()) / max(len(self.surfels), 1)
+        count = each * max(self.config.max_surfels, len(self.surfels)) + sum(
+            p.numel() for p in self.texture.parameters()
+        )
+        return int(3 * 4 * count) + 2**20
+
+    def _state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Everything that shapes the future of the run, as copies on the CPU."""
         tensors = {f"surfels.{k}": v for k, v in self.surfels.state_dict().items()}
         tensors |= {f"texture.{k}": v for k, v in self.texture.state_dict().items()}
         for name, parameter in self._named_parameters():
@@ -215,28 +354,43 @@ class Trainer:
         state = {
             "iteration": self.iteration,
             "seconds": self.seconds,
-            "order": self.order,
+            "order": list(self.order),
             "views": self.views.fingerprint(),
             "numpy": [kind, *rest],
             "python": random.getstate(),
+            "rate_factor": self.rate_factor,
+            "scene": self._scene_digest,
             "config": self.config.as_dict(),
         }
-        save_checkpoint(run, tensors, state)
+        return {name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state
 
-    def restore(self, run: Path) -> None:
-        """Continue from a checkpoint of the same scene and settings; ValueError where they differ."""
-        tensors, state = load_checkpoint(run)
+    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None) -> None:
+        """Continue from the newest whole checkpoint of the same scene and settings.
+
+        Args:
+            run: run folder.
+            warn: is told of a damaged checkpoint that is passed over.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: they are damaged, or scene or settings differ.
+        """
+        tensors, state = load_checkpoint(run, warn)
         try:
             if Config.from_dict(state["config"]) != self.config:
                 raise ValueError("its settings are others")
             if state["views"] != self.views.fingerprint():
                 raise ValueError("it has seen other training views than the scene has")
+            if state["scene"] != self._scene_digest:
+                raise ValueError("the scene's photos, masks or points have changed since")
             self._restore(tensors, state)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())  # torch's go over several lines
-            raise ValueError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
+            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def _restore(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
+        # Copies: what is restored may be restored again.
+        tensors = {k: v.clone() for k, v in tensors.items()}
         raw = {k[8:]: v for k, v in tensors.items() if k.startswith("surfels.")}
         self.surfels = Surfels(raw).to(self.device)
         self.texture.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("texture.")})
@@ -244,12 +398,17 @@ class Trainer:
         for name, parameter in self._named_parameters():
             prefix = f"adam.{name}."
             entries = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+            wrong = [k for k, v in entries.items() if v.shape != (() if k == "step" else parameter.shape)]
+            if wrong:
+                raise ValueError(f"{prefix}{wrong[0]}: expected the shape of its parameter, {tuple(parameter.shape)}")
             if entries:
                 self.optimizer.state[parameter] = {
                     k: v.to(parameter.device) if k != "step" or self.device.type == "cuda" else v
                     for k, v in entries.items()
                 }
         self.densifier = Densifier(_densify_schedule(self.config), self.surfels, self.config.max_surfels)
+        if tensors["densify.errors"].shape != self.densifier.errors.shape:
+            raise ValueError(f"densify.errors: expected one for each of {len(self.surfels)} surfels")
         self.densifier.errors = tensors["densify.errors"].to(self.device)
         self.generator.set_state(tensors["rng.views"])
         torch.set_rng_state(tensors["rng.torch"])
@@ -259,7 +418,21 @@ class Trainer:
         np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
         version, internal, gauss = state["python"]
         random.setstate((version, tuple(internal), gauss))
-        self.iteration, self.seconds, self.order = state["iteration"], state["seconds"], state["order"]
+        self.iteration, self.seconds, self.order = state["iteration"], state["seconds"], list(state["order"])
+        self.rate_factor = state["rate_factor"]
+        self.loss_log, self.checked = LossLog(), self.iteration
+
+    @cached_property
+    def _scene_digest(self) -> str:
+        """Digest of what training takes from the scene beside its cameras: photos, masks, points, scale."""
+        digest = hashlib.sha256(f"{self.scene.scale} {self.texture.config}".encode())
+        for view in self.scene.train:
+            for pixels in (view.image, view.mask, view.alpha):
+                if pixels is not None:  # CRC: photos are many, and nobody forges them
+                    digest.update(zlib.crc32(pixels.contiguous().numpy()).to_bytes(4, "little"))
+        for values in (self.scene.points, self.scene.colors):
+            digest.update(values.contiguous().numpy())
+        return digest.hexdigest()
 
     def _named_parameters(self) -> Iterator[tuple[str, torch.nn.Parameter]]:
         yield from ((f"surfels.{k}", v) for k, v in self.surfels.named_parameters())
@@ -297,7 +470,8 @@ class Trainer:
         progress = (self.iteration - 1) / max(self.config.iterations - 1, 1)
         for group in self.optimizer.param_groups:
             first, last = group["ends"]
-            group["lr"] = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
+            rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
+            group["lr"] = self.rate_factor * rate
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,10 @@
 import json
 import os
 import pickle
+import random
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +17,12 @@ from safetensors import safe_open
 
 import nexwarp as nw
 from nexwarp.checkpoint import (
+    CHECKPOINTS,
     FORMAT_VERSION,
     MODEL_FILE,
     Model,
+    _read_checkpoint,
+    has_checkpoint,
     load_cameras,
     load_checkpoint,
     save_cameras,
@@ -261,6 +267,12 @@ def saved_number(run: Path) -> int:
     return state["iteration"]
 
 
+def kept(run: Path) -> list[int]:
+    """Iterations of the checkpoints there are, the newest first; each is whole, and there is nothing else."""
+    assert sorted(os.listdir(run)) == list(CHECKPOINTS[: len(os.listdir(run))])
+    return [_read_checkpoint(run / name)[1]["iteration"] for name in CHECKPOINTS if (run / name).exists()]
+
+
 def test_checkpoint_round_trip(tmp_path):
     tensors = {
         "float": torch.randn(5, 0, 3),
@@ -274,7 +286,7 @@ def test_checkpoint_round_trip(tmp_path):
     assert again == state and loaded.keys() == tensors.keys()
     assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
     save_number(tmp_path, 4)
-    assert saved_number(tmp_path) == 4 and os.listdir(tmp_path) == ["checkpoint"]
+    assert saved_number(tmp_path) == 4 and kept(tmp_path) == [4, 3]
 
 
 def test_kill_between_the_renames_still_resumes(tmp_path):
@@ -282,7 +294,7 @@ def test_kill_between_the_renames_still_resumes(tmp_path):
     (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
     assert saved_number(tmp_path) == 1
     save_number(tmp_path, 2)
-    assert saved_number(tmp_path) == 2 and os.listdir(tmp_path) == ["checkpoint"]
+    assert saved_number(tmp_path) == 2 and kept(tmp_path) == [2, 1]
 
 
 @pytest.mark.parametrize("after_kill", [False, True], ids=["checkpoint", "checkpoint.old"])
@@ -306,7 +318,7 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
 
     with monkeypatch.context() as patch:
         if stage == "tensors":
-            patch.setattr(safetensors.torch, "save_file", fail)
+            patch.setattr(safetensors.torch, "save", fail)
         elif stage == "state":
             patch.setattr("nexwarp.checkpoint.write_atomically", fail)
         else:
@@ -316,7 +328,96 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
                 save_number(tmp_path, 2)
     assert saved_number(tmp_path) == 1
     save_number(tmp_path, 3)
-    assert saved_number(tmp_path) == 3 and os.listdir(tmp_path) == ["checkpoint"]
+    assert saved_number(tmp_path) == 3 and kept(tmp_path) == [3, 1]
+
+
+SYSTEM_CALLS = (
+    (Path, "write_bytes"),
+    (os, "fsync"),
+    (os, "replace"),
+    (Path, "rename"),
+    (Path, "mkdir"),
+    (shutil, "rmtree"),
+)
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
+    """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
+    calls: list[str] = []
+
+    def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            calls.append(name)
+            if len(calls) > moment:  # what is dead does nothing any more, not even clean up
+                if len(calls) == moment + 1 and name == "write_bytes":
+                    with open(args[0], "wb") as half:
+                        half.write(args[1][: len(args[1]) // 2])
+                raise Killed
+            return original(*args, **kwargs)
+
+        return call
+
+    for owner, name in SYSTEM_CALLS:
+        patch.setattr(owner, name, dying(name, getattr(owner, name)))
+    unlink = Path.unlink
+    patch.setattr(Path, "unlink", lambda *args, **kw: None if len(calls) > moment else unlink(*args, **kw))
+    return calls
+
+
+@pytest.mark.parametrize("before", [0, 1, 2, 3])
+def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, before):
+    """Whatever number of saves came before; and the next save, killed at any moment too, starts from what is left."""
+    moment, calls = 0, []
+    while moment <= len(calls):
+        run = tmp_path / f"run{moment}"
+        run.mkdir()
+        for number in range(1, before + 1):
+            save_number(run, number)
+        for at in (moment, 3, 7, 11):  # killed again, and again
+            with pytest.MonkeyPatch.context() as patch:
+                done = kill_at(patch, at)
+                with suppress(Killed):
+                    save_number(run, before + 1)
+            calls = done if at == moment else calls
+            if before:
+                assert saved_number(run) in (before, before + 1), (moment, at)
+            else:
+                assert not has_checkpoint(run) or saved_number(run) == 1
+        save_number(run, before + 2)
+        assert saved_number(run) == before + 2 and kept(run)[0] == before + 2
+        moment += 1
+    assert moment > 8
+
+
+@pytest.mark.parametrize("name", ["tensors.safetensors", "state.json"])
+def test_every_flipped_bit_and_every_length_is_found(tmp_path, name):
+    """What is read is what was written, or the checkpoint before; never anything else."""
+    save_number(tmp_path, 1)
+    save_number(tmp_path, 2)
+    file = tmp_path / "checkpoint" / name
+    content = file.read_bytes()
+    generator = random.Random(0)
+    damaged = [content[:length] for length in range(len(content))]
+    for place in range(len(content)):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << generator.randrange(8)
+        damaged.append(bytes(flipped))
+    told: list[str] = []
+    for bad in damaged:
+        file.write_bytes(bad)
+        told.clear()
+        tensors, state = load_checkpoint(tmp_path, told.append)
+        if told:
+            assert state == {"iteration": 1} and tensors["x"].tolist() == [1.0] * 3
+            assert told[0].startswith(f"{file.parent}: expected a whole checkpoint") and "\n" not in told[0]
+        else:  # a flip in white space
+            assert name == "state.json" and state == {"iteration": 2}, bad
+    file.write_bytes(content + b"\0")
+    assert load_checkpoint(tmp_path)[1] == {"iteration": 1}
 
 
 def test_no_checkpoint(tmp_path):

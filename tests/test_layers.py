@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 LAYERS = [
+    {"errors"},
     {"kernels"},
     {"ops", "camera", "files"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
-    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer"},
+    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "watch"},
     {"config"},
     {"initial"},
     {"trainer"},

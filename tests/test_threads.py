@@ -5,8 +5,14 @@ from typing import Any
 import pytest
 import torch
 
+import nexwarp as nw
 from nexwarp import ops
+from nexwarp.config import Config, TextureConfig
+from nexwarp.data import write_demo
+from nexwarp.densify import DensifyConfig
 from nexwarp.kernels import launch
+from nexwarp.losses import depth_loss
+from nexwarp.trainer import Trainer
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -219,3 +225,45 @@ def test_errors_must_have_the_size_of_the_image():
 def test_no_error_blends_to_nothing():
     scene = random_scene(8)
     assert not Passes(scene).blended(0 * errors_of(scene)).any()
+
+
+# Training
+
+
+def test_training_does_not_depend_on_threads(tmp_path):
+    """Neither on those of the kernels nor on torch's, whose BLAS adds up in another order with another number."""
+    scene = nw.load_scene(write_demo(tmp_path / "scene", width=96, height=72, views=4, points=500))
+    texture = TextureConfig(levels=12, table_size=2**12, width=32)
+    config = Config(iterations=40, max_surfels=2000, texture=texture, densify=DensifyConfig(every=3))
+    before, models = torch.get_num_threads(), []
+    try:
+        for kernels, others in ((1, 1), (2, 3), (3, 4)):
+            launch.set_num_threads(kernels)
+            torch.set_num_threads(others)
+            trainer = Trainer(scene, config, "cpu")
+            for _ in range(4):
+                trainer.step()
+            models.append(dict(trainer._named_parameters()) | {"errors": trainer.densifier.errors})
+            assert torch.get_num_threads() == others
+    finally:
+        torch.set_num_threads(before)
+    assert_identical([{name: x.detach() for name, x in model.items()} for model in models])
+
+
+def test_many_points_in_one_pixel_add_up_in_order():
+    """Indexing would add gradients by atomics."""
+    generator = torch.Generator().manual_seed(0)
+    shape, count = (40, 30, 2), 60_000
+    depths = 1 + torch.rand(shape, generator=generator)
+    pixels = torch.rand(count, 2, generator=generator) * torch.tensor([3.0, 40.0])
+    expected = 1 + torch.rand(count, generator=generator)
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 4, 4, 7):
+            torch.set_num_threads(threads)
+            weights = torch.full(shape, 0.3, requires_grad=True)
+            depth_loss(depths, weights, pixels, expected).backward()
+            results.append({"weights": weights.grad})
+    finally:
+        torch.set_num_threads(before)
+    assert_identical(results)

@@ -1,5 +1,6 @@
 """Texturing pass: the neural field at points, as spherical harmonics coefficients or as colours along rays."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point
+from nexwarp.ops.columns import parts_of, share_columns
 
 # Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
 HALF_GRADIENT = 64.0
@@ -92,10 +94,7 @@ class _Texture(torch.autograd.Function):
             arguments,
             [array(encoded, STORAGES[dtype])],
         )
-        layers = [encoded]
-        for matrix in matrices[:-1]:
-            layers.append(torch.relu_(matrix @ layers[-1]))
-        coefficients = matrices[-1] @ layers[-1]
+        *layers, coefficients = _mlp(encoded, matrices)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         ctx.save_for_backward(
@@ -130,12 +129,8 @@ class _Texture(torch.autograd.Function):
                 coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
             )
         unscale = scale.reciprocal()
-        grad_matrices = []
-        for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):
-            grad_matrices.insert(0, _product(signal, layer) * unscale)
-            signal = matrix.T @ signal
-            if len(grad_matrices) < len(matrices):
-                signal = torch.ops.aten.threshold_backward(signal, layer, 0)
+        signal, grad_matrices = _mlp_backward(signal, layers, matrices)
+        grad_matrices = [x * unscale for x in grad_matrices]
         grad_grid, grad_positions, grad_depths = _lookup_backward(
             table, positions, depths, resolutions, focal, signal, unscale, need_positions or need_depths
         )
@@ -165,6 +160,57 @@ def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
         return grad.new_ones(1)
     largest = torch.linalg.vector_norm(grad, float("inf")).clamp_min(1e-30)
     return torch.exp2(torch.floor(torch.log2(HALF_GRADIENT / largest))).clamp(2.0**-24, 2.0**60).view(1)
+
+
+def _mlp(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Return the input (in, n) of each layer, and the output of the last one."""
+    if encoded.device.type != "cpu":
+        layers = [encoded]
+        for matrix in matrices[:-1]:
+            layers.append(torch.relu_(matrix @ layers[-1]))
+        return [*layers, matrices[-1] @ layers[-1]]
+    count = encoded.shape[1]
+    layers = [encoded, *(encoded.new_empty(len(matrix), count) for matrix in matrices)]
+
+    def part(_: int, columns: slice) -> None:
+        for i, matrix in enumerate(matrices):
+            out = torch.mm(matrix, layers[i][:, columns], out=layers[i + 1][:, columns])
+            if i + 1 < len(matrices):
+                out.relu_()
+
+    share_columns(count, part)
+    return layers
+
+
+def _mlp_backward(
+    signal: torch.Tensor, layers: Sequence[torch.Tensor], matrices: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return the gradients of the first layer's input and of the matrices, from that of the output (out, n)."""
+    if signal.device.type != "cpu":
+        grads: list[torch.Tensor] = []
+        for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):
+            grads.insert(0, _product(signal, layer))
+            signal = matrix.T @ signal
+            if len(grads) < len(matrices):
+                signal = torch.ops.aten.threshold_backward(signal, layer, 0)
+        return signal, grads
+    count = signal.shape[1]
+    result = torch.empty_like(layers[0])
+    # A slot for each part, added up in order.
+    slots = [matrix.new_zeros(max(parts_of(count), 1), *matrix.shape) for matrix in matrices]
+
+    def part(index: int, columns: slice) -> None:
+        here = signal[:, columns]
+        for i in reversed(range(len(matrices))):
+            layer = layers[i][:, columns]
+            torch.mm(here, layer.T, out=slots[i][index])
+            if i == 0:
+                torch.mm(matrices[0].T, here, out=result[:, columns])
+            else:
+                here = torch.ops.aten.threshold_backward(matrices[i].T @ here, layer, 0)
+
+    share_columns(count, part)
+    return result, [functools.reduce(torch.Tensor.add_, slot.unbind()) for slot in slots]
 
 
 def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,114 @@
+"""A disk that fails at the k-th thing asked of it, below a folder; elsewhere it goes on as ever."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+class Disk:
+    """Counts what is asked of the disk below `folder`, and fails the `fatal`-th request (from 0), with `number`.
+
+    A request is a file that is opened to be written, a write to it, its closing, a flush, a rename, a new folder. A
+    write that fails has written half. With `lasting` every later request fails too, as on a full disk.
+    """
+
+    def __init__(self, folder: Path, fatal: int | None = None, number: int = errno.ENOSPC, lasting: bool = False):
+        self.folder, self.fatal, self.number, self.lasting = folder, fatal, number, lasting
+        self.requests: list[str] = []
+
+    def ask(self, what: str, path: Any) -> None:
+        if isinstance(path, int):
+            path = os.readlink(f"/proc/self/fd/{path}")
+        if not Path(os.path.abspath(path)).is_relative_to(self.folder):
+            return
+        self.requests.append(f"{what} {Path(path).name}")
+        count = len(self.requests) - 1
+        if self.fatal is not None and (count == self.fatal or (self.lasting and count > self.fatal)):
+            raise OSError(self.number, os.strerror(self.number))
+
+
+class Failing:
+    """A file open to be written."""
+
+    def __init__(self, file: Any, disk: Disk, path: Any) -> None:
+        self.file, self.disk, self.path = file, disk, path
+
+    def write(self, content: Any) -> int:
+        try:
+            self.disk.ask("write", self.path)
+        except OSError:
+            self.file.write(content[: len(content) // 2])
+            raise
+        return self.file.write(content)
+
+    def close(self) -> None:
+        if not self.file.closed:
+            self.file.close()
+            self.disk.ask("close", self.path)
+
+    def fileno(self) -> int:
+        raise io.UnsupportedOperation  # so that nobody writes past `write`
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+    def __enter__(self) -> Failing:
+        return self
+
+    def __exit__(self, kind: Any, *_: Any) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.file.close()
+
+
+@contextmanager
+def failing(disk: Disk) -> Iterator[Disk]:
+    """Let the requests of a block go to `disk`."""
+    import OpenEXR
+
+    real_open = io.open
+
+    def opening(file: Any, mode: str = "r", *args: Any, **kwargs: Any) -> Any:
+        if not set(mode) & set("wax+") or isinstance(file, int):
+            return real_open(file, mode, *args, **kwargs)
+        disk.ask("open", file)
+        return Failing(real_open(file, mode, *args, **kwargs), disk, file)
+
+    def asking(what: str, original: Any, which: int = 0) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if what != "mkdir" or not os.path.exists(args[which]):
+                disk.ask(what, args[which])
+            return original(*args, **kwargs)
+
+        return call
+
+    class File(OpenEXR.File):
+        """Fails as the real one does, with a RuntimeError."""
+
+        def write(self, name: str) -> None:
+            try:
+                disk.ask("exr", name)
+            except OSError as error:
+                Path(name).write_bytes(b"v/1\x01")
+                raise RuntimeError(f'Failed to write pixel data to image file "{name}". {error.strerror}.') from None
+            super().write(name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(builtins, "open", opening)
+        patch.setattr(io, "open", opening)
+        patch.setattr(os, "fsync", asking("fsync", os.fsync))
+        patch.setattr(os, "replace", asking("replace", os.replace, 1))
+        patch.setattr(os, "rename", asking("rename", os.rename, 1))
+        patch.setattr(os, "mkdir", asking("mkdir", os.mkdir))
+        patch.setattr(OpenEXR, "File", File)
+        yield disk
