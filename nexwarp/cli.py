@@ -733,8 +733,8 @@ def main(arguments: list[str] | None = None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(
         COMMANDS,
         prog="nexwarp",
-        description="Nexels: neurally-textured surfels. Each command has a --help of its own. With --debug, any command "
-        "shows the full trace of an error.",
+        description="Nexels: neurally-textured surfels. Each command has a --help of its own. With --debug, any shows "
+        "the full trace of an error.",
         args=[argument for argument in given if argument != "--debug"],
         config=(tyro.conf.FlagCreatePairsOff,),
     )
