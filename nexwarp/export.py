@@ -89,11 +89,12 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected surfels as PLY")
     with open(path, "rb") as file:
-        data = file.read()
-    count, dtype, start = _header(path, data)
-    if len(data) != start + count * dtype.itemsize:
-        raise ValueError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {len(data)}")
-    vertices = np.frombuffer(data, dtype, count, start)
+        count, dtype, start = _header(path, file.read(LONGEST_HEADER))
+        size = path.stat().st_size
+        if size != start + count * dtype.itemsize:
+            raise ValueError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {size}")
+        file.seek(start)
+        vertices = np.fromfile(file, dtype, count)
     rest = sum(name.startswith("f_rest_") for name in dtype.names)
     expected = ["x", "y", "z", *_names("f_dc", 3), *_names("f_rest", rest), "opacity", *_names("scale", 2)]
     expected += [*_names("rot", 4), *_names("gamma", 2)]

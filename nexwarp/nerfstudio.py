@@ -17,6 +17,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.files import written_aside
+from nexwarp.json_files import read_json
 
 # OpenGL camera axes in those of OpenCV, and back.
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -25,6 +26,8 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 EXACT = 1e-9
 LAST_ROW = 1e-6
+MAX_SIDE = 2**16  # pixels
+LARGEST = 1e15  # of a number: squares stay finite in single precision
 
 
 @dataclass(frozen=True)
@@ -240,10 +243,7 @@ def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected cameras as JSON")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected cameras as JSON, but it cannot be read ({error})") from None
+    data = read_json(path)
     if not isinstance(data, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(data).__name__}")
     return data
@@ -270,15 +270,18 @@ def _number(
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
+    fits = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (fits and above < value < below and abs(value) <= LARGEST):
         least = f" above {above:g}" if above > -math.inf else ""
         most = f" below {below:g}" if below < math.inf else ""
-        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r}")
+        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r:.60}")
     return float(value)
 
 
 def _size(where: str | Path, values: Mapping[str, Any], key: str) -> int:
     size = _number(where, values, key, above=0.0)
+    if size > MAX_SIDE:
+        raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
     if size != int(size):
         raise ValueError(f"{where}: {key}: expected a whole number of pixels, got {size:g}")
     return int(size)

@@ -6,7 +6,6 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 
 import ctypes
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import torch
 from nexwarp.checkpoint import write_atomically, write_json
 from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.json_files import read_json
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
@@ -105,7 +105,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
     if not path.is_file():
         raise FileNotFoundError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         scene = data["scene"]
         if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
             raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
@@ -121,7 +121,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
     """Read a run's metrics; nothing where there are none yet."""
     path = run / METRICS_FILE
     try:
-        return dict(json.loads(path.read_text())) if path.is_file() else {}
+        return dict(read_json(path)) if path.is_file() else {}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
 

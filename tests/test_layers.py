@@ -10,7 +10,7 @@ import pytest
 
 LAYERS = [
     {"kernels"},
-    {"ops", "camera", "files"},
+    {"ops", "camera", "files", "json_files"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
     {"densify", "checkpoint", "evaluate", "passes", "export", "viewer"},

@@ -8,6 +8,7 @@ import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,15 @@ def pycolmap_module() -> Any:
     import pycolmap
 
     return pycolmap
+
+
+@lru_cache(maxsize=1)
+def camera_models() -> dict[int, tuple[str, int]]:
+    """COLMAP's camera models: id -> name and number of parameters."""
+    pycolmap = pycolmap_module()
+    create = pycolmap.Camera.create_from_model_id
+    models = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    return {int(model): (name, len(create(1, model, 1.0, 2, 2).params)) for name, model in models.items()}
 
 
 @dataclass(frozen=True)

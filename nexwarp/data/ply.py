@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nexwarp.data.capture import check_points
+
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -46,10 +48,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if lacking:
         raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
     positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    bad = ~np.isfinite(positions).all(axis=1)
-    if bad.any():
-        index = int(np.flatnonzero(bad)[0])
-        raise ValueError(f"{path}: expected finite points, got {tuple(positions[index].tolist())} (vertex {index})")
+    check_points(path, positions, "points", lambda index: f"vertex {index}")
     return positions, _colors(vertices)
 
 
