@@ -89,7 +89,7 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
         if not isinstance(error, DOCUMENTED) and not (isinstance(error, OSError) and str(folder) in str(error)):
             return Failure("", 0, type(error).__name__, text)
         message = str(error)
-        if "\n" in message or not message.isprintable() or len(message) > 2000:
+        if str(folder) not in message or "\n" in message or not message.isprintable() or len(message) > 2000:
             return Failure("", 0, "message", text)
         return type(error).__name__
     return "loaded"

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.files import written_aside
+from nexwarp.files import one_line, written_aside
 from nexwarp.json_files import parse_json, read_json
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_finite, check_range, check_tensors
@@ -96,7 +96,7 @@ def load(path: str | os.PathLike[str]) -> Model:
             meta, texture = _check_header(path, header, kinds)
             tensors = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
+        raise ValueError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
         if "footprints" in tensors:
@@ -126,7 +126,9 @@ def _check_header(
     if not isinstance(meta, dict):
         raise ValueError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
     if meta.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
+        raise ValueError(
+            f"{path}: expected format version {FORMAT_VERSION}, got {one_line(meta.get('format_version'))}"
+        )
     try:
         _check_options(meta)
         texture = meta.pop("texture")
@@ -148,8 +150,7 @@ def _check_header(
 
 
 def _no_model(path: Path, error: Exception) -> ValueError:
-    reason = " ".join(str(error).split())  # torch's go over several lines
-    return ValueError(f"{path}: the tensors do not make a model ({reason})")
+    return ValueError(f"{path}: the tensors do not make a model ({one_line(error)})")
 
 
 def _check_options(meta: dict[str, Any]) -> None:
@@ -243,8 +244,8 @@ def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
         }
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: expected the run's cameras, found no such file") from None
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:  # torch.tensor of huge integers
-        raise ValueError(f"{path}: expected named cameras as JSON ({error})") from None
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"{path}: expected named cameras as JSON ({one_line(error)})") from None
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nexwarp.files import written_aside
+from nexwarp.files import one_line, written_aside
 from nexwarp.ops.checks import check_finite, check_range
 from nexwarp.surfels import Surfels
 
@@ -124,7 +124,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         shN = coefficients.reshape(count, 3, rest // 3).mT.contiguous()
         return Surfels({**{name: x.contiguous() for name, x in raw.items()}, "shN": shN})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected nexwarp surfels ({error})") from None
+        raise ValueError(f"{path}: expected nexwarp surfels ({one_line(error)})") from None
 
 
 def _names(name: str, count: int) -> list[str]:
@@ -183,5 +183,5 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
             raise ValueError(f"expected a number of vertices, got {count}")
         dtype = np.dtype([(words[2], TYPES[words[1]]) for words in properties])
     except ValueError as error:
-        raise ValueError(f"{path}: expected the header of nexwarp surfels ({error})") from None
+        raise ValueError(f"{path}: expected the header of nexwarp surfels ({one_line(error)})") from None
     return int(count), dtype, end + len(mark)

@@ -5,6 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from nexwarp.files import one_line
+
 MAX_BYTES = 32 * 2**20  # some 30,000 cameras; parsed it takes at most twenty times as much
 MAX_DEPTH = 64
 # The closing quote is optional, so that a text without one is looked at once, not from each of its quotes.
@@ -48,7 +50,7 @@ def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite
     try:
         return json.loads(content.decode("utf-8"), parse_constant=_refuse if finite else None)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{where}: expected JSON, could not parse it: {error}") from None
+        raise ValueError(f"{where}: expected JSON, could not parse it: {one_line(error)}") from None
 
 
 def _refuse(name: str) -> None:

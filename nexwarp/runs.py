@@ -18,6 +18,7 @@ import torch
 from nexwarp.checkpoint import write_atomically, write_json
 from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.files import one_line
 from nexwarp.json_files import read_json
 
 CONFIG_FILE = "config.json"
@@ -114,7 +115,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the settings of a nexwarp run ({error})") from None
+        raise ValueError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
@@ -123,7 +124,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
     try:
         return dict(read_json(path)) if path.is_file() else {}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
+        raise ValueError(f"{path}: expected the metrics of a nexwarp run ({one_line(error)})") from None
 
 
 def keep_camera_path(run: Path, content: bytes) -> str:

@@ -22,6 +22,7 @@ from nexwarp.data.images import (
     resize_mask,
 )
 from nexwarp.data.lens import FACES, PANORAMA, Lens, Maps, Pinhole
+from nexwarp.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
@@ -104,7 +105,10 @@ class ViewReader:
         _check_enlarged(photo.file, size, (lens.width, lens.height), "its camera")
         if photo.mask is not None and not self.alpha_mask:
             _check_mask(photo, size)
-        target = _pinhole(lens)
+        try:
+            target = _pinhole(lens)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{photo.file}: the camera of this image is not usable: {one_line(error)}") from error
         ratio = width / lens.width, height / lens.height
         target = target.resized(
             *(max(round(a * b), 1) for a, b in zip((target.width, target.height), ratio, strict=True))
