@@ -24,7 +24,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -182,7 +182,10 @@ def _saved(failure: Failure, folder: Path, failed: Path) -> Failure:
     kept = failed / f"{failure.target}-{failure.index}-{failure.kind}"
     kept.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(folder, kept, symlinks=True)
+    if folder.is_dir():
+        shutil.copytree(folder, kept, symlinks=True)
+    else:
+        kept.mkdir()
     (kept / "failure.txt").write_text(failure.detail, encoding="utf-8", errors="backslashreplace")
     return Failure(failure.target, failure.index, failure.kind, failure.detail, kept)
 
@@ -207,31 +210,44 @@ def _work(
     os.dup2(null, 2)
     _limit_memory()
     end = time.monotonic() + left
-    inputs = loaded = 0
-    refusals: Counter = Counter()
-    for index, files in _inputs(target, valid, first, last, seed, driver):
+    counts = Result()
+
+    def run(index: int, files: Files) -> bool:
+        """Run an input; return whether there is time for another."""
         target.write(folder, files)
         now[0], now[1] = float(index), time.monotonic()
         outcome = judge(target.read, folder)
-        inputs += 1
+        counts.inputs += 1
         if isinstance(outcome, Failure):
             kept = folder.with_name(f"failed-{index}")
             shutil.copytree(folder, kept, symlinks=True)
             report.send(("failure", outcome.kind, index, outcome.detail, str(kept)))
         elif outcome == "loaded":
-            loaded += 1
+            counts.loaded += 1
         else:
-            refusals[outcome] += 1
+            counts.refusals[outcome] += 1
         now[0], now[1] = float(index + 1), time.monotonic()
-        if inputs % 50 == 0:
-            report.send(("counts", inputs, loaded, refusals))
-            inputs, loaded, refusals = 0, 0, Counter()
-            if time.monotonic() > end:
+        if counts.inputs % 50 == 0:
+            _report(report, counts)
+        return time.monotonic() < end
+
+    if driver == "hypothesis":
+        _draw(target, valid, first, last, seed, run)
+    else:
+        for index in range(first, last):
+            rng = random.Random(f"{seed}/{target.name}/{index}")
+            if not run(index, damage(rng, rng.choice(valid), target.fuzzed)):
                 break
-    report.send(("counts", inputs, loaded, refusals))
+    _report(report, counts)
     report.close()
     shutil.rmtree(folder.parent / "cache", ignore_errors=True)
     os._exit(0)
+
+
+def _report(report: Connection, counts: Result) -> None:
+    report.send(("counts", counts.inputs, counts.loaded, Counter(counts.refusals)))
+    counts.inputs = counts.loaded = 0
+    counts.refusals.clear()
 
 
 def _limit_memory() -> None:
@@ -245,22 +261,14 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _inputs(
-    target: Target, valid: list[Files], first: int, last: int, seed: int, driver: str
-) -> Iterator[tuple[int, Files]]:
-    if driver == "hypothesis":
-        yield from _drawn(target, valid, first, last, seed)
-        return
-    for index in range(first, last):
-        rng = random.Random(f"{seed}/{target.name}/{index}")
-        yield index, damage(rng, rng.choice(valid), target.fuzzed)
-
-
-def _drawn(target: Target, valid: list[Files], first: int, last: int, seed: int) -> Iterator[tuple[int, Files]]:
-    """Inputs of Hypothesis' strategies: drawn first, then run, for its own loop would hold the process on a failure."""
+def _draw(
+    target: Target, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], bool]
+) -> None:
+    """Run inputs that Hypothesis draws."""
     import hypothesis
 
-    drawn: list[Files] = []
+    index = first
+    there_is_time = True
 
     @hypothesis.seed(f"{seed}/{target.name}/{first}")
     @hypothesis.settings(
@@ -271,11 +279,13 @@ def _drawn(target: Target, valid: list[Files], first: int, last: int, seed: int)
         suppress_health_check=list(hypothesis.HealthCheck),
     )
     @hypothesis.given(strategy(valid, target.fuzzed))
-    def collect(files: Files) -> None:
-        drawn.append(files)
+    def one(files: Files) -> None:
+        nonlocal index, there_is_time
+        if there_is_time and index < last:
+            there_is_time = run(index, files)
+            index += 1
 
-    collect()
-    yield from enumerate(drawn, first)
+    one()
 
 
 def drive_atheris(target: Target, seconds: float, failed: Path) -> None:

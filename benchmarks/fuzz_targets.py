@@ -238,17 +238,17 @@ def _images(folder: Path) -> list[Files]:
     rng = np.random.default_rng(0)
     color = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8))
     wide = Image.fromarray(rng.integers(0, 2**16, (HEIGHT, WIDTH), dtype=np.uint16))
+    rgb, grey, palette = (color.convert(mode) for mode in ("RGB", "L", "P"))
     pictures = {
-        "rgb.jpg": color.convert("RGB"), "grey.jpg": color.convert("L"), "rgba.png": color, "grey.png": color.convert("L"),
-        "bits.png": color.convert("1"), "palette.png": color.convert("P"), "wide.png": wide, "wide.tiff": wide,
-        "rgb.tiff": color.convert("RGB"), "palette.gif": color.convert("P"), "rgba.webp": color, "rgb.bmp": color.convert("RGB"),
-        "rgb.ppm": color.convert("RGB"), "rgba.tga": color, "rgb.jp2": color.convert("RGB"), "cmyk.jpg": color.convert("CMYK"),
+        "rgb.jpg": rgb, "grey.jpg": grey, "cmyk.jpg": color.convert("CMYK"), "rgba.png": color, "grey.png": grey,
+        "bits.png": color.convert("1"), "palette.png": palette, "wide.png": wide, "wide.tiff": wide, "rgb.tiff": rgb,
+        "palette.gif": palette, "rgba.webp": color, "rgb.bmp": rgb, "rgb.ppm": rgb, "rgba.tga": color, "rgb.jp2": rgb,
     }  # fmt: skip
     inputs = []
     for name, image in pictures.items():
         image.save(folder / name)
         inputs.append({"mask": (folder / name).read_bytes()})
-    color.convert("RGB").save(folder / "packed.tiff", compression="tiff_lzw")
+    rgb.save(folder / "packed.tiff", compression="tiff_lzw")
     return [*inputs, {"mask": (folder / "packed.tiff").read_bytes()}]
 
 

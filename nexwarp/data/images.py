@@ -1,5 +1,7 @@
 """Reading photos and masks into uint8 tensors, and shrinking them."""
 
+import io
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +32,16 @@ def quiet_pillow() -> Iterator[None]:
         yield
 
 
+class _Bounded(io.BufferedReader):
+    """A file of which no more is read than there is."""
+
+    # Python allocates what is asked for, and PIL asks for lengths as damaged files give them.
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > os.fstat(self.fileno()).st_size:
+            size = -1
+        return super().read(size)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator:
     """A PIL image; whatever goes wrong with it until the end is told in one line."""
@@ -38,7 +50,8 @@ def _opened(path: Path) -> Iterator:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
-        with Image.open(path, formats=[name for name in FORMATS if name in _registered()]) as image:
+        formats = [name for name in FORMATS if name in _registered()]
+        with _Bounded(io.FileIO(path)) as file, Image.open(file, formats=formats) as image:
             # Also where another library took PIL's guard off.
             pixels = image.width * image.height
             if pixels > MAX_PIXELS:

@@ -110,8 +110,8 @@ class Lens:
             raise ValueError(f"K: expected focal lengths > 0, got {', '.join(f'{f:g}' for f in focal)}")
         if min(focal, default=1.0) < MIN_FOCAL or max(map(abs, self.params), default=1.0) > MAX_PARAMETER:
             raise ValueError(
-                f"camera model {self.model}: expected focal lengths of at least {MIN_FOCAL:g} and parameters of at most "
-                f"{MAX_PARAMETER:g}, got {self.params}"
+                f"camera model {self.model}: expected focal lengths of at least {MIN_FOCAL:g} and parameters of at "
+                f"most {MAX_PARAMETER:g}, got {self.params}"
             )
 
     @property
