@@ -226,8 +226,10 @@ def _matrix(where: str, key: str, value: Any) -> np.ndarray:
         matrix = np.array([*rows[:3], rows[3] if len(rows) == 4 else [0, 0, 0, 1]], dtype=np.float64)
     except OverflowError:
         raise ValueError(f"{where}: {key}: expected finite numbers, got {short(value)}") from None
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{where}: {key}: expected finite numbers, got {short(value)}")
+    if not (np.abs(matrix) <= LARGEST_COORDINATE).all():
+        raise ValueError(
+            f"{where}: {key}: expected finite numbers of at most {LARGEST_COORDINATE:g}, got {short(value)}"
+        )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {short(rows[3])}")
     return matrix
