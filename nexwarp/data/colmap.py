@@ -5,13 +5,21 @@ from pathlib import Path
 
 import numpy as np
 
-from nexwarp.data.capture import Capture, Cloud, Photo, check_points, check_unique, inside_folder, safe_name
+from nexwarp.data.capture import (
+    LARGEST_COORDINATE,
+    Capture,
+    Cloud,
+    Photo,
+    check_points,
+    check_unique,
+    inside_folder,
+    safe_name,
+)
 from nexwarp.data.colmap_files import CameraRecord, ImageRecord, PointRecords, Records, read_binary, read_text
 from nexwarp.data.lens import Lens
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
-LARGEST = 1e15  # of a pose or an error: squares stay finite in single precision
 FOLDERS = ("sparse/0", "sparse", ".")
 
 
@@ -87,7 +95,7 @@ def _photo(
 def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
     """(4, 4) of a rotation wxyz and a translation."""
     quat, shift = np.array(pose[:4]), np.array(pose[4:])
-    if not (np.abs(pose) <= LARGEST).all() or not np.abs(quat).max() >= 1 / LARGEST:
+    if not (np.abs(pose) <= LARGEST_COORDINATE).all() or not np.abs(quat).max() >= 1 / LARGEST_COORDINATE:
         raise ValueError(f"{where}: expected a finite pose with a rotation, got {pose}")
     quat /= np.abs(quat).max()
     w, x, y, z = quat / np.linalg.norm(quat)
@@ -106,8 +114,10 @@ def _seen(records: Records, folder: Path) -> list[np.ndarray]:
     points = records.points
     identities = np.array(list(records.images), np.int64)
     ascending = np.argsort(identities)
-    place = np.searchsorted(identities[ascending], points.seen_by)
-    known = identities[ascending][np.minimum(place, len(identities) - 1)] == points.seen_by
+    # Of observations there are many more than of anything else: what is made of them is made in place.
+    pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
+    np.minimum(pairs, len(identities) - 1, out=pairs)
+    known = identities[ascending].astype(np.uint32)[pairs] == points.seen_by
     if not known.all():
         first = int(np.flatnonzero(~known)[0])
         raise ValueError(
@@ -115,7 +125,10 @@ def _seen(records: Records, folder: Path) -> list[np.ndarray]:
             "which the model does not have"
         )
     # By image, then by point; a point that an image sees twice counts once.
-    pairs = np.unique(place * len(points.ids) + points.points)
+    pairs *= len(points.ids)
+    pairs += points.points
+    pairs.sort()
+    pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
     ends = np.searchsorted(pairs, np.arange(1, len(identities)) * len(points.ids))
     positions = points.positions.astype(np.float32)
     seen: list[np.ndarray] = [positions[part % len(points.ids)] for part in np.split(pairs, ends)]
@@ -126,7 +139,7 @@ def _seen(records: Records, folder: Path) -> list[np.ndarray]:
 
 def _cloud(points: PointRecords, folder: Path) -> Cloud:
     check_points(folder, points.positions, "3D points", lambda index: f"point id {points.ids[index]}")
-    bad = ~(np.abs(points.errors) <= LARGEST)
+    bad = ~(np.abs(points.errors) <= LARGEST_COORDINATE)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
         raise ValueError(

@@ -68,7 +68,7 @@ class PointRecords:
         errors: (P,) float64, mean reprojection errors.
         lengths: (P,) int64, observations of each.
         seen_by: (E,) uint32, image ids of the observations, point after point in the order of `points`.
-        points: (E,) int64, index of the point of each.
+        points: (E,) int32, index of the point of each.
     """
 
     ids: np.ndarray
@@ -218,6 +218,7 @@ def _binary_points(file: _Reader) -> PointRecords:
             tracks += file.read(8 * length)
     points = np.frombuffer(heads, POINT_RECORD)
     seen_by = np.frombuffer(tracks, "<u4")[::2].copy()
+    del tracks
     return _sorted(file.path, points["id"], points["xyz"], points["rgb"], points["error"], points["length"], seen_by)
 
 
@@ -330,7 +331,7 @@ def _sorted(
     twice = np.flatnonzero(ids[1:] == ids[:-1])
     if len(twice):
         raise ValueError(f"{path}: damaged, expected each id once, got {ids[twice[0]]} twice")
-    rank = np.empty_like(order)
+    rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))
     lengths = lengths.astype(np.int64)
     return PointRecords(

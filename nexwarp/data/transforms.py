@@ -12,7 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from nexwarp.data.capture import Capture, Cloud, Photo, check_points, check_unique, inside_folder, safe_name, short
+from nexwarp.data.capture import (
+    LARGEST_COORDINATE,
+    Capture,
+    Cloud,
+    Photo,
+    check_points,
+    check_unique,
+    inside_folder,
+    safe_name,
+    short,
+)
 from nexwarp.data.images import image_size, read_image
 from nexwarp.data.lens import Lens
 from nexwarp.data.ply import read_ply
