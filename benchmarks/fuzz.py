@@ -11,6 +11,7 @@ paths in nexwarp's code (one target, in a process of its own; `pip install ather
 """
 
 import argparse
+import inspect
 import multiprocessing
 import os
 import random
@@ -212,8 +213,14 @@ def _work(
     end = time.monotonic() + left
     counts = Result()
 
-    def run(index: int, files: Files) -> bool:
-        """Run an input; return whether there is time for another."""
+    def finish() -> None:
+        _report(report, counts)
+        report.close()
+        shutil.rmtree(folder.parent / "cache", ignore_errors=True)
+        os._exit(0)
+
+    def run(index: int, files: Files) -> None:
+        """Run an input; end the process when time is up."""
         target.write(folder, files)
         now[0], now[1] = float(index), time.monotonic()
         outcome = judge(target.read, folder)
@@ -229,19 +236,16 @@ def _work(
         now[0], now[1] = float(index + 1), time.monotonic()
         if counts.inputs % 50 == 0:
             _report(report, counts)
-        return time.monotonic() < end
+        if time.monotonic() > end:
+            finish()
 
     if driver == "hypothesis":
         _draw(target, valid, first, last, seed, run)
     else:
         for index in range(first, last):
             rng = random.Random(f"{seed}/{target.name}/{index}")
-            if not run(index, damage(rng, rng.choice(valid), target.fuzzed)):
-                break
-    _report(report, counts)
-    report.close()
-    shutil.rmtree(folder.parent / "cache", ignore_errors=True)
-    os._exit(0)
+            run(index, damage(rng, rng.choice(valid), target.fuzzed))
+    finish()
 
 
 def _report(report: Connection, counts: Result) -> None:
@@ -262,13 +266,12 @@ def _limit_memory() -> None:
 
 
 def _draw(
-    target: Target, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], bool]
+    target: Target, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], None]
 ) -> None:
     """Run inputs that Hypothesis draws."""
     import hypothesis
 
     index = first
-    there_is_time = True
 
     @hypothesis.seed(f"{seed}/{target.name}/{first}")
     @hypothesis.settings(
@@ -280,9 +283,9 @@ def _draw(
     )
     @hypothesis.given(strategy(valid, target.fuzzed))
     def one(files: Files) -> None:
-        nonlocal index, there_is_time
-        if there_is_time and index < last:
-            there_is_time = run(index, files)
+        nonlocal index
+        if index < last:
+            run(index, files)
             index += 1
 
     one()
@@ -312,7 +315,11 @@ def drive_atheris(target: Target, seconds: float, failed: Path) -> None:
         if isinstance(outcome, Failure):
             raise RuntimeError(f"{outcome.kind}: {outcome.detail}")
 
-    atheris.instrument_all()
+    for name, module in list(sys.modules.items()):
+        if name.startswith("nexwarp.") and not name.startswith("nexwarp.kernels"):
+            for function in vars(module).values():
+                if inspect.isfunction(function) and function.__module__ == name:
+                    atheris.instrument_func(function)
     options = [f"-max_total_time={int(seconds)}", f"-timeout={HANG:g}", "-rss_limit_mb=4096"]
     atheris.Setup([sys.argv[0], *options, f"-artifact_prefix={failed}/{target.name}-", str(corpus)], one)
     atheris.Fuzz()
