@@ -13,11 +13,12 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.errors import CheckpointError, FormatError, MissingError
-from nexwarp.files import sync, write_atomically
+from nexwarp.files import one_line, sync, write_atomically
+from nexwarp.json_files import parse_json, read_json
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_finite, check_range, check_tensors
 from nexwarp.surfels import Surfels
-from nexwarp.texture import NeuralTexture
+from nexwarp.texture import LARGEST_RESOLUTION, NeuralTexture
 
 FORMAT_VERSION = 1
 CHECKPOINT_VERSION = 1
@@ -27,6 +28,9 @@ CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
 FRAME = "COLMAP world, cameras x right, y down, z forward"
 # What reading a damaged file of ours may raise.
 READ_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
+DTYPES = ("F16", "F32")
+LARGEST_COLOR, LARGEST_LENGTH = 1e6, 1e15
+ROUNDING = 1 + 1e-6
 RENDER_OPTIONS = ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
 
 
@@ -95,33 +99,65 @@ def load(path: str | os.PathLike[str]) -> Model:
     try:
         with safe_open(path, "pt") as file:
             header = (file.metadata() or {}).get("nexwarp")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in file.keys()}
+            meta, texture = _check_header(path, header, kinds)
+            tensors = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError) as error:
-        raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({error})") from None
-    if header is None:
-        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
-    try:
-        meta = json.loads(header)
-    except (ValueError, RecursionError):
-        meta = None
-    if not isinstance(meta, dict):
-        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
-    if meta.get("format_version") != FORMAT_VERSION:
-        raise FormatError(f"{path}: expected format version {FORMAT_VERSION}, got {meta.get('format_version')}")
+        raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
         if "footprints" in tensors:
             check_tensors({"footprints": (tensors["footprints"], (len(surfels),))}, dtype=torch.float32)
             surfels.footprints = tensors["footprints"]
-        _check_options(meta)
         for name, x in tensors.items():
             check_finite(name, x)
-        texture = NeuralTexture(**meta.pop("texture"))
-        texture.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
+        field = NeuralTexture(**texture)
+        field.load_state_dict({name[8:]: x.float() for name, x in tensors.items() if name.startswith("texture.")})
+        check_range("texture.resolutions", float(field.resolutions.min()), 0.0)
+        check_range("texture.resolutions", float(field.resolutions.max()), 0.0, LARGEST_RESOLUTION * ROUNDING)
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-        reason = " ".join(str(error).split())  # torch's go over several lines
-        raise FormatError(f"{path}: the tensors do not make a model ({reason})") from None
-    return Model(surfels, texture, meta)
+        raise _no_model(path, error) from None
+    return Model(surfels, field, meta)
+
+
+def _check_header(
+    path: Path, header: str | None, kinds: Mapping[str, tuple[str, list[int]]]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Metadata and the texture's config, checked against dtypes and shapes before anything is allocated."""
+    if header is None:
+        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
+    try:
+        meta = parse_json(f"{path}: nexwarp metadata", header.encode("utf-8", "surrogatepass"))
+    except ValueError:
+        meta = None
+    if not isinstance(meta, dict):
+        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {header[:40]!r}")
+    if meta.get("format_version") != FORMAT_VERSION:
+        raise FormatError(
+            f"{path}: expected format version {FORMAT_VERSION}, got {one_line(meta.get('format_version'))}"
+        )
+    try:
+        _check_options(meta)
+        texture = meta.pop("texture")
+        if not isinstance(texture, dict):
+            raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
+        with torch.device("meta"):  # shapes without memory, whatever sizes the metadata names
+            expected = {f"texture.{name}": list(x.shape) for name, x in NeuralTexture(**texture).state_dict().items()}
+        for name, (dtype, shape) in kinds.items():
+            if dtype not in DTYPES:
+                raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
+            if name.startswith("texture.") and expected.get(name) != shape:
+                raise ValueError(f"{name}: expected shape {expected.get(name)}, got {shape}")
+        missing = sorted(expected.keys() - kinds.keys())
+        if missing:
+            raise ValueError(f"expected the tensor {missing[0]}, found none")
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise _no_model(path, error) from None
+    return meta, texture
+
+
+def _no_model(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: the tensors do not make a model ({one_line(error)})")
 
 
 def _check_options(meta: dict[str, Any]) -> None:
@@ -139,6 +175,13 @@ def _check_options(meta: dict[str, Any]) -> None:
     colour = meta["background"]
     if not (isinstance(colour, list) and len(colour) == 3 and all(type(x) in (int, float) for x in colour)):
         raise ValueError(f"background: expected three numbers, got {colour!r}")
+    for x in colour:
+        check_range("background", x, -LARGEST_COLOR, LARGEST_COLOR)
+    for name in ("near", "scene_scale"):
+        if name in meta:
+            if type(meta[name]) not in (int, float):
+                raise ValueError(f"{name}: expected a number, got {meta[name]!r:.60}")
+            check_range(name, meta[name], 0.0, LARGEST_LENGTH)
 
 
 def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
@@ -254,7 +297,7 @@ def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> Non
 def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
     """Read what `save_cameras` wrote, float32 on the CPU."""
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         return {
             group: {
                 name: Camera(torch.tensor(c["viewmat"]), torch.tensor(c["K"]), c["width"], c["height"], near=c["near"])
@@ -264,8 +307,8 @@ def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
         }
     except FileNotFoundError:
         raise MissingError(f"{path}: expected the run's cameras, found no such file") from None
-    except READ_ERRORS as error:
-        raise FormatError(f"{path}: expected named cameras as JSON ({error})") from None
+    except (*READ_ERRORS, RuntimeError, OverflowError) as error:
+        raise FormatError(f"{path}: expected named cameras as JSON ({one_line(error)})") from None
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -15,6 +15,7 @@ from nexwarp.ops.checks import check_range
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
+LARGEST_NUMBER = 2**53
 MASK_MODES = ("ignore", "background")
 LARGEST = 2**53  # of numbers in settings: all integers up to there are floats too
 
@@ -162,14 +163,37 @@ class Config:
             "densify": DensifyConfig,
         }
         try:
-            data = {k: parts[k](**_tuples(v)) if k in parts else v for k, v in data.items()}
-            return cls(**_tuples(data))
+            data = {k: parts[k](**_checked(parts[k], _tuples(v), k)) if k in parts else v for k, v in data.items()}
+            return cls(**_checked(cls, _tuples(data), "config"))
         except (TypeError, AttributeError) as error:
             raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:
     return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+
+
+def _checked(cls: type, data: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return settings whose values have their fields' types; numbers are finite."""
+    types = get_type_hints(cls)
+    for name, value in data.items():
+        if name in types and not _fits(value, types[name]):
+            kind = getattr(types[name], "__name__", types[name]) if not get_args(types[name]) else types[name]
+            raise ValueError(f"{where}: {name}: expected {kind}, got {value!r:.60}")
+    return data
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_fits, value, kinds))
+    if get_args(kind):  # a union
+        return any(_fits(value, one) for one in get_args(kind))
+    if isinstance(value, bool) or kind not in (int, float):
+        return isinstance(value, kind)
+    if not isinstance(value, int if kind is int else (int, float)):
+        return False
+    return abs(value) <= LARGEST_NUMBER
 
 
 def with_settings(config: Config, settings: dict[str, Any]) -> Config:

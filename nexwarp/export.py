@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nexwarp.files import written_aside
+from nexwarp.files import one_line, written_aside
 from nexwarp.ops.checks import check_finite, check_range
 from nexwarp.surfels import Surfels
 
@@ -89,11 +89,12 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected surfels as PLY")
     with open(path, "rb") as file:
-        data = file.read()
-    count, dtype, start = _header(path, data)
-    if len(data) != start + count * dtype.itemsize:
-        raise ValueError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {len(data)}")
-    vertices = np.frombuffer(data, dtype, count, start)
+        count, dtype, start = _header(path, file.read(LONGEST_HEADER))
+        size = path.stat().st_size
+        if size != start + count * dtype.itemsize:
+            raise ValueError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {size}")
+        file.seek(start)
+        vertices = np.fromfile(file, dtype, count)
     rest = sum(name.startswith("f_rest_") for name in dtype.names)
     expected = ["x", "y", "z", *_names("f_dc", 3), *_names("f_rest", rest), "opacity", *_names("scale", 2)]
     expected += [*_names("rot", 4), *_names("gamma", 2)]
@@ -123,7 +124,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         shN = coefficients.reshape(count, 3, rest // 3).mT.contiguous()
         return Surfels({**{name: x.contiguous() for name, x in raw.items()}, "shN": shN})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected nexwarp surfels ({error})") from None
+        raise ValueError(f"{path}: expected nexwarp surfels ({one_line(error)})") from None
 
 
 def _names(name: str, count: int) -> list[str]:
@@ -182,5 +183,5 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
             raise ValueError(f"expected a number of vertices, got {count}")
         dtype = np.dtype([(words[2], TYPES[words[1]]) for words in properties])
     except ValueError as error:
-        raise ValueError(f"{path}: expected the header of nexwarp surfels ({error})") from None
+        raise ValueError(f"{path}: expected the header of nexwarp surfels ({one_line(error)})") from None
     return int(count), dtype, end + len(mark)

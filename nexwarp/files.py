@@ -11,6 +11,15 @@ from nexwarp.errors import StorageError
 LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\.[^.]*)?")
 
 
+def one_line(text: object, limit: int = 300) -> str:
+    """Text that came out of a file, for a message: on one line, printable, of at most `limit` characters."""
+    line = "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in " ".join(str(text)[: 4 * limit].split())
+    )
+    return line if len(line) <= limit else f"{line[: limit - 3]}..."
+
+
 @contextmanager
 def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary name beside `path`, with its suffix, to write to; it becomes `path` when the block ends.

@@ -16,7 +16,8 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.files import written_aside
+from nexwarp.files import one_line, written_aside
+from nexwarp.json_files import read_json
 
 # OpenGL camera axes in those of OpenCV, and back.
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -25,6 +26,8 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 EXACT = 1e-9
 LAST_ROW = 1e-6
+MAX_SIDE = 2**16  # pixels
+LARGEST = 1e15  # of a number: squares stay finite in single precision
 
 
 @dataclass(frozen=True)
@@ -160,9 +163,9 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
         if "frames" in data:
             return CameraPath(list(_frames(path, data, near).values()), None)
         found = ", ".join(sorted(data)[:8]) or "none"
-        raise ValueError(f"{path}: expected the key camera_path or frames, found {found}")
+        raise ValueError(f"{path}: expected the key camera_path or frames, found {one_line(found)}")
     if data.get("camera_type", "perspective") != "perspective":
-        raise ValueError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r}")
+        raise ValueError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
     fps = _number(path, data, "fps", above=0.0) if "fps" in data else None
     entries = _list(path, data, "camera_path")
@@ -183,7 +186,7 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
 def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
     model = data.get("camera_model", "PINHOLE")
     if model not in PINHOLES:
-        raise ValueError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r}")
+        raise ValueError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
     undo = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in data:
         undo = torch.linalg.inv(_pose(str(path), data, "applied_transform"))
@@ -206,7 +209,7 @@ def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
             fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
         cx = _number(where, values, "cx") if "cx" in values else width / 2
         cy = _number(where, values, "cy") if "cy" in values else height / 2
-        name = str(frame.get("file_path", f"{i:04d}"))
+        name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
         cameras[name] = _camera(where, undo @ pose, (fx, fy, cx, cy), width, height, near)
@@ -240,10 +243,7 @@ def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected cameras as JSON")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected cameras as JSON, but it cannot be read ({error})") from None
+    data = read_json(path)
     if not isinstance(data, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(data).__name__}")
     return data
@@ -257,10 +257,10 @@ def _write(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
 def _list(path: Path, data: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     entries = data[key]
     if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{path}: {key}: expected a list of at least one camera, got {str(entries)[:40]}")
+        raise ValueError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise ValueError(f"{path}: {key}[{i}]: expected a JSON object, got {str(entry)[:40]}")
+            raise ValueError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
     return entries
 
 
@@ -270,15 +270,18 @@ def _number(
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
+    fits = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (fits and above < value < below and abs(value) <= LARGEST):
         least = f" above {above:g}" if above > -math.inf else ""
         most = f" below {below:g}" if below < math.inf else ""
-        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r}")
+        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r:.60}")
     return float(value)
 
 
 def _size(where: str | Path, values: Mapping[str, Any], key: str) -> int:
     size = _number(where, values, key, above=0.0)
+    if size > MAX_SIDE:
+        raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
     if size != int(size):
         raise ValueError(f"{where}: {key}: expected a whole number of pixels, got {size:g}")
     return int(size)
@@ -293,7 +296,7 @@ def _pose(where: str, values: Mapping[str, Any], key: str) -> torch.Tensor:
     except (TypeError, ValueError, OverflowError, RuntimeError):
         matrix = torch.empty(0)
     if tuple(matrix.shape) not in ((16,), (12,), (4, 4), (3, 4)):
-        raise ValueError(f"{where}: {key}: expected a 4x4 matrix of numbers, got {str(values[key])[:60]}")
+        raise ValueError(f"{where}: {key}: expected a 4x4 matrix of numbers, got {one_line(values[key], 60)}")
     matrix = matrix.reshape(-1, 4)
     if len(matrix) == 3:
         matrix = torch.cat([matrix, matrix.new_tensor([[0.0, 0.0, 0.0, 1.0]])])

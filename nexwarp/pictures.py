@@ -11,12 +11,15 @@ import numpy as np
 import torch
 
 from nexwarp.errors import StorageError
-from nexwarp.files import written_aside
+from nexwarp.files import one_line, written_aside
+from nexwarp.json_files import parse_json
 from nexwarp.ops.checks import check_range
 
 ERROR_SCALE = 0.25
 CAPTION_HEIGHT = 16
 METADATA = "nexwarp"
+MAX_SIDE = 2**16  # pixels
+MAX_RATIO = 1100  # of zlib: pixels to bytes
 
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
@@ -90,18 +93,21 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
         raise FileNotFoundError(f"{path}: no such file, expected an OpenEXR file")
     parts, text = {}, ""
     try:
+        _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             for part in file.parts:
-                text = part.header.get(METADATA, text)
+                text = str(part.header.get(METADATA, text))
                 planes = {name: channel.pixels for name, channel in part.channels.items()}
                 parts[part.name()] = (set(planes), [planes[name] for name in "RGBY" if name in planes])
     except Exception as error:  # OpenEXR raises bare RuntimeErrors, and others
-        raise ValueError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({error})") from None
+        raise ValueError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
     try:
-        metadata = dict(json.loads(text)) if text else {"parts": list(parts)}
+        metadata = dict(parse_json("metadata", text.encode("utf-8", "replace"))) if text else {"parts": list(parts)}
         names = list(metadata["parts"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({error})") from None
+        raise ValueError(
+            f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({one_line(error)})"
+        ) from None
     # OpenEXR leaves out, with no more than a message, the parts that it cannot read.
     if not parts or names != list(parts):
         raise ValueError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
@@ -109,10 +115,29 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
     for name, (names, planes) in parts.items():
         if names not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
             kinds = ", ".join(sorted(names))
-            raise ValueError(f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {kinds} in part {name!r}")
+            raise ValueError(
+                f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {one_line(kinds, 60)} in part {name!r}"
+            )
         planes = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
         tensors[name] = torch.stack(planes, dim=-1) if len(planes) == 3 else planes[0]
     return tensors, metadata
+
+
+def _check_size(path: Path) -> None:
+    """Raise ValueError when the headers announce more pixels than the file can hold."""
+    import OpenEXR
+
+    total = 0
+    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+        for part in file.parts:
+            low, high = part.header["dataWindow"]
+            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+                raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+            total += width * height * 4 * len(part.header["channels"])
+    limit = MAX_RATIO * path.stat().st_size
+    if total > limit:
+        raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,6 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 
 import ctypes
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -20,7 +19,8 @@ from nexwarp.checkpoint import READ_ERRORS
 from nexwarp.config import Config
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
-from nexwarp.files import is_leftover, remove_leftovers, write_atomically, written_aside
+from nexwarp.files import is_leftover, one_line, remove_leftovers, write_atomically, written_aside
+from nexwarp.json_files import read_json
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
@@ -142,7 +142,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
     if not path.is_file():
         raise MissingError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         scene = data["scene"]
         if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
             raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
@@ -151,14 +151,14 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
         return SceneSource(**data["scene"]), Config.from_dict(data["config"]), data
     except READ_ERRORS as error:
-        raise FormatError(f"{path}: expected the settings of a nexwarp run ({error})") from None
+        raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
     """Read a run's metrics; nothing where there are none yet."""
     path = run / METRICS_FILE
     try:
-        metrics = json.loads(path.read_text()) if path.is_file() else {}
+        metrics = read_json(path) if path.is_file() else {}
         if not isinstance(metrics, dict):
             raise ValueError(f"expected an object, got {type(metrics).__name__}")
         for name in ("psnr", "ssim"):
@@ -166,7 +166,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
                 raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
         return metrics
     except READ_ERRORS as error:
-        raise FormatError(f"{path}: expected the metrics of a nexwarp run ({error})") from None
+        raise FormatError(f"{path}: expected the metrics of a nexwarp run ({one_line(error)})") from None
 
 
 def keep_camera_path(run: Path, content: bytes) -> str:

@@ -138,7 +138,7 @@ def frame(**changes: Any) -> dict[str, Any]:
 
 SINGULAR = torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0])).flatten().tolist()
 BAD = [
-    ("{", "expected cameras as JSON, but it cannot be read"),
+    ("{", "expected JSON, could not parse it"),
     ("[]", "expected a JSON object, got list"),
     ({}, "expected the key camera_path or frames, found none"),
     ({"poses": [], "fps": 3}, "expected the key camera_path or frames, found fps, poses"),

@@ -1,11 +1,16 @@
 """What a scene's files say before a pixel is read: photos with their cameras, and points."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
 from nexwarp.data.lens import Lens
+
+MAX_PART, MAX_PATH = 240, 1024  # bytes of a file name
+LARGEST_COORDINATE = 1e15  # squares stay finite in single precision
 
 
 @dataclass(frozen=True)
@@ -73,10 +78,63 @@ class Capture:
     background: tuple[float, float, float] | None = None
 
 
-def leaves_folder(name: str) -> bool:
-    """Whether a file name of a scene is no printable relative path below the scene's folder, on any system."""
-    return (
+def safe_name(where: str, name: str, folder: str) -> str:
+    """Normalise a file name of a scene: "/" between its parts, none of them ".".
+
+    Raises:
+        ValueError: it is no printable relative path below the scene's folder, on any system, or longer than one has.
+    """
+    if (
         not name
         or not name.isprintable()
         or any(".." in path.parts or path.anchor for path in (PurePosixPath(name), PureWindowsPath(name)))
-    )
+    ):
+        raise ValueError(f"{where} {short(name)} leaves the {folder}, expected a relative path below it")
+    path = PurePosixPath(name)
+    if not path.parts:
+        raise ValueError(f"{where} {short(name)} names no file, expected a relative path below the {folder}")
+    # What a mask or an undistorted photo adds to a name has to fit as well.
+    if len(name.encode()) > MAX_PATH or any(len(part.encode()) > MAX_PART for part in path.parts):
+        raise ValueError(f"{where} {short(name)}: expected at most {MAX_PART} bytes a part and {MAX_PATH} in all")
+    return str(path)
+
+
+def inside_folder(where: str, path: Path, folder: Path) -> Path:
+    """Return a path below a scene's folder unless symbolic links lead it out; the folder itself may be a link.
+
+    Raises:
+        ValueError: they do.
+    """
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links in a circle
+        inside = False
+    if not inside:
+        raise ValueError(f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it")
+    return path
+
+
+def check_unique(source: Path, photos: list[Photo]) -> None:
+    """Raise ValueError when two photos have one name."""
+    seen: set[str] = set()
+    for photo in photos:
+        if photo.name in seen:
+            raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
+        seen.add(photo.name)
+
+
+def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:
+    """Raise ValueError naming the first of (P, 3) positions that is not finite or is absurdly far."""
+    bad = ~(np.abs(positions) <= LARGEST_COORDINATE).all(axis=1)
+    if bad.any():
+        index = int(np.flatnonzero(bad)[0])
+        where = tuple(positions[index].tolist())
+        raise ValueError(
+            f"{source}: expected finite {what}, got {where} ({name(index)}); at most {LARGEST_COORDINATE:g} from 0"
+        )
+
+
+def short(value: Any) -> str:
+    """What a file holds, for a message of one line."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,19 +1,26 @@
-"""COLMAP models, read through pycolmap into plain numpy arrays; nothing of pycolmap leaves this file."""
+"""COLMAP models: where they lie, and what their records say about photos and points."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nexwarp.data.capture import Capture, Cloud, Photo, leaves_folder
-from nexwarp.data.colmap_files import check_binary_model
-from nexwarp.data.lens import Lens, pycolmap_module
+from nexwarp.data.capture import (
+    LARGEST_COORDINATE,
+    Capture,
+    Cloud,
+    Photo,
+    check_points,
+    check_unique,
+    inside_folder,
+    safe_name,
+)
+from nexwarp.data.colmap_files import CameraRecord, ImageRecord, PointRecords, Records, read_binary, read_text
+from nexwarp.data.lens import Lens
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
 FOLDERS = ("sparse/0", "sparse", ".")
-# What pycolmap 4.2 raises on damaged files: for a missing rig IndexError, for absurd counts MemoryError.
-READ_ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError, OverflowError)
 
 
 def has_model(path: Path) -> bool:
@@ -49,76 +56,93 @@ def read_model(path: Path, images: Path) -> Capture:
 
     Raises:
         FileNotFoundError: there is no model.
-        ValueError: the model is damaged, has no registered image, a camera that is not usable, an image name that
-            leaves the images folder, or points that are not finite.
+        ValueError: the model is damaged, has no registered image, a camera or pose that is not usable, an image name
+            that leaves the images folder or comes twice, or points that are not finite.
     """
     folder, suffix = find_model(path)
-    if suffix == "bin":
-        check_binary_model(folder)
-    reconstruction = pycolmap_module().Reconstruction()
-    read = reconstruction.read_binary if suffix == "bin" else reconstruction.read_text
-    try:
-        read(str(folder))
-    except READ_ERRORS as error:
-        detail = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"{folder}: not a readable COLMAP model ({suffix}), damaged or truncated: {detail}") from error
-    if suffix == "bin":
-        _check_cameras_size(folder / "cameras.bin", reconstruction.cameras.values())
-    registered = [reconstruction.image(index) for index in reconstruction.reg_image_ids()]
-    if not registered:
+    records = (read_binary if suffix == "bin" else read_text)(folder)
+    if not records.images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
-    cloud, seen = _points(reconstruction, folder), _seen(reconstruction)
-    photos = [_photo(image, folder, images, seen.get(image.image_id, {})) for image in registered]
+    lenses: dict[int, Lens] = {}
+    photos = [_photo(image, records.cameras, lenses, folder, images) for image in records.images.values()]
+    check_unique(folder, photos)
+    if not len(records.points.ids):
+        return Capture(folder, sorted(photos, key=lambda photo: photo.name), None)
+    cloud = _cloud(records.points, folder)
+    photos = [
+        dataclasses.replace(photo, points=points) for photo, points in zip(photos, _seen(records, folder), strict=True)
+    ]
     return Capture(folder, sorted(photos, key=lambda photo: photo.name), cloud)
 
 
-def _check_cameras_size(path: Path, cameras: Any) -> None:
-    """Raise when cameras.bin ends early: pycolmap says nothing and leaves the last parameters unset."""
-    expected = 8 + sum(24 + 8 * len(camera.params) for camera in cameras)
-    if path.stat().st_size < expected:
-        raise ValueError(f"{path}: truncated, expected {expected} bytes, got {path.stat().st_size}")
+def _photo(
+    image: ImageRecord, cameras: dict[int, CameraRecord], lenses: dict[int, Lens], folder: Path, images: Path
+) -> Photo:
+    name = safe_name(f"{folder}: image name", image.name, "images folder")
+    where = f"{folder}: {name}"
+    file = inside_folder(f"{folder}: image name", images / name, images)
+    if image.camera not in cameras:
+        raise ValueError(f"{where}: expected a camera of the model, got id {image.camera}")
+    if image.camera not in lenses:
+        camera = cameras[image.camera]
+        try:
+            lenses[image.camera] = Lens(camera.model, camera.params, camera.width, camera.height)
+        except ValueError as error:
+            raise ValueError(f"{where}: the COLMAP camera of this image is not usable: {error}") from error
+    return Photo(name, file, _viewmat(where, image.pose), lenses[image.camera], points=np.zeros((0, 3), np.float32))
 
 
-def _photo(image: Any, folder: Path, images: Path, seen: dict[int, np.ndarray]) -> Photo:
-    try:
-        name, camera = image.name, image.camera
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{folder}: expected image names in UTF-8, got {error.object[:60]!r}") from None
-    if leaves_folder(name):
-        raise ValueError(f"{folder}: image name {name!r} leaves the images folder, expected a relative path below it")
+def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
+    """(4, 4) of a rotation wxyz and a translation."""
+    quat, shift = np.array(pose[:4]), np.array(pose[4:])
+    if not (np.abs(pose) <= LARGEST_COORDINATE).all() or not np.abs(quat).max() >= 1 / LARGEST_COORDINATE:
+        raise ValueError(f"{where}: expected a finite pose with a rotation, got {pose}")
+    quat /= np.abs(quat).max()
+    w, x, y, z = quat / np.linalg.norm(quat)
     viewmat = np.eye(4)
-    viewmat[:3] = image.cam_from_world().matrix()
-    try:
-        lens = Lens(camera.model.name, tuple(map(float, camera.params)), int(camera.width), int(camera.height))
-    except ValueError as error:
-        raise ValueError(f"{folder}: {name}: the COLMAP camera of this image is not usable: {error}") from error
-    points = np.array(list(seen.values()), dtype=np.float32).reshape(-1, 3)
-    return Photo(name, images / name, viewmat, lens, points=points)
+    viewmat[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    viewmat[:3, 3] = shift
+    return viewmat
 
 
-def _seen(reconstruction: Any) -> dict[int, dict[int, np.ndarray]]:
-    """Image id -> id -> position of the points that were triangulated from it, by ascending id."""
-    seen: dict[int, dict[int, np.ndarray]] = {}
-    for index, point in sorted(reconstruction.points3D.items()):
-        for element in point.track.elements:
-            seen.setdefault(element.image_id, {})[index] = point.xyz
-    return seen
+def _seen(records: Records, folder: Path) -> list[np.ndarray]:
+    """For each image the (M, 3) float32 positions of the points that were triangulated from it, by ascending id."""
+    points = records.points
+    identities = np.array(list(records.images), np.int64)
+    ascending = np.argsort(identities)
+    # Of observations there are many more than of anything else: what is made of them is made in place.
+    pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
+    np.minimum(pairs, len(identities) - 1, out=pairs)
+    known = identities[ascending].astype(np.uint32)[pairs] == points.seen_by
+    if not known.all():
+        first = int(np.flatnonzero(~known)[0])
+        raise ValueError(
+            f"{folder}: damaged, point {points.ids[points.points[first]]} is seen by image {points.seen_by[first]}, "
+            "which the model does not have"
+        )
+    # By image, then by point; a point that an image sees twice counts once.
+    pairs *= len(points.ids)
+    pairs += points.points
+    pairs.sort()
+    pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
+    ends = np.searchsorted(pairs, np.arange(1, len(identities)) * len(points.ids))
+    positions = points.positions.astype(np.float32)
+    seen: list[np.ndarray] = [positions[part % len(points.ids)] for part in np.split(pairs, ends)]
+    order = np.empty_like(ascending)
+    order[ascending] = np.arange(len(ascending))
+    return [seen[index] for index in order]
 
 
-def _points(reconstruction: Any, folder: Path) -> Cloud | None:
-    """The model's points by id, so that binary and text models load alike."""
-    points = sorted(reconstruction.points3D.items())
-    if not points:
-        return None
-    positions = np.array([point.xyz for _, point in points], dtype=np.float64)
-    bad = ~np.isfinite(positions).all(axis=1)
+def _cloud(points: PointRecords, folder: Path) -> Cloud:
+    check_points(folder, points.positions, "3D points", lambda index: f"point id {points.ids[index]}")
+    bad = ~(np.abs(points.errors) <= LARGEST_COORDINATE)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
-        where = tuple(positions[index].tolist())
-        raise ValueError(f"{folder}: expected finite 3D points, got {where} (point id {points[index][0]})")
-    return Cloud(
-        positions,
-        np.array([point.color for _, point in points], dtype=np.uint8),
-        np.array([point.track.length() for _, point in points], dtype=np.int32),
-        np.array([point.error for _, point in points], dtype=np.float32),
-    )
+        raise ValueError(
+            f"{folder}: expected finite reprojection errors, got {points.errors[index]} (point id {points.ids[index]})"
+        )
+    return Cloud(points.positions, points.colors, points.lengths.astype(np.int32), points.errors.astype(np.float32))

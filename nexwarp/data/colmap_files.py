@@ -1,53 +1,351 @@
-"""Whether a binary COLMAP model is complete.
+"""COLMAP's model files, binary and text, into plain arrays.
 
-pycolmap reads on past the end of a truncated file: counts become whatever memory holds, and it allocates for
-them until memory is gone (minutes, for a cut-off points3D.bin). So the lengths in
-the files are followed first.
+Read here and not through pycolmap: that allocates for counts before it knows that the file holds them, reads on past
+the end of a truncated file, stops the process on some damaged ones, and takes a Python object for each point. Poses
+and points are all that is used; rigs and frames repeat the poses of the images and are only looked at for damage.
 """
 
 import struct
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
-MIN_CAMERA = 24 + 2 * 8  # id, model, width and height, and the two parameters of the simplest model
+import numpy as np
 
+from nexwarp.data.lens import camera_models
 
-def check_binary_model(folder: Path) -> None:
-    """Raise ValueError naming the file of the model in `folder` that ends before what its counts announce."""
-    for name, end_of_record in (
-        ("cameras.bin", lambda data, start: start + MIN_CAMERA),
-        ("images.bin", _end_of_image),
-        ("points3D.bin", _end_of_point),
-        ("frames.bin", _end_of_frame),
-    ):
-        path = folder / name
-        if path.is_file() and not _is_complete(path.read_bytes(), end_of_record):
-            raise ValueError(f"{path}: truncated or damaged, expected more records than the file holds")
-
-
-def _is_complete(data: bytes, end_of_record) -> bool:
-    try:
-        (count,) = struct.unpack_from("<Q", data)
-        end = 8
-        for _ in range(count):
-            end = end_of_record(data, end)
-            if end > len(data):
-                return False
-    except (struct.error, ValueError):  # a length or a name reaches past the end
-        return False
-    return True
+MAX_CAMERAS = MAX_IMAGES = 100_000
+MAX_POINTS = 10_000_000
+MAX_OBSERVATIONS = 100_000_000
+MAX_NAME = 4096  # bytes
+MAX_LINE = 64 * 2**20  # bytes of a text file's line: a photo with a million keypoints
+CAMERA, IMAGE, POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), 51
+POINT_RECORD = np.dtype(
+    {
+        "names": ["id", "xyz", "rgb", "error", "length"],
+        "formats": ["<u8", ("<f8", 3), ("u1", 3), "<f8", "<u8"],
+        "offsets": [0, 8, 32, 35, 43],
+        "itemsize": POINT,
+    }
+)
 
 
-def _end_of_image(data: bytes, start: int) -> int:
-    """Id, pose (7 doubles), camera, name with a closing zero, and 24 bytes an observation."""
-    name_end = data.index(b"\0", start + 64) + 1
-    return name_end + 8 + 24 * struct.unpack_from("<Q", data, name_end)[0]
+@dataclass(frozen=True)
+class CameraRecord:
+    """A camera: its model by COLMAP's name, size in pixels, parameters in COLMAP's order."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
 
 
-def _end_of_point(data: bytes, start: int) -> int:
-    """Id, position, colour, error, and 8 bytes an observation."""
-    return start + 51 + 8 * struct.unpack_from("<Q", data, start + 43)[0]
+@dataclass(frozen=True)
+class ImageRecord:
+    """A registered image.
+
+    Attributes:
+        pose: (7,) rotation wxyz, of any length, and translation, world to camera.
+        camera: id of its camera.
+        name: as the file has it.
+    """
+
+    pose: tuple[float, ...]
+    camera: int
+    name: str
 
 
-def _end_of_frame(data: bytes, start: int) -> int:
+@dataclass(frozen=True)
+class PointRecords:
+    """Points by ascending id.
+
+    Attributes:
+        ids: (P,) uint64.
+        positions: (P, 3) float64.
+        colors: (P, 3) uint8.
+        errors: (P,) float64, mean reprojection errors.
+        lengths: (P,) int64, observations of each.
+        seen_by: (E,) uint32, image ids of the observations, point after point in the order of `points`.
+        points: (E,) int32, index of the point of each.
+    """
+
+    ids: np.ndarray
+    positions: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    lengths: np.ndarray
+    seen_by: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class Records:
+    """What the files of a model hold: cameras and images by id, and points."""
+
+    cameras: dict[int, CameraRecord]
+    images: dict[int, ImageRecord]
+    points: PointRecords
+
+
+def read_binary(folder: Path) -> Records:
+    """Read cameras.bin, images.bin and points3D.bin; what lies in rigs.bin and frames.bin must be whole.
+
+    Raises:
+        ValueError: naming the file, where it is truncated or damaged, or holds more than nexwarp takes.
+    """
+    for name, skip in (("rigs.bin", _skip_rig), ("frames.bin", _skip_frame)):
+        if (folder / name).is_file():
+            with _Reader(folder / name) as file:
+                for _ in range(file.count(MAX_IMAGES)):
+                    skip(file)
+                file.end()
+    with _Reader(folder / "cameras.bin") as file:
+        cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
+        file.end()
+    with _Reader(folder / "images.bin") as file:
+        images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
+        file.end()
+    with _Reader(folder / "points3D.bin") as file:
+        points = _binary_points(file)
+        file.end()
+    return Records(cameras, images, points)
+
+
+def read_text(folder: Path) -> Records:
+    """Read cameras.txt, images.txt and points3D.txt; errors as of `read_binary`, with the line."""
+    lines = _lines(folder / "cameras.txt")
+    cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines), MAX_CAMERAS)
+    images = _unique(folder / "images.txt", _text_images(folder / "images.txt"), MAX_IMAGES)
+    return Records(cameras, images, _text_points(folder / "points3D.txt"))
+
+
+class _Reader:
+    """A binary file that is never read past its end, nor allocated for beyond its size."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.position = path, 0
+        self.size = path.stat().st_size
+        self._file: BinaryIO = path.open("rb")
+
+    def __enter__(self) -> "_Reader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, size: int) -> bytes:
+        self._advance(size)
+        data = self._file.read(size)
+        if len(data) < size:
+            raise self._short()
+        return data
+
+    def skip(self, size: int) -> None:
+        self._advance(size)
+        self._file.seek(self.position)
+
+    def number(self, kind: str) -> int:
+        return struct.unpack(f"<{kind}", self.read(struct.calcsize(f"<{kind}")))[0]
+
+    def count(self, limit: int) -> int:
+        count = self.number("Q")
+        if count > self.size - self.position:  # a record takes more than a byte
+            raise self._short()
+        if count > limit:
+            raise ValueError(f"{self.path}: expected at most {limit:,} records, got {count:,}")
+        return count
+
+    def text(self) -> bytes:
+        """Bytes up to a zero."""
+        start = self.position
+        data, zero, _ = self._file.read(MAX_NAME + 1).partition(b"\0")
+        if not zero and start + MAX_NAME < self.size:
+            raise ValueError(f"{self.path}: damaged, expected image names of at most {MAX_NAME} bytes")
+        self.skip(len(data) + 1)
+        return data
+
+    def end(self) -> None:
+        if self.position != self.size:
+            raise ValueError(
+                f"{self.path}: damaged, expected {self.position:,} bytes as its counts say, got {self.size:,}"
+            )
+
+    def _advance(self, size: int) -> None:
+        self.position += size
+        if self.position > self.size:
+            raise self._short()
+
+    def _short(self) -> ValueError:
+        return ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
+
+
+def _unique(path: Path, records: Iterator[tuple[int, object]], limit: int = MAX_CAMERAS) -> dict:
+    """Records by id, each id once."""
+    found = {}
+    for identity, record in records:
+        if identity in found:
+            raise ValueError(f"{path}: damaged, expected each id once, got {identity} twice")
+        found[identity] = record
+        if len(found) > limit:
+            raise ValueError(f"{path}: expected at most {limit:,} records, got more")
+    return found
+
+
+def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:
+    identity, model, width, height = CAMERA.unpack(file.read(CAMERA.size))
+    if model not in camera_models():
+        raise ValueError(f"{file.path}: camera {identity}: expected a camera model that COLMAP knows, got {model}")
+    name, count = camera_models()[model]
+    return identity, CameraRecord(name, width, height, struct.unpack(f"<{count}d", file.read(8 * count)))
+
+
+def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
+    identity, *pose, camera = IMAGE.unpack(file.read(IMAGE.size))
+    name = _decoded(file.path, file.text())
+    file.skip(24 * file.number("Q"))  # keypoints
+    return identity, ImageRecord(tuple(pose), camera, name)
+
+
+def _binary_points(file: _Reader) -> PointRecords:
+    heads, tracks = bytearray(), bytearray()
+    for _ in range(file.count(MAX_POINTS)):
+        head = file.read(POINT)
+        heads += head
+        if length := int.from_bytes(head[43:], "little"):
+            _check_observations(file.path, len(tracks) // 8 + length)
+            tracks += file.read(8 * length)
+    points = np.frombuffer(heads, POINT_RECORD)
+    seen_by = np.frombuffer(tracks, "<u4")[::2].copy()
+    del tracks
+    return _sorted(file.path, points["id"], points["xyz"], points["rgb"], points["error"], points["length"], seen_by)
+
+
+def _skip_rig(file: _Reader) -> None:
+    """Id, sensors: the first of type and id, the others with a pose (7 doubles) or none."""
+    file.skip(4)
+    sensors = file.number("I")
+    if sensors:
+        file.skip(8)
+    for _ in range(sensors - 1):
+        file.skip(8)
+        if file.number("B"):
+            file.skip(56)
+
+
+def _skip_frame(file: _Reader) -> None:
     """Id, rig, pose (7 doubles), and 16 bytes a sensor."""
-    return start + 68 + 16 * struct.unpack_from("<I", data, start + 64)[0]
+    file.skip(64)
+    file.skip(16 * file.number("I"))
+
+
+def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Where a line is, and the line; comments and empty ones are left out."""
+    return ((where, line) for where, line in _all_lines(path) if line and not line.startswith(b"#"))
+
+
+def _all_lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    with path.open("rb") as file:
+        number = 0
+        while line := file.readline(MAX_LINE):
+            number += 1
+            if len(line) == MAX_LINE:
+                raise ValueError(f"{path}: line {number}: expected at most {MAX_LINE:,} bytes")
+            yield f"{path}: not a readable COLMAP model: line {number}", line.strip()
+
+
+def _unreadable(where: str, expected: str, line: bytes) -> ValueError:
+    return ValueError(f"{where}: expected {expected}, got {line[:60].decode('ascii', 'backslashreplace')!r}")
+
+
+def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
+    try:
+        identity, model, width, height, *params = line.split()
+        known = {name.encode(): count for name, count in camera_models().values()}
+        if known.get(model) != len(params):
+            raise ValueError
+        return int(identity), CameraRecord(model.decode(), int(width), int(height), tuple(map(float, params)))
+    except ValueError:
+        expected = "id, model, width, height and the model's parameters of a camera"
+        raise _unreadable(where, expected, line) from None
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, ImageRecord]]:
+    lines = _all_lines(path)
+    for where, line in lines:
+        if not line or line.startswith(b"#"):
+            continue
+        try:
+            identity, *pose, camera, name = line.split(None, 9)
+            numbers = int(identity), tuple(map(float, pose)), int(camera)
+            if len(pose) != 7:
+                raise ValueError
+        except ValueError:
+            raise _unreadable(where, "id, pose, camera and name of an image", line) from None
+        yield numbers[0], ImageRecord(*numbers[1:], _decoded(path, name))
+        next(lines, None)  # keypoints
+
+
+def _text_points(path: Path) -> PointRecords:
+    ids, values, colors, lengths, seen_by = array("Q"), array("d"), array("B"), array("q"), array("I")
+    for where, line in _lines(path):
+        words = line.split()
+        try:
+            ids.append(int(words[0]))
+            values.extend(map(float, (*words[1:4], words[7])))
+            colors.extend(map(int, words[4:7]))
+            seen_by.extend(map(int, words[8::2]))
+            lengths.append(len(words[8::2]))
+            if len(words) % 2:
+                raise ValueError
+        except (ValueError, IndexError, OverflowError):
+            raise _unreadable(where, "id, position, colour, error and track of a point", line) from None
+        if len(ids) > MAX_POINTS:
+            raise ValueError(f"{path}: expected at most {MAX_POINTS:,} points, got more")
+        _check_observations(path, len(seen_by))
+    table = np.frombuffer(values, np.float64).reshape(-1, 4)
+    return _sorted(
+        path,
+        np.frombuffer(ids, np.uint64),
+        table[:, :3],
+        np.frombuffer(colors, np.uint8).reshape(-1, 3),
+        table[:, 3],
+        np.frombuffer(lengths, np.int64),
+        np.frombuffer(seen_by, np.uint32),
+    )
+
+
+def _sorted(
+    path: Path,
+    ids: np.ndarray,
+    positions: np.ndarray,
+    colors: np.ndarray,
+    errors: np.ndarray,
+    lengths: np.ndarray,
+    seen_by: np.ndarray,
+) -> PointRecords:
+    """Points by ascending id, so that binary and text models load alike."""
+    order = np.argsort(ids, kind="stable")
+    ids = ids[order]
+    twice = np.flatnonzero(ids[1:] == ids[:-1])
+    if len(twice):
+        raise ValueError(f"{path}: damaged, expected each id once, got {ids[twice[0]]} twice")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    lengths = lengths.astype(np.int64)
+    return PointRecords(
+        ids, positions[order], colors[order], errors[order], lengths[order], seen_by, np.repeat(rank, lengths)
+    )
+
+
+def _check_observations(path: Path, count: int) -> None:
+    if count > MAX_OBSERVATIONS:
+        raise ValueError(f"{path}: expected at most {MAX_OBSERVATIONS:,} observations, got more")
+
+
+def _decoded(path: Path, name: bytes) -> str:
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: expected image names in UTF-8, got {name[:60]!r}") from None

@@ -1,8 +1,8 @@
 """Reading photos and masks into uint8 tensors, and shrinking them."""
 
-import struct
+import io
+import os
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +10,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nexwarp.files import one_line
+
 # PIL has more, some of which start other programs.
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF")
+ROWS = 256  # that are converted at a time
 MAX_SUM = 2**32 - 1
+MAX_PIXELS = 178_956_970  # PIL's own limit for an honest image, twice what it warns of
+# No codec packs a photo so well; the pixels of a one-coloured PNG take an eighth of a thousandth of a byte at most.
+HONEST_PIXELS, HONEST_RATIO = 40_000_000, (2_000, 16_000)
 WHITE = 128  # and above counts in a mask that has such values; in another, such as one of 0 and 1, all but 0
 
 
@@ -26,6 +32,16 @@ def quiet_pillow() -> Iterator[None]:
         yield
 
 
+class _Bounded(io.BufferedReader):
+    """A file of which no more is read than there is."""
+
+    # Python allocates what is asked for, and PIL asks for lengths as damaged files give them.
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > os.fstat(self.fileno()).st_size:
+            size = -1
+        return super().read(size)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator:
     """A PIL image; whatever goes wrong with it until the end is told in one line."""
@@ -34,15 +50,21 @@ def _opened(path: Path) -> Iterator:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
-        with Image.open(path, formats=[name for name in FORMATS if name in _registered()]) as image:
+        formats = [name for name in FORMATS if name in _registered()]
+        with _Bounded(io.FileIO(path)) as file, Image.open(file, formats=formats) as image:
+            # Also where another library took PIL's guard off.
+            pixels = image.width * image.height
+            if pixels > MAX_PIXELS:
+                raise Image.DecompressionBombError
+            if pixels > HONEST_PIXELS + HONEST_RATIO[image.mode == "1"] * path.stat().st_size:
+                raise ValueError(f"{image.width}x{image.height} pixels are more than a file of this size holds")
             yield image
     except Image.DecompressionBombError:
-        limit = 2 * Image.MAX_IMAGE_PIXELS // 10**6
         raise ValueError(
-            f"{path}: expected an image of at most {limit} megapixels, got more; reduce it first"
+            f"{path}: expected an image of at most {MAX_PIXELS // 10**6} megapixels, got more; reduce it first"
         ) from None
-    except (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error, MemoryError, OverflowError) as error:
-        raise ValueError(f"{path}: expected a complete image file, could not decode it: {error}") from error
+    except Exception as error:  # PIL's decoders raise whatever a damaged file leads them to
+        raise ValueError(f"{path}: expected a complete image file, could not decode it: {one_line(error)}") from error
 
 
 def _registered() -> dict:
@@ -122,7 +144,10 @@ def _grey(image):
 def _to_rgb(image) -> np.ndarray:
     """(H, W, 3) uint8 of a PIL image."""
     if image.mode.startswith("I"):  # 16-bit greyscale, which PIL's own conversion would clip at 255
-        grey = np.clip((np.asarray(image).astype(np.int64) + 128) // 257, 0, 255).astype(np.uint8)
+        wide = np.asarray(image)
+        grey = np.empty(wide.shape, np.uint8)
+        for top in range(0, len(wide), ROWS):
+            grey[top : top + ROWS] = np.clip((wide[top : top + ROWS].astype(np.int64) + 128) // 257, 0, 255)
         return np.repeat(grey[:, :, None], 3, axis=2)
     if image.mode == "P":  # palettes may hold transparency, which PIL can drop only by way of RGBA
         image = image.convert("RGBA")

@@ -8,6 +8,7 @@ import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 PANORAMA = "EQUIRECTANGULAR"
 MAX_SIDE = 2**16  # pixels, of an undistorted image
+MIN_FOCAL, MAX_PARAMETER = 1e-3, 1e9  # pixels: rays and pixels stay finite in single precision
 ROWS = 128  # of a map that are computed at a time: their rays take double precision
 KEPT_MAPS = 6  # a panorama's faces
 BORDER = 0.5  # pixels outside a photo that still take the colour of its edge
@@ -40,6 +42,15 @@ def pycolmap_module() -> Any:
     import pycolmap
 
     return pycolmap
+
+
+@lru_cache(maxsize=1)
+def camera_models() -> dict[int, tuple[str, int]]:
+    """COLMAP's camera models: id -> name and number of parameters."""
+    pycolmap = pycolmap_module()
+    create = pycolmap.Camera.create_from_model_id
+    models = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    return {int(model): (name, len(create(1, model, 1.0, 2, 2).params)) for name, model in models.items()}
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,11 @@ class Lens:
         focal = [self.params[index] for index in camera.focal_length_idxs()]
         if min(focal, default=1.0) <= 0:
             raise ValueError(f"K: expected focal lengths > 0, got {', '.join(f'{f:g}' for f in focal)}")
+        if min(focal, default=1.0) < MIN_FOCAL or max(map(abs, self.params), default=1.0) > MAX_PARAMETER:
+            raise ValueError(
+                f"camera model {self.model}: expected focal lengths of at least {MIN_FOCAL:g} and parameters of at "
+                f"most {MAX_PARAMETER:g}, got {self.params}"
+            )
 
     @property
     def distorted(self) -> bool:
@@ -118,7 +134,10 @@ class Lens:
         pycolmap = pycolmap_module()
         options = pycolmap.UndistortCameraOptions()
         camera = pycolmap.undistort_camera(options, self._camera())
-        return Pinhole(np.array(camera.calibration_matrix()), int(camera.width), int(camera.height))
+        K = np.array(camera.calibration_matrix())
+        if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE and np.isfinite(K).all()):
+            raise ValueError(f"camera model {self.model}: cannot undistort with the parameters {self.params}")
+        return Pinhole(K, int(camera.width), int(camera.height))
 
     def project(self, rays: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) float64 of camera-frame directions (N, 3); NaN where the lens sees nothing."""

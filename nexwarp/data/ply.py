@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nexwarp.data.capture import check_points
+from nexwarp.files import one_line
+
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -45,12 +48,11 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     lacking = [axis for axis in "xyz" if axis not in names]
     if lacking:
         raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
-    positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    bad = ~np.isfinite(positions).all(axis=1)
-    if bad.any():
-        index = int(np.flatnonzero(bad)[0])
-        raise ValueError(f"{path}: expected finite points, got {tuple(positions[index].tolist())} (vertex {index})")
-    return positions, _colors(vertices)
+    with np.errstate(invalid="ignore"):
+        positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    check_points(path, positions, "points", lambda index: f"vertex {index}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        return positions, _colors(vertices)
 
 
 def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[tuple[str, int, list[tuple[str, str]] | None]]]:
@@ -89,16 +91,18 @@ def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list, si
     for name, count, properties in elements:
         left = size - file.tell()
         if properties is None:
-            what = "its lists" if name == "vertex" else f"lists of {name} before them"
+            what = "its lists" if name == "vertex" else f"lists of {one_line(name, 60)} before them"
             raise ValueError(f"{path}: expected vertices without lists first, got {what}")
         fields = [(field, ORDERS[form] + kind) for field, kind in properties]
         if len({field for field, _ in fields}) < len(fields) or len(fields) > MAX_PROPERTIES:
-            raise ValueError(f"{path}: element {name}: expected properties of different names")
+            raise ValueError(f"{path}: element {one_line(name, 60)}: expected properties of different names")
         dtype = np.dtype(fields)
         # An ascii value takes a digit and a blank or an end of line.
         least = count * (dtype.itemsize if form != "ascii" else max(2 * len(fields), 1)) - (form == "ascii")
         if least > left or count > MAX_POINTS:
-            raise ValueError(f"{path}: truncated, expected {count:,} of element {name}, got {left:,} bytes for them")
+            raise ValueError(
+                f"{path}: truncated, expected {count:,} of element {one_line(name, 60)}, got {left:,} bytes for them"
+            )
         if name != "vertex":
             if form == "ascii":
                 for _ in range(count):
@@ -119,7 +123,9 @@ def _ascii(path: Path, file: io.BufferedReader, dtype: np.dtype, count: int) -> 
     try:
         values = np.loadtxt(lines, np.float64, comments=None, max_rows=count, ndmin=2, encoding="ascii")
     except (ValueError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected rows of {len(dtype)} numbers, could not read them: {error}") from None
+        raise ValueError(
+            f"{path}: expected rows of {len(dtype)} numbers, could not read them: {one_line(error)}"
+        ) from None
     if values.shape != (count, len(dtype)):
         raise ValueError(f"{path}: truncated, expected {count:,} rows of {len(dtype)} numbers, got {values.shape}")
     vertices = np.empty(count, dtype)

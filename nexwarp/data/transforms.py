@@ -4,8 +4,6 @@ Both hold camera-to-world matrices with OpenGL's camera axes (x right, y up, z b
 (and `applied_scale`) a file says how its world came from the original one; it is undone, for cameras and points.
 """
 
-import itertools
-import json
 import math
 import re
 import warnings
@@ -14,14 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from nexwarp.data.capture import Capture, Cloud, Photo, leaves_folder
+from nexwarp.data.capture import (
+    LARGEST_COORDINATE,
+    Capture,
+    Cloud,
+    Photo,
+    check_points,
+    check_unique,
+    inside_folder,
+    safe_name,
+    short,
+)
 from nexwarp.data.images import image_size, read_image
 from nexwarp.data.lens import Lens
 from nexwarp.data.ply import read_ply
+from nexwarp.json_files import read_json
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = {split: f"transforms_{split}.json" for split in ("train", "test", "val")}
-MAX_BYTES = 32 * 2**20  # of a JSON file: some 30,000 frames; parsed it takes at most twenty times as much
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 ROTATION_TOLERANCE = 1e-3  # as of Camera
 WHITE = (1.0, 1.0, 1.0)
@@ -73,30 +81,13 @@ def read_blender(path: Path, images: str) -> Capture:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    size = file.stat().st_size
-    if size > MAX_BYTES:
-        raise ValueError(f"{file}: expected at most {MAX_BYTES:,} bytes of JSON, got {size:,}")
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except RecursionError:
-        raise ValueError(f"{file}: expected a JSON object of frames, got one nested too deeply") from None
-    except ValueError as error:
-        raise ValueError(f"{file}: expected JSON, could not parse it: {error}") from None
+    data = read_json(file, finite=True)
     if not isinstance(data, dict):
         raise ValueError(f"{file}: expected a JSON object, got {type(data).__name__}")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {_short(frames)}")
+        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {short(frames)}")
     return data
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON number")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _photos(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
@@ -105,13 +96,10 @@ def _photos(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
     for index, frame in enumerate(data["frames"]):
         where = f"{file}: frame {index}"
         if not isinstance(frame, dict):
-            raise ValueError(f"{where}: expected a JSON object, got {_short(frame)}")
+            raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
         photos.append(_photo(where, file.parent, data, frame, images, to_original))
-    photos.sort(key=lambda photo: photo.name)
-    for one, other in itertools.pairwise(photos):
-        if one.name == other.name:
-            raise ValueError(f"{file}: expected each photo once, got {one.name} twice")
-    return photos
+    check_unique(file, photos)
+    return sorted(photos, key=lambda photo: photo.name)
 
 
 def _photo(
@@ -126,6 +114,7 @@ def _photo(
         mask = folder / _file_name(where, "mask_path", frame["mask_path"])
         if not mask.is_file():
             raise FileNotFoundError(f"{where}: mask not found: {mask}")
+        inside_folder(f"{where}: mask_path", mask, folder)
     lens = _lens(where, {**data, **frame}, file)
     return Photo(name, file, _viewmat(where, frame.get("transform_matrix"), to_original), lens, mask)
 
@@ -133,11 +122,8 @@ def _photo(
 def _file_name(where: str, key: str, value: Any) -> str:
     """A file's name below the scene's folder, with "/" between its parts."""
     if not isinstance(value, str) or not value:
-        raise ValueError(f"{where}: {key}: expected the name of a file, got {_short(value)}")
-    name = value.replace("\\", "/")
-    if leaves_folder(name):
-        raise ValueError(f"{where}: {key}: {value!r} leaves the scene's folder, expected a relative path below it")
-    return str(PurePosixPath(name))
+        raise ValueError(f"{where}: {key}: expected the name of a file, got {short(value)}")
+    return safe_name(f"{where}: {key}:", value.replace("\\", "/"), "scene's folder")
 
 
 def _view_name(named: str) -> str:
@@ -151,10 +137,11 @@ def _find(where: str, folder: Path, named: str, images: str) -> Path:
             raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
         named = f"{images}/{named[7:]}"
     path = folder / named
+    top = folder / images if PurePosixPath(named).is_relative_to(images) else folder
     candidates = [path, *(path.with_name(path.name + extension) for extension in EXTENSIONS)]
     for candidate in candidates:
         if candidate.is_file():
-            return candidate
+            return inside_folder(f"{where}: file_path", candidate, top)
     raise FileNotFoundError(f"{where}: image not found: {path}")
 
 
@@ -163,7 +150,7 @@ def _number(where: str, keys: dict[str, Any], key: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{where}: {key}: expected a number, got {_short(value)}")
+        raise ValueError(f"{where}: {key}: expected a number, got {short(value)}")
     try:
         value = float(value)
     except OverflowError:
@@ -208,7 +195,7 @@ def _lens(where: str, keys: dict[str, Any], file: Path) -> Lens:
     else:
         raise ValueError(
             f"{where}: camera_model: expected one of {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, EQUIRECTANGULAR, "
-            f"got {_short(model)}"
+            f"got {short(model)}"
         )
     unknown = [key for key in keys if re.fullmatch(r"[kps]\d", key) and key not in known and keys[key]]
     if unknown:
@@ -244,15 +231,17 @@ def _matrix(where: str, key: str, value: Any) -> np.ndarray:
     rows = value if isinstance(value, list) else []
     good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
     if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for row in rows for x in row):
-        raise ValueError(f"{where}: {key}: expected 4 rows of 4 numbers, got {_short(value)}")
+        raise ValueError(f"{where}: {key}: expected 4 rows of 4 numbers, got {short(value)}")
     try:
         matrix = np.array([*rows[:3], rows[3] if len(rows) == 4 else [0, 0, 0, 1]], dtype=np.float64)
     except OverflowError:
-        raise ValueError(f"{where}: {key}: expected finite numbers, got {_short(value)}") from None
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{where}: {key}: expected finite numbers, got {_short(value)}")
+        raise ValueError(f"{where}: {key}: expected finite numbers, got {short(value)}") from None
+    if not (np.abs(matrix) <= LARGEST_COORDINATE).all():
+        raise ValueError(
+            f"{where}: {key}: expected finite numbers of at most {LARGEST_COORDINATE:g}, got {short(value)}"
+        )
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
-        raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {_short(rows[3])}")
+        raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {short(rows[3])}")
     return matrix
 
 
@@ -300,7 +289,7 @@ def _split(file: Path, data: dict[str, Any], photos: list[Photo]) -> tuple[list[
         if names is None:
             continue
         if not isinstance(names, list):
-            raise ValueError(f"{file}: {key}: expected a list of file names, got {_short(names)}")
+            raise ValueError(f"{file}: {key}: expected a list of file names, got {short(names)}")
         lists[key] = {_view_name(_file_name(str(file), key, name)) for name in names}
         known = {photo.name for photo in photos}
         known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
@@ -332,9 +321,10 @@ def _points(file: Path, data: dict[str, Any], photos: list[Photo]) -> Cloud | No
     path = file.parent / _file_name(str(file), "ply_file_path", data["ply_file_path"])
     if not path.is_file():
         raise FileNotFoundError(f"{file}: ply_file_path: points not found: {path}")
-    positions, colors = read_ply(path)
+    positions, colors = read_ply(inside_folder(f"{file}: ply_file_path", path, file.parent))
     to_original = _inverse_applied(file, data)
     moved = positions @ to_original[:3, :3].T + to_original[:3, 3]
+    check_points(path, moved, "points in the original world", lambda index: f"vertex {index}")
     # Some releases of nerfstudio left the points in the original world and moved only the cameras.
     if not np.allclose(to_original, np.eye(4)):
         as_promised, as_they_are = (_color_error(where, colors, photos) for where in (moved, positions))

@@ -22,9 +22,12 @@ from nexwarp.data.images import (
     resize_mask,
 )
 from nexwarp.data.lens import FACES, PANORAMA, Lens, Maps, Pinhole
+from nexwarp.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
+# A small camera's photo is not decoded when it is huge: one of a single colour takes hardly a byte in its file.
+MAX_ENLARGED, SMALL = 16, 1024
 HALF = 128  # alpha of a pixel that counts
 
 
@@ -99,7 +102,13 @@ class ViewReader:
                 f"{photo.file}: expected an image of {lens.width}x{lens.height} pixels, or that shape at another "
                 f"size, got {width}x{height}"
             )
-        target = _pinhole(lens)
+        _check_enlarged(photo.file, size, (lens.width, lens.height), "its camera")
+        if photo.mask is not None and not self.alpha_mask:
+            _check_mask(photo, size)
+        try:
+            target = _pinhole(lens)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{photo.file}: the camera of this image is not usable: {one_line(error)}") from error
         ratio = width / lens.width, height / lens.height
         target = target.resized(
             *(max(round(a * b), 1) for a, b in zip((target.width, target.height), ratio, strict=True))
@@ -211,10 +220,24 @@ def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torc
         return None
     height, width = image.shape[:2]
     mask = read_mask(photo.mask)
-    rows, columns = mask.shape
+    return mask if mask.shape == (height, width) else resize_mask(mask, width, height)
+
+
+def _check_mask(photo: Photo, size: tuple[int, int]) -> None:
+    """Compare a mask's header with its photo's size, before it is decoded."""
+    width, height = size
+    columns, rows = image_size(photo.mask)
     if abs(columns * height - rows * width) > max(width, height, columns, rows):
         raise ValueError(
             f"{photo.mask}: expected a mask of {width}x{height} pixels as {photo.file.name} has, or that shape at "
             f"another size, got {columns}x{rows}"
         )
-    return mask if (columns, rows) == (width, height) else resize_mask(mask, width, height)
+    _check_enlarged(photo.mask, (columns, rows), size, "its photo")
+
+
+def _check_enlarged(file: Path, size: tuple[int, int], expected: tuple[int, int], what: str) -> None:
+    if max(size) > max(MAX_ENLARGED * max(expected), SMALL):
+        raise ValueError(
+            f"{file}: expected an image of at most {MAX_ENLARGED} times the size of {what}, "
+            f"{expected[0]}x{expected[1]}, got {size[0]}x{size[1]}"
+        )

@@ -1,0 +1,300 @@
+"""The readers of files that others made, each with small valid files to damage."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.fuzz_inputs import Files
+from nexwarp.camera import Camera
+from nexwarp.checkpoint import Model, load, load_cameras, save_cameras, save_model
+from nexwarp.config import Config
+from nexwarp.data import load_scene
+from nexwarp.data.images import read_image, read_mask, read_transparent
+from nexwarp.data.lens import pycolmap_module
+from nexwarp.data.ply import read_ply
+from nexwarp.export import load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
+from nexwarp.pictures import load_exr, save_exr
+from nexwarp.runs import SceneSource, create_run, read_run
+from nexwarp.surfels import Surfels
+from nexwarp.texture import NeuralTexture
+
+WIDTH, HEIGHT, VIEWS = 12, 9, 3
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: of the reader.
+        make: writes valid inputs below a folder and returns them.
+        read: loads the input in a folder.
+        fuzzed: ends of names of the files that are damaged; the others stay.
+    """
+
+    name: str
+    make: Callable[[Path], list[Files]]
+    read: Callable[[Path], object]
+    fuzzed: tuple[str, ...]
+
+    def write(self, folder: Path, files: Files) -> None:
+        """Put an input into a folder, in place of the one before it."""
+        there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+        for name in there:
+            if name.endswith(self.fuzzed) and name not in files:
+                (folder / name).unlink()
+        for name, data in files.items():
+            if name.endswith(self.fuzzed) or name not in there:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(data)
+
+
+def _files(folder: Path) -> Files:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def _viewmats() -> list[np.ndarray]:
+    """(4, 4) world to camera, on an arc around the origin, looking at it."""
+    viewmats = []
+    for index in range(VIEWS):
+        angle = 0.4 * index
+        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([[forward[1], -forward[0], 0.0], [0.0, 0.0, -1.0], forward])
+        viewmat[2, 3] = 2.0
+        viewmats.append(viewmat)
+    return viewmats
+
+
+def _photos(folder: Path, mode: str = "RGB") -> list[str]:
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    names = [f"{index}.png" for index in range(VIEWS)]
+    for name in names:
+        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, len(mode)), dtype=np.uint8)).save(folder / name)
+    return names
+
+
+def _cameras() -> list[Camera]:
+    K = torch.tensor([[10.0, 0.0, 6.0], [0.0, 11.0, 4.5], [0.0, 0.0, 1.0]])
+    return [Camera(torch.from_numpy(viewmat).float(), K, WIDTH, HEIGHT) for viewmat in _viewmats()]
+
+
+def _colmap(text: bool) -> Callable[[Path], list[Files]]:
+    def make(folder: Path) -> list[Files]:
+        pycolmap = pycolmap_module()
+        models = {
+            "PINHOLE": [10.0, 11.0, 6.0, 4.5],
+            "SIMPLE_RADIAL": [10.0, 6.0, 4.5, 0.05],
+            "OPENCV_FISHEYE": [10.0, 11.0, 6.0, 4.5, 0.01, 0.0, 0.0, 0.0],
+        }
+        inputs = []
+        for model, params in models.items():
+            path = folder / model
+            names = _photos(path / "images")
+            scene = pycolmap.Reconstruction()
+            camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+            scene.add_camera_with_trivial_rig(camera)
+            for index, (name, viewmat) in enumerate(zip(names, _viewmats(), strict=True)):
+                image = pycolmap.Image(name=name, keypoints=np.ones((6, 2)), camera_id=1, image_id=index + 1)
+                scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3]))
+            for index in range(6):
+                track = pycolmap.Track()
+                for image_id in range(1, 2 + index % 3):
+                    track.add_element(image_id, index)
+                scene.add_point3D(0.1 * np.array([index, index % 2, 1.0]), track, np.array([9, 99, 200], np.uint8))
+            (path / "sparse/0").mkdir(parents=True)
+            (scene.write_text if text else scene.write_binary)(str(path / "sparse/0"))
+            inputs.append(_files(path))
+        return inputs
+
+    return make
+
+
+def _ply(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [(0.1 * i, 0.2 * i, 1.0, 10 * i, 20, 30) for i in range(6)]
+    names = ("x", "y", "z", "red", "green", "blue")
+    kinds = {"ascii": ("float",) * 3 + ("uchar",) * 3, "binary_little_endian": ("float",) * 3 + ("uchar",) * 3,
+             "binary_big_endian": ("double",) * 3 + ("ushort",) * 3}  # fmt: skip
+    inputs = []
+    for form, types in kinds.items():
+        properties = [f"property {kind} {name}" for kind, name in zip(types, names, strict=True)]
+        header = ["ply", f"format {form} 1.0", "comment six points", "element camera 1", "property int id"]
+        header += ["element vertex 6", *properties, "element face 0", "property list uchar int vertex_index"]
+        head = "\n".join([*header, "end_header", ""]).encode()
+        if form == "ascii":
+            body = b"7\n" + b"".join(" ".join(map(str, row)).encode() + b"\n" for row in rows)
+        else:
+            order = "<" if "little" in form else ">"
+            codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2"}
+            dtype = np.dtype([(name, order + codes[kind]) for name, kind in zip(names, types, strict=True)])
+            body = np.array([7], f"{order}i4").tobytes() + np.array(rows, dtype).tobytes()
+        inputs.append({"points.ply": head + body})
+    save_splats_ply(folder / "points.ply", _surfels())
+    return [*inputs, _files(folder)]
+
+
+def _surfels() -> Surfels:
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=generator)
+
+    return Surfels.from_activated(
+        random(5, 3), random(5, 4) + 0.1, random(5, 2) + 0.1, random(5), 1 + random(5, 2), random(5, 4, 3)
+    )
+
+
+def _surfels_ply(folder: Path) -> list[Files]:
+    save_surfels_ply(folder / "a" / "surfels.ply", _surfels())
+    save_surfels_ply(folder / "b" / "surfels.ply", _surfels().double())
+    return [_files(folder / "a"), _files(folder / "b")]
+
+
+def _nerfstudio(folder: Path) -> list[Files]:
+    cameras = _cameras()
+    inputs = []
+    for kind in ("plain", "full", "fisheye"):
+        path = folder / kind
+        names = [f"images/{name}" for name in _photos(path / "images", "RGBA")]
+        _photos(path / "masks")
+        save_transforms(path / "transforms.json", dict(zip(names, cameras, strict=True)))
+        data = json.loads((path / "transforms.json").read_text())
+        if kind == "fisheye":
+            data |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.0, "k3": 0.0, "k4": 0.0}
+        if kind == "full":
+            data |= {"camera_model": "OPENCV", "k1": 0.01, "p1": 0.001, "ply_file_path": "points.ply"}
+            data |= {"applied_transform": np.eye(4)[[0, 2, 1]].tolist(), "applied_scale": 0.5}
+            data["applied_transform"][1] = [0.0, 0.0, -1.0, 0.5]
+            data |= {"train_filenames": names[:2], "val_filenames": names[2:], "test_filenames": names[2:]}
+            for frame, name in zip(data["frames"], names, strict=True):
+                frame["mask_path"] = name.replace("images", "masks")
+            save_splats_ply(path / "points.ply", _surfels())
+        (path / "transforms.json").write_text(json.dumps(data))
+        inputs.append(_files(path))
+    return inputs
+
+
+def _blender(folder: Path) -> list[Files]:
+    save_transforms(folder / "all.json", {str(i): camera for i, camera in enumerate(_cameras())})
+    frames = [frame["transform_matrix"] for frame in json.loads((folder / "all.json").read_text())["frames"]]
+    for split in ("train", "test"):
+        names = _photos(folder / split, "RGBA")
+        entries = [
+            {"file_path": f"./{split}/{name[:-4]}", "rotation": 0.01, "transform_matrix": matrix}
+            for name, matrix in zip(names, frames, strict=True)
+        ]
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
+    (folder / "all.json").unlink()
+    return [_files(folder)]
+
+
+def _model(folder: Path) -> list[Files]:
+    texture = NeuralTexture(levels=2, table_size=16, width=8, hidden_layers=1, sh_degree=1)
+    meta = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 1, "low_pass": False, "clamp_texture": False}
+    surfels = _surfels()
+    save_model(folder / "a", Model(surfels, texture, {**meta, "near": 0.01, "scene_scale": 1.5, "preset": "default"}))
+    surfels.footprints = torch.ones(5)
+    save_model(folder / "b", Model(surfels, texture, meta))
+    return [_files(folder / "a"), _files(folder / "b")]
+
+
+def _config(folder: Path) -> list[Files]:
+    create_run(folder, SceneSource("demo"), Config(), "cpu")
+    return [_files(folder)]
+
+
+def _run_cameras(folder: Path) -> list[Files]:
+    cameras = {str(i): camera for i, camera in enumerate(_cameras())}
+    save_cameras(folder / "cameras.json", {"train": cameras, "test": cameras})
+    return [_files(folder)]
+
+
+def _camera_path(folder: Path) -> list[Files]:
+    cameras = _cameras()
+    save_camera_path(folder / "a" / "path.json", cameras)
+    plain = [
+        dataclasses.replace(c, K=torch.tensor([[11.0, 0.0, 6.0], [0.0, 11.0, 4.5], [0.0, 0.0, 1.0]])) for c in cameras
+    ]
+    save_camera_path(folder / "b" / "path.json", plain)
+    save_transforms(folder / "c" / "path.json", {str(i): camera for i, camera in enumerate(cameras)})
+    return [_files(folder / name) for name in "abc"]
+
+
+def _images(folder: Path) -> list[Files]:
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    color = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8))
+    wide = Image.fromarray(rng.integers(0, 2**16, (HEIGHT, WIDTH), dtype=np.uint16))
+    rgb, grey, palette = (color.convert(mode) for mode in ("RGB", "L", "P"))
+    pictures = {
+        "rgb.jpg": rgb, "grey.jpg": grey, "cmyk.jpg": color.convert("CMYK"), "rgba.png": color, "grey.png": grey,
+        "bits.png": color.convert("1"), "palette.png": palette, "wide.png": wide, "wide.tiff": wide, "rgb.tiff": rgb,
+        "palette.gif": palette, "rgba.webp": color, "rgb.bmp": rgb, "rgb.ppm": rgb, "rgba.tga": color, "rgb.jp2": rgb,
+    }  # fmt: skip
+    inputs = []
+    for name, image in pictures.items():
+        image.save(folder / name)
+        inputs.append({"mask": (folder / name).read_bytes()})
+    rgb.save(folder / "packed.tiff", compression="tiff_lzw")
+    return [*inputs, {"mask": (folder / "packed.tiff").read_bytes()}]
+
+
+def _read_images(folder: Path) -> None:
+    """As a mask and as a photo; what refuses a file does so for each."""
+    outcomes = []
+    for read in (read_mask, read_image, read_transparent):
+        try:
+            read(folder / "mask")
+            outcomes.append(None)
+        except ValueError as error:
+            outcomes.append(error)
+    for error in outcomes:
+        if error is not None:
+            raise error
+
+
+def _exr(folder: Path) -> list[Files]:
+    rng = np.random.default_rng(0)
+    color = torch.from_numpy(rng.random((HEIGHT, WIDTH, 3), np.float32))
+    save_exr(folder / "a" / "a.exr", {"image": color, "ids": color[..., 0].int(), "depth": color[..., 1].contiguous()})
+    save_exr(folder / "b" / "a.exr", {"depth": torch.ones(HEIGHT, WIDTH)}, {"near": 0.01})
+    return [_files(folder / "a"), _files(folder / "b")]
+
+
+def _masked_scene(folder: Path) -> object:
+    return load_scene(folder, background="white")
+
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target("colmap_binary", _colmap(False), load_scene, (".bin",)),
+        Target("colmap_text", _colmap(True), load_scene, (".txt",)),
+        Target("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
+        Target("blender", _blender, _masked_scene, (".json",)),
+        Target("model", _model, load, (".safetensors",)),
+        Target("config", _config, read_run, (".json",)),
+        Target("cameras", _run_cameras, lambda folder: load_cameras(folder / "cameras.json"), (".json",)),
+        Target("camera_path", _camera_path, lambda folder: load_camera_path(folder / "path.json"), (".json",)),
+        Target("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
+        Target("surfels_ply", _surfels_ply, lambda folder: load_surfels_ply(folder / "surfels.ply"), (".ply",)),
+        Target("masks", _images, _read_images, ("mask",)),
+        Target("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
+    )
+}
+# One thread: a forked process has none of its parent's.
+torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,0 +1,91 @@
+"""Every reader stands damaged files: a bounded run of `benchmarks.fuzz`, and what its harness must notice."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.fuzz import Failure, fuzz
+from benchmarks.fuzz_inputs import Files
+from benchmarks.fuzz_targets import TARGETS, Target
+
+INPUTS = 100
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_readers_load_or_refuse_in_one_line(tmp_path: Path, name: str) -> None:
+    result = fuzz(TARGETS[name], seconds=60.0, inputs=INPUTS, seed=0, driver="mutate", failed=tmp_path)
+    assert result.failures == [], "\n".join(f"{f.kind} at {f.index}: {f.detail}" for f in result.failures)
+    assert result.inputs == INPUTS
+    assert 0 < result.loaded < INPUTS, "inputs are neither all as good as new nor all beyond recognition"
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "config", "colmap_binary"])
+def test_readers_stand_what_hypothesis_draws(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("hypothesis")
+    result = fuzz(TARGETS[name], seconds=60.0, inputs=40, seed=0, driver="hypothesis", failed=tmp_path)
+    assert result.failures == [], "\n".join(f"{f.kind} at {f.index}: {f.detail}" for f in result.failures)
+    assert result.inputs == 40
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_the_valid_files_load(tmp_path: Path, name: str) -> None:
+    target = TARGETS[name]
+    for index, files in enumerate(target.make(tmp_path / "valid")):
+        target.write(tmp_path / str(index), files)
+        target.read(tmp_path / str(index))
+
+
+def _crash(folder: Path) -> None:
+    if (folder / "a").read_bytes() != b"good":
+        os.abort()
+
+
+def _hang(folder: Path) -> None:
+    if (folder / "a").read_bytes() != b"good":
+        time.sleep(60)
+
+
+def _hoard(folder: Path) -> None:
+    try:
+        np.empty(2 * 10**9, np.uint8)
+    except MemoryError as error:
+        raise ValueError(f"{folder}: too large") from error
+
+
+def _stumble(folder: Path) -> None:
+    raise KeyError("x")
+
+
+def _mumble(folder: Path) -> None:
+    raise ValueError(f"{folder}: one line\nand another")
+
+
+def _one(folder: Path) -> list[Files]:
+    return [{"a": b"good"}]
+
+
+@pytest.mark.parametrize(
+    ("read", "kind"),
+    [(_crash, "crash"), (_hang, "hang"), (_hoard, "memory"), (_stumble, "KeyError"), (_mumble, "message")],
+)
+def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, kind: str) -> None:
+    if kind == "hang":
+        monkeypatch.setattr("benchmarks.fuzz.HANG", 1.0)
+    result = fuzz(Target("one", _one, read, ("a",)), seconds=60.0, inputs=1, seed=3, driver="mutate", failed=tmp_path)
+    (failure,) = result.failures
+    assert isinstance(failure, Failure) and failure.kind == kind and (failure.target, failure.index) == ("one", 0)
+    assert failure.folder is not None and (failure.folder / "failure.txt").is_file()
+    assert result.inputs == 1 and result.loaded == 0
+
+
+def test_the_same_seed_gives_the_same_inputs() -> None:
+    import random
+
+    from benchmarks.fuzz_inputs import damage
+
+    files = {"a.json": b'{"a": [1, 2, {"b": null}]}', "b.bin": bytes(range(100)), "c.txt": b"1 2 3\n4 5 6\n"}
+    made = [[damage(random.Random(f"0/{i}"), files, (".json", ".bin", ".txt")) for i in range(50)] for _ in range(2)]
+    assert made[0] == made[1] and files not in made[0][:10]
