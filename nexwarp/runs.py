@@ -6,6 +6,7 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 
 import ctypes
 import dataclasses
+import json
 import shutil
 import sys
 from collections.abc import Callable

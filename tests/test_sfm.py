@@ -15,9 +15,10 @@ from scipy.ndimage import map_coordinates
 from nexwarp import cli
 from nexwarp.data import load_scene
 from nexwarp.data.capture import Capture
-from nexwarp.data.colmap import pycolmap_module, read_model
+from nexwarp.data.colmap import read_model
 from nexwarp.data.demo import TARGET, _look_at
 from nexwarp.data.demo_room import LAMP, build_room
+from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.raytrace import render
 from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.sfm.pairs import components, exhaustive_pairs, sequential_pairs
