@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from nexwarp.data.colmap import pycolmap_module
+from nexwarp.data.lens import pycolmap_module
 
 
 def tracked_only(model: Any) -> Any:

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from nexwarp.data.colmap import pycolmap_module
 from nexwarp.data.images import read_image
+from nexwarp.data.lens import pycolmap_module
 from nexwarp.sfm.options import SfmOptions
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # what both PIL and pycolmap 4.2 decode

@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from nexwarp.data.colmap import pycolmap_module
+from nexwarp.data.lens import pycolmap_module
 
 POLL_SECONDS = 0.2
 ONLY_FATAL = 3  # glog level
