@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nexwarp.errors import FormatError, MissingError
 from nexwarp.files import one_line, written_aside
 from nexwarp.ops.checks import check_finite, check_range
 from nexwarp.surfels import Surfels
@@ -87,12 +88,12 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, expected surfels as PLY")
+        raise MissingError(f"{path}: no such file, expected surfels as PLY")
     with open(path, "rb") as file:
         count, dtype, start = _header(path, file.read(LONGEST_HEADER))
         size = path.stat().st_size
         if size != start + count * dtype.itemsize:
-            raise ValueError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {size}")
+            raise FormatError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {size}")
         file.seek(start)
         vertices = np.fromfile(file, dtype, count)
     rest = sum(name.startswith("f_rest_") for name in dtype.names)
@@ -100,7 +101,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
     expected += [*_names("rot", 4), *_names("gamma", 2)]
     missing = [name for name in expected if name not in dtype.names]
     if missing:
-        raise ValueError(f"{path}: expected the properties of nexwarp surfels, found no {missing[0]}")
+        raise FormatError(f"{path}: expected the properties of nexwarp surfels, found no {missing[0]}")
 
     def take(names: list[str]) -> torch.Tensor:
         stacked = np.stack([vertices[name] for name in names], axis=1) if names else np.empty((count, 0), dtype[0])
@@ -124,7 +125,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         shN = coefficients.reshape(count, 3, rest // 3).mT.contiguous()
         return Surfels({**{name: x.contiguous() for name, x in raw.items()}, "shN": shN})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected nexwarp surfels ({one_line(error)})") from None
+        raise FormatError(f"{path}: expected nexwarp surfels ({one_line(error)})") from None
 
 
 def _names(name: str, count: int) -> list[str]:
@@ -164,7 +165,7 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
     mark = b"end_header\n"
     end = data.find(mark, 0, LONGEST_HEADER)
     if not data.startswith(b"ply\n") or end < 0:
-        raise ValueError(f"{path}: expected a PLY file as nexwarp writes it")
+        raise FormatError(f"{path}: expected a PLY file as nexwarp writes it")
     lines = [line.split() for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]]
     lines = [words for words in lines if words and words[0] != "comment"]
     try:
@@ -183,5 +184,5 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
             raise ValueError(f"expected a number of vertices, got {count}")
         dtype = np.dtype([(words[2], TYPES[words[1]]) for words in properties])
     except ValueError as error:
-        raise ValueError(f"{path}: expected the header of nexwarp surfels ({one_line(error)})") from None
+        raise FormatError(f"{path}: expected the header of nexwarp surfels ({one_line(error)})") from None
     return int(count), dtype, end + len(mark)

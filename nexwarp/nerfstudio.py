@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.errors import FormatError, MissingError
 from nexwarp.files import one_line, written_aside
 from nexwarp.json_files import read_json
 
@@ -163,9 +164,9 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
         if "frames" in data:
             return CameraPath(list(_frames(path, data, near).values()), None)
         found = ", ".join(sorted(data)[:8]) or "none"
-        raise ValueError(f"{path}: expected the key camera_path or frames, found {one_line(found)}")
+        raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(found)}")
     if data.get("camera_type", "perspective") != "perspective":
-        raise ValueError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
+        raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
     fps = _number(path, data, "fps", above=0.0) if "fps" in data else None
     entries = _list(path, data, "camera_path")
@@ -186,7 +187,7 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
 def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
     model = data.get("camera_model", "PINHOLE")
     if model not in PINHOLES:
-        raise ValueError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
+        raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
     undo = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in data:
         undo = torch.linalg.inv(_pose(str(path), data, "applied_transform"))
@@ -242,10 +243,10 @@ def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
 
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, expected cameras as JSON")
+        raise MissingError(f"{path}: no such file, expected cameras as JSON")
     data = read_json(path)
     if not isinstance(data, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(data).__name__}")
+        raise FormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
     return data
 
 
@@ -257,10 +258,10 @@ def _write(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
 def _list(path: Path, data: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     entries = data[key]
     if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
+        raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise ValueError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
+            raise FormatError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
     return entries
 
 

@@ -12,6 +12,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load, load_cameras
+from nexwarp.errors import RunError, SettingError
 from nexwarp.export import save_splats_ply, save_surfels_ply
 from nexwarp.metrics import to_uint8
 from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
@@ -109,17 +110,17 @@ class RenderOrder:
 
     def __post_init__(self) -> None:
         if self.views not in SETS:
-            raise ValueError(f"--set: expected test, train or all, got {self.views!r}")
+            raise SettingError(f"--set: expected test, train or all, got {self.views!r}")
         if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
-            raise ValueError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
+            raise SettingError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
         if self.frames is not None and self.frames < 0:
-            raise ValueError(f"--frames: expected at least 0, got {self.frames}")
+            raise SettingError(f"--frames: expected at least 0, got {self.frames}")
         if self.frames == 0 and (self.video is not None or self.views is None):
-            raise ValueError("--frames: expected at least 1 for a path or a video, got 0")
+            raise SettingError("--frames: expected at least 1 for a path or a video, got 0")
         if self.path is None and self.frames:
-            raise ValueError("--frames: expected with --path or --video, got it with --set alone")
+            raise SettingError("--frames: expected with --path or --video, got it with --set alone")
         if self.fps is not None and self.video is None:
-            raise ValueError("--fps: expected with --video, got it without")
+            raise SettingError("--fps: expected with --video, got it without")
         self._size()
         if self.video is not None:
             _check_video(self.video, FPS if self.fps is None else self.fps)
@@ -146,7 +147,7 @@ class RenderOrder:
                 camera = resized(size(camera), first.width, first.height)
                 pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
-            raise ValueError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
+            raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
         return RenderJob(pictures, self.video, fps if self.fps is None else self.fps)
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
@@ -156,7 +157,7 @@ class RenderOrder:
         if self.path not in PATHS:
             file = Path(self.path)
             if self.frames is not None:
-                raise ValueError(f"--frames: expected none with {file}, which says it itself, got {self.frames}")
+                raise SettingError(f"--frames: expected none with {file}, which says it itself, got {self.frames}")
             path = load_camera_path(file, near)
             return renders / f"path_{file.stem}", path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
@@ -167,26 +168,26 @@ class RenderOrder:
             return renders / self.path, PATHS[self.path](list(known.values()), count), FPS
         except ValueError as error:
             hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
-            raise ValueError(f"--path {self.path}: {error}{hint}") from None
+            raise SettingError(f"--path {self.path}: {error}{hint}") from None
 
     def _size(self) -> Callable[[Camera], Camera]:
         """Function that gives a camera the size asked for."""
         if not 0 < self.scale < math.inf:
-            raise ValueError(f"--scale: expected a number above 0, got {self.scale:g}")
+            raise SettingError(f"--scale: expected a number above 0, got {self.scale:g}")
         if self.size is None:
             return self._scaled
         if self.scale != 1.0:
-            raise ValueError("--size, --scale: expected at most one of them, got both")
+            raise SettingError("--size, --scale: expected at most one of them, got both")
         match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
         sides = tuple(int(side) for side in match.groups()) if match else ()
         if not sides or not all(1 <= side <= LARGEST_SIDE for side in sides):
-            raise ValueError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
+            raise SettingError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
         return lambda camera: resized(camera, sides[0], sides[1])
 
     def _scaled(self, camera: Camera) -> Camera:
         sides = [max(round(side * self.scale), 1) for side in (camera.width, camera.height)]
         if max(sides) > LARGEST_SIDE:
-            raise ValueError(
+            raise SettingError(
                 f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {sides[0]}x{sides[1]} with {self.scale:g}"
             )
         return resized(camera, *sides)
@@ -204,7 +205,7 @@ def export_run(run: Path, kind: str, folder: Path) -> Sequence[Path]:
         ValueError, OSError: naming what is not as expected.
     """
     if kind not in FORMATS:
-        raise ValueError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
     if kind == "ply":
         model = load(run)
@@ -220,7 +221,7 @@ def export_run(run: Path, kind: str, folder: Path) -> Sequence[Path]:
     }
     cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
-        raise ValueError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
+        raise RunError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
     files = [folder / "transforms.json", folder / "camera_path.json"]
     save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
     first = next(iter(cameras.values()))
@@ -233,7 +234,7 @@ def _check_video(path: Path, fps: float) -> None:
         check_video(path, fps)
     except ValueError as error:
         option = "--fps" if str(error).startswith("fps: ") else "--video"
-        raise ValueError(f"{option}: {str(error).removeprefix('fps: ')}") from None
+        raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
 
 
 def _remove_frames(folder: Path, count: int) -> None:

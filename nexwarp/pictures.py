@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nexwarp.errors import StorageError
+from nexwarp.errors import FormatError, MissingError, StorageError
 from nexwarp.files import one_line, written_aside
 from nexwarp.json_files import parse_json
 from nexwarp.ops.checks import check_range
@@ -90,7 +90,7 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
 
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, expected an OpenEXR file")
+        raise MissingError(f"{path}: no such file, expected an OpenEXR file")
     parts, text = {}, ""
     try:
         _check_size(path)
@@ -100,22 +100,22 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
                 planes = {name: channel.pixels for name, channel in part.channels.items()}
                 parts[part.name()] = (set(planes), [planes[name] for name in "RGBY" if name in planes])
     except Exception as error:  # OpenEXR raises bare RuntimeErrors, and others
-        raise ValueError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
+        raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
     try:
         metadata = dict(parse_json("metadata", text.encode("utf-8", "replace"))) if text else {"parts": list(parts)}
         names = list(metadata["parts"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise FormatError(
             f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({one_line(error)})"
         ) from None
     # OpenEXR leaves out, with no more than a message, the parts that it cannot read.
     if not parts or names != list(parts):
-        raise ValueError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
+        raise FormatError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
     tensors = {}
     for name, (names, planes) in parts.items():
         if names not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
             kinds = ", ".join(sorted(names))
-            raise ValueError(
+            raise FormatError(
                 f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {one_line(kinds, 60)} in part {name!r}"
             )
         planes = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from nexwarp.errors import SettingError
 from nexwarp.files import written_aside
 from nexwarp.ops.checks import check_range
 
@@ -28,13 +29,13 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
     """Raise ValueError unless `path` and `fps` suit a video, and PyAV is there to write it."""
     suffix = Path(path).suffix.lower()
     if suffix not in KINDS:
-        raise ValueError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
+        raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
     if not 0 < fps <= FASTEST:
-        raise ValueError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
+        raise SettingError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
     try:
         import av  # noqa: F401
     except ImportError:
-        raise ValueError(f"{path}: videos need PyAV, which is not installed: pip install 'nexwarp[video]'") from None
+        raise SettingError(f"{path}: videos need PyAV, which is not installed: pip install 'nexwarp[video]'") from None
 
 
 @contextmanager
