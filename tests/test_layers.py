@@ -11,7 +11,8 @@ import pytest
 LAYERS = [
     {"errors"},
     {"kernels"},
-    {"ops", "camera", "files", "json_files"},
+    {"ops", "camera", "files"},
+    {"json_files"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
     {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "watch"},

@@ -275,7 +275,7 @@ def test_bad_render_options(refuses: Callable[..., None], flags: list[str], word
 def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
     path = run.parent / "flight.json"
     path.write_text("{")
-    refuses(["render", "--path", path], str(path), "expected cameras as JSON")
+    refuses(["render", "--path", path], str(path), "expected JSON")
     save_camera_path(path, ring(2))
     refuses(["render", "--path", path, "--frames", "3"], "--frames: expected none with", "got 3")
     data = json.loads(path.read_text())
