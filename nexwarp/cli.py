@@ -138,7 +138,7 @@ class Train:
     device: Device_ = None
     """Where to train."""
     resume: bool = False
-    """Continue the run in --run, however it ended: with its settings; what else is given must agree with them."""
+    """Continue the run in --run, however it ended: with its settings, whatever else is given must agree with them."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
     """Iterations between checkpoints, of which the last two are kept."""
     overwrite: bool = False
@@ -199,7 +199,7 @@ class Train:
         with self._viewer(trainer, run, source.name, console) as viewer:
             if not resume:
                 create_run(run, source, config, device.type)
-            _train(trainer, run, console, viewer, self.checkpoint_every, tensorboard=self.tensorboard)
+            _train(trainer, run, console, viewer, tensorboard=self.tensorboard, every=self.checkpoint_every)
             try:
                 _finish(trainer, scene, run, device, console)
             except OSError as error:
@@ -251,7 +251,7 @@ class Train:
                 raise SettingError(f"{flag}: expected {expected} as in the run to resume, got {given}")
         return dataclasses.replace(old, path=source.path)
 
-    def _config(self, run: Path, resume: bool) -> Config:
+    def _config(self, run: Path, resume: bool = False) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
         given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
         given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic or None}
@@ -280,11 +280,11 @@ class Train:
         try:
             settings = parse_settings(self.settings)
         except ValueError as error:
-            raise ValueError(f"--set: {error}") from None
+            raise SettingError(f"--set: {error}") from None
         for name in settings:
             if name == "preset" or name in given:
                 flag = f"--{name.replace('_', '-')}"
-                raise ValueError(f"--set: {name}: expected {flag} alone, got {name} with --set")
+                raise SettingError(f"--set: {name}: expected {flag} alone, got {name} with --set")
         return settings
 
 
@@ -528,7 +528,7 @@ def _with_settings(config: Config, settings: dict[str, Any]) -> Config:
     try:
         return with_settings(config, settings)
     except ValueError as error:
-        raise ValueError(f"--set: {error}") from None
+        raise SettingError(f"--set: {error}") from None
 
 
 def _check_max_hits(max_hits: int | None) -> None:
@@ -556,9 +556,9 @@ def _train(
     run: Path,
     console: Console,
     viewer: "Viewer | None" = None,
-    every: int | None = None,
     *,
     tensorboard: bool = False,
+    every: int | None = None,
 ) -> None:
     """Run the loop with its display and log; keep checkpoints on the way and when a signal asks to stop."""
     total = trainer.config.iterations
@@ -568,16 +568,22 @@ def _train(
 
         def observe(step: Any) -> None:
             shown(step)
-            log(step)
+            with _rescued(trainer, run):
+                log(step)
             if viewer is not None:
                 viewer.between_steps(step.iteration, partial(_describe, step), lambda: asked() is not None)
             if step.iteration % every == 0 or step.iteration == total or asked() is not None:
-                _save(trainer, run)
+                with _rescued(trainer, run):
+                    trainer.save(run)
             if (number := asked()) is not None:
                 raise _Stopped(number)
 
+        def warn(text: str) -> None:
+            _warn(console, text)
+            log.rewind()
+
         try:
-            trainer.run(observe, partial(_warn, console))
+            trainer.run(observe, warn)
         except DivergedError as error:
             # The trainer is in its last good state.
             report = {"message": str(error), **error.report}
@@ -590,10 +596,11 @@ def _train(
             raise DivergedError(f"{error}; {kept}", report) from None
 
 
-def _save(trainer: Trainer, run: Path) -> None:
-    """Keep a checkpoint; where the disk will not take it, at least the model, which is smaller."""
+@contextmanager
+def _rescued(trainer: Trainer, run: Path) -> Iterator[None]:
+    """Where the disk takes no more in a block, keep at least the model, which is smaller than a checkpoint."""
     try:
-        trainer.save(run)
+        yield
     except OSError as error:
         try:
             save_model(run, trainer.model())
@@ -733,7 +740,7 @@ def main(arguments: list[str] | None = None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(
         COMMANDS,
         prog="nexwarp",
-        description="Nexels: neurally-textured surfels. Each command has a --help of its own. With --debug, any shows "
+        description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, each shows "
         "the full trace of an error.",
         args=[argument for argument in given if argument != "--debug"],
         config=(tyro.conf.FlagCreatePairsOff,),

@@ -95,11 +95,21 @@ class TrainingLog:
         self.written = time.perf_counter()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self.file is not None:
-            self.file.close()
-        if self.writer is not None:
-            self.writer.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        for file in (self.file, self.writer):
+            try:
+                if file is not None:
+                    file.close()
+            except OSError:  # what a full disk did not take, it does not take now: that was told before
+                if kind is None:
+                    raise
+
+    def rewind(self) -> None:
+        """Drop the lines beyond the trainer's iteration, after it has gone back."""
+        self.file.close()
+        keep_lines(self.run / LOG_FILE, self.trainer.iteration)
+        self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
+        self.last, self.written = self.trainer.iteration, time.perf_counter()
 
     def __call__(self, step: Progress) -> None:
         """Observe a step."""

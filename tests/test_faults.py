@@ -23,7 +23,7 @@ from nexwarp.runs import check_room, read_metrics, read_run
 from tests.faults import Disk, failing
 
 SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
-FLAGS = ["--iterations", "3", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
+FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
 FULL, BROKEN = errno.ENOSPC, errno.EIO
 
 

@@ -237,6 +237,9 @@ def test_the_command_line_goes_back_and_tells(folder, tmp_path, monkeypatch, cap
     out, err = capsys.readouterr()
     assert "warning: " in out and "going back to iteration 12 with half the learning rates" in out and err == ""
     assert nw.load(tmp_path / "run").meta["iteration"] == 40
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == list(range(1, 41))  # those of the other future are gone
+    assert all(line["loss"] is not None for line in lines)
 
 
 def test_the_command_line_gives_up_with_a_report_and_a_model(folder, tmp_path, monkeypatch, capsys):
