@@ -257,6 +257,10 @@ def _report(report: Connection, counts: Result) -> None:
 def _limit_memory() -> None:
     import ctypes
 
+    import torch
+
+    # The threads of torch that were there before the fork are not; without this it may ask for them.
+    torch.set_num_threads(1)
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL("libc.so.6").mallopt(M_ARENA_MAX, 1)

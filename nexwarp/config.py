@@ -165,8 +165,12 @@ class Config:
         try:
             data = {k: parts[k](**_checked(parts[k], _tuples(v), k)) if k in parts else v for k, v in data.items()}
             return cls(**_checked(cls, _tuples(data), "config"))
-        except (TypeError, AttributeError) as error:
+        except (TypeError, AttributeError, KindError) as error:
             raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
+
+
+class KindError(ValueError):
+    """A setting's value is not of its type."""
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:
@@ -179,7 +183,7 @@ def _checked(cls: type, data: dict[str, Any], where: str) -> dict[str, Any]:
     for name, value in data.items():
         if name in types and not _fits(value, types[name]):
             kind = getattr(types[name], "__name__", types[name]) if not get_args(types[name]) else types[name]
-            raise ValueError(f"{where}: {name}: expected {kind}, got {value!r:.60}")
+            raise KindError(f"{where}: {name}: expected {kind}, got {value!r:.60}")
     return data
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nexwarp.data.lens import FACES, Lens, Maps, pycolmap_module
+from nexwarp.data.lens import FACES, MAX_PARAMETER, MIN_FOCAL, Lens, Maps, pycolmap_module
 
 WIDTH, HEIGHT = 120, 90
 F = (80.0, 83.0, 61.5, 43.0)  # fx, fy, cx, cy
@@ -154,6 +154,7 @@ def test_bad_lenses(model, params, size, message):
 
 def test_absurd_lenses_give_finite_maps_of_bounded_size():
     rng = np.random.default_rng(0)
+    refused = 0
     for trial in range(300):
         model = sorted(LENSES)[trial % len(LENSES)]
         size = 10.0 ** rng.uniform(-3, rng.choice([0, 2, 20, 300]))
@@ -161,8 +162,19 @@ def test_absurd_lenses_give_finite_maps_of_bounded_size():
         params[4:] *= rng.choice([-1, 1], len(params) - 4) if len(params) > 4 else 1
         if trial % 3:
             params[:4] = (50.0, 50.0, 20.0, 15.0)[: len(params)]
-        here = Lens(model, tuple(params.tolist()), 40, 30)
+        if np.abs(params).max() > MAX_PARAMETER or params[0] < MIN_FOCAL:
+            refused += 1
+            with pytest.raises(ValueError, match=r"^(camera model|K: )"):
+                Lens(model, tuple(params.tolist()), 40, 30)
+            continue
+        try:
+            here = Lens(model, tuple(params.tolist()), 40, 30)
+        except ValueError as error:  # the other focal length
+            assert "focal lengths" in str(error)
+            refused += 1
+            continue
         target = here.pinhole()
         assert 1 <= target.width <= 80 and 1 <= target.height <= 60 and np.isfinite(target.K).all()
         way = Maps().get(here, target, None)
         assert way.grid.isfinite().all() and way.grid.abs().max() <= 2
+    assert 20 < refused < 200
