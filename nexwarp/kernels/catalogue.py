@@ -74,7 +74,7 @@ def thread_kernels(
         lookup = (hashgrid_rows_kernels if cpu else hashgrid_kernels)(real, storage, count)
         yield from (lookup.forward, lookup.backward)
         if fixed and not cpu:
-            yield lookup.fixed_backward
+            yield hashgrid_kernels(real, storage, count, fixed=True).backward
     for low_pass in low_passes:
         lists = list_kernels(real, low_pass, tile_size)
         yield footprint_kernel(real, low_pass, tile_size)

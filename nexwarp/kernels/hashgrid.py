@@ -172,13 +172,14 @@ def _interpolation(real: type, features: int, lanes: int, f: SimpleNamespace) ->
 
 
 @functools.cache
-def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespace:
+def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = False) -> SimpleNamespace:
     """Make the forward and backward kernels.
 
     Args:
         real: scalar type of positions, table gradients and arithmetic.
         storage: scalar type of the table and of the features written (`real` or wp.float16).
         features: features a level, 1, 2, 4 or 8.
+        fixed: let the backward kernel add to the table in fixed point: integers, `units` of them in 1.
     """
     t = types(real)
     vec3, vec4 = t.vec3, t.vec4
@@ -189,7 +190,9 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
     ZERO = t.ZERO
     load = load_function(features, storage)
     options = {"fast_math": real is wp.float32}
-    pairs = features == 2 and real is wp.float32
+    # In fixed point the lanes of a cell do not add up theirs first: which ones come together may change.
+    pairs = features == 2 and real is wp.float32 and not fixed
+    table_of_sums = wp.array2d(dtype=wp.int64) if fixed else wp.array2d(dtype=vec)
     add_units = fixed_units(real)
 
     @wp.func
@@ -242,9 +245,11 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
         mask: wp.uint32,
         grad_encoded: wp.array2d(dtype=storage),
         unscale: wp.array(dtype=real),
+        units: wp.array(dtype=wp.float64),
         # outputs
-        grad_table: wp.array2d(dtype=vec),
+        grad_table: table_of_sums,
         grad_points: wp.array(dtype=vec4),
+        bad: wp.array(dtype=wp.int32),
     ):
         p = first + wp.tid()
         depth = depths[p]
@@ -268,60 +273,21 @@ def hashgrid_kernels(real: type, storage: type, features: int) -> SimpleNamespac
             if wp.static(pairs):
                 gc = merge_cells(corner[0], corner[1], corner[2], gc)
             for j in range(8):
-                part = vec()
-                for k in range(wp.static(features)):
-                    part[k] = gc[j, k]
-                if wp.static(pairs):
-                    if part[0] != real(0.0) or part[1] != real(0.0):
-                        add_pair(grad_table, level, hash_slot(corner, j, mask), part)
+                if wp.static(fixed):
+                    first_sum = int(hash_slot(corner, j, mask)) * wp.static(features)
+                    for k in range(wp.static(features)):
+                        add_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
                 else:
-                    wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
+                    part = vec()
+                    for k in range(wp.static(features)):
+                        part[k] = gc[j, k]
+                    if wp.static(pairs):
+                        if part[0] != real(0.0) or part[1] != real(0.0):
+                            add_pair(grad_table, level, hash_slot(corner, j, mask), part)
+                    else:
+                        wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
             total += vec4(gx * scale, gy * scale, gz * scale, gd)
         if grad_points.shape[0] > 0:
             grad_points[p] = total
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
-    def hashgrid_fixed_backward(
-        first: wp.int32,
-        table: wp.array2d(dtype=row),
-        positions: wp.array(dtype=vec3),
-        depths: wp.array(dtype=real),
-        resolutions: wp.array(dtype=real),
-        focal: wp.array(dtype=real),
-        mask: wp.uint32,
-        grad_encoded: wp.array2d(dtype=storage),
-        unscale: wp.array(dtype=real),
-        scale_of_sums: wp.array(dtype=wp.float64),
-        # outputs
-        grad_table: wp.array2d(dtype=wp.int64),
-        grad_points: wp.array(dtype=vec4),
-        bad: wp.array(dtype=wp.int32),
-    ):
-        p = first + wp.tid()
-        depth = depths[p]
-        if not (depth > ZERO):
-            if grad_points.shape[0] > 0:
-                grad_points[p] = vec4()
-            return
-        total = vec4()
-        for level in range(resolutions.shape[0]):
-            grad = vec()
-            for k in range(wp.static(features)):
-                grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
-            scale = resolutions[level]
-            x = positions[p] * scale
-            base = cell(x)
-            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-            x -= base
-            gx, gy, gz, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-                x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0], grad
-            )
-            for j in range(8):
-                slot = int(hash_slot(corner, j, mask))
-                for k in range(wp.static(features)):
-                    add_units(grad_table, level, slot * wp.static(features) + k, gc[j, k], scale_of_sums[0], bad)
-            total += vec4(gx * scale, gy * scale, gz * scale, gd)
-        if grad_points.shape[0] > 0:
-            grad_points[p] = total
-
-    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward, fixed_backward=hashgrid_fixed_backward)
+    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)

@@ -280,7 +280,7 @@ def hashgrid(
 
     def backward() -> None:
         points = _new(positions, count, types(real).vec4, requires_grad=False)
-        _silent(kernels.backward, count, [*inputs, encoded.grad, one], [table.grad, points])
+        _silent(kernels.backward, count, [*inputs, encoded.grad, one, None], [table.grad, points, None])
         _silent(_add_points, count, [points], [positions.grad, depths.grad])
 
     tape.record_func(backward, [table, positions, depths, encoded])

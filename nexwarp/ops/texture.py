@@ -274,10 +274,13 @@ def _lookup_backward(
         units = _units(grad_encoded, unscale)
         bad = torch.zeros(1, dtype=torch.int32, device=table.device)
         outputs = [array(grad_grid.view(levels, -1), wp.int64), points_out, array(bad, wp.int32)]
-        launch(positions, kernels.fixed_backward, threads, [*arguments, array(units, wp.float64)], outputs)
+        backward = hashgrid_kernels(real, STORAGES[table.dtype], features, fixed=True).backward
+        launch(positions, backward, threads, [*arguments, array(units, wp.float64)], outputs)
         grad_grid = torch.where(bad.bool(), torch.nan, (grad_grid.double() / units).to(positions.dtype))
     else:
         outputs = [array(grad_grid, wp.types.vector(length=features, dtype=real)), points_out]
+        if not rows:
+            arguments, outputs = [*arguments, None], [*outputs, None]
         launch(positions, kernels.backward, threads, arguments, outputs)
     if not need_points:
         return grad_grid, None, None
