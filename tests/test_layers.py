@@ -15,7 +15,7 @@ LAYERS = [
     {"json_files"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
-    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "watch"},
+    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},
     {"config"},
     {"initial"},
     {"trainer"},

@@ -12,7 +12,8 @@ from nexwarp.config import Config, TextureConfig, with_settings
 from nexwarp.data import Scene, View
 from nexwarp.data.demo import write_demo
 from nexwarp.evaluate import evaluate
-from nexwarp.trainer import Trainer, mean_colour
+from nexwarp.trainer import Trainer
+from nexwarp.training_views import mean_color
 from tests.tolerances import assert_close
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
@@ -129,8 +130,8 @@ def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
 
 def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
     photos = torch.stack([view.image for view in scene.train]).double() / 255
-    assert mean_colour(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
-    assert make_trainer(scene).render_options()["background"] == mean_colour(scene.train)
+    assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
+    assert make_trainer(scene).render_options()["background"] == mean_color(scene.train)
     black = make_trainer(scene, background=(0.0, 0.0, 0.0))
     assert black.render_options()["background"] == (0.0, 0.0, 0.0)
     white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))

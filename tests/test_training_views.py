@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nexwarp import trainer
+from nexwarp import training_views
 from nexwarp.camera import Camera
 from nexwarp.data import View
 
@@ -37,7 +37,7 @@ def blocks(values: np.ndarray, factor: int) -> np.ndarray:
 @pytest.mark.parametrize("factor", [1, 2, 3, 14])
 def test_photo_mask_and_alpha_are_reduced_alike(factor):
     views = make_views(3)
-    mine = trainer._Views(views, torch.device("cpu"))
+    mine = training_views.TrainingViews(views, torch.device("cpu"))
     used = factor if factor <= 13 else 1  # smaller photos than a block stay as they are
     for index, view in enumerate(views):
         camera, photo = mine.get(index, factor)
@@ -55,7 +55,7 @@ def test_photo_mask_and_alpha_are_reduced_alike(factor):
 
 def test_what_comes_next_changes_nothing_on_a_cpu():
     views = make_views(4)
-    mine = trainer._Views(views, torch.device("cpu"))
+    mine = training_views.TrainingViews(views, torch.device("cpu"))
     for index, ahead in ((2, [1, 0]), (1, []), (3, [3, 3]), (0, [1, 2, 3])):
         _, photo = mine.get(index, 1, ahead)
         assert torch.equal(photo, views[index].image.float() / 255.0)
@@ -64,9 +64,9 @@ def test_what_comes_next_changes_nothing_on_a_cpu():
 @pytest.mark.cuda
 def test_photos_fetched_ahead_are_the_photos(monkeypatch: Any):
     """In any order, right guesses and wrong ones, while the GPU is busy; and no more than two wait."""
-    monkeypatch.setattr(trainer, "PHOTO_SHARE", 0.0)
+    monkeypatch.setattr(training_views, "PHOTO_SHARE", 0.0)
     views = make_views(12, width=640, height=480)
-    mine = trainer._Views(views, torch.device("cuda"))
+    mine = training_views.TrainingViews(views, torch.device("cuda"))
     assert all(not photo.is_cuda for photo in mine.photos)
     order = np.random.default_rng(0).integers(0, 12, 300).tolist()
     load = torch.rand(1024, 1024, device="cuda")
