@@ -13,6 +13,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.errors import CheckpointError, FormatError, MissingError
+from nexwarp.exposures import Exposures
 from nexwarp.files import one_line, sync, write_atomically
 from nexwarp.json_files import parse_json, read_json
 from nexwarp.kernels.types import MAX_HITS
@@ -70,6 +71,8 @@ def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
         tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
     if model.surfels.footprints is not None:
         tensors["footprints"] = model.surfels.footprints
+    if model.surfels.exposures is not None:
+        tensors |= {f"exposures.{name}": x for name, x in model.surfels.exposures.tensors().items()}
     tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
     meta = {**model.meta, "format_version": FORMAT_VERSION, "frame": FRAME, "texture": model.texture.config}
     path = Path(folder) / MODEL_FILE
@@ -109,6 +112,8 @@ def load(path: str | os.PathLike[str]) -> Model:
         if "footprints" in tensors:
             check_tensors({"footprints": (tensors["footprints"], (len(surfels),))}, dtype=torch.float32)
             surfels.footprints = tensors["footprints"]
+        if exposures := {name[10:]: x.float() for name, x in tensors.items() if name.startswith("exposures.")}:
+            surfels.exposures = Exposures(**exposures)
         for name, x in tensors.items():
             check_finite(name, x)
         field = NeuralTexture(**texture)

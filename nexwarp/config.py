@@ -42,9 +42,12 @@ class LearningRates:
     """Of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """Of the MLP."""
+    cooldown: float = 0.0
+    """Share of the run, at its end, over which all of them fall to a hundredth of that."""
 
     def __post_init__(self) -> None:
-        for rate in dataclasses.fields(self):
+        check_range("cooldown", self.cooldown, 0.0, 1.0)
+        for rate in dataclasses.fields(self)[:-1]:
             value = getattr(self, rate.name)
             ends = value if isinstance(value, tuple) else (value, value)
             if not (min(ends) > 0 or ends == (0.0, 0.0)):
@@ -99,6 +102,8 @@ class Config:
     """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
     footprints: bool = True
     """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
+    exposures: bool = True
+    """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
     mask_mode: str = "ignore"
     """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08
@@ -303,6 +308,7 @@ PRESETS: dict[str, Config] = {
         background=(0.0, 0.0, 0.0),
         border=0.0,
         footprints=False,
+        exposures=False,
         clamp_image=True,
         filter_points=False,
         orient_points=False,

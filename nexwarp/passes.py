@@ -78,9 +78,13 @@ def render_buffers(
     expected = (wide.weights * wide.depths).sum(-1) / total.clamp_min(torch.finfo(total.dtype).tiny)
     _, rays = _unproject(wide.depths[..., :1], camera)
     background = torch.as_tensor(background).to(out.image).expand(3).clone()
+    colors = _slot_colors(surfels, texture, camera, out.ids, out.depths, sh_degree, clamp_texture)
+    if surfels.exposures is not None:
+        gains = surfels.exposures.gains(camera).to(out.image)
+        background, colors = background * gains, colors * gains
     return Buffers(
         **{name: getattr(out, name) for name in ("image", "plain", "textured", "alpha", "ids", "depths", "weights")},
-        colors=_slot_colors(surfels, texture, camera, out.ids, out.depths, sh_degree, clamp_texture),
+        colors=colors,
         expected_depth=expected,
         top_depth=wide.depths[..., 0].clone(),
         normal=_facing_normals(surfels, wide.ids[..., 0], rays),

@@ -80,7 +80,8 @@ def render(
 ) -> Rendering:
     """Render surfels as a camera sees them.
 
-    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`.
+    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`. With
+    `surfels.exposures`, all colours, the background's too, are times the gains there, which count as constants.
 
     Args:
         surfels: the N surfels, N may be 0.
@@ -110,9 +111,13 @@ def render(
         depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
-    image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
+    plain = hits.plain
+    image, textured = ops.compose(plain, texels, weights, hits.alpha, background, base)
+    if surfels.exposures is not None:
+        gains = surfels.exposures.gains(camera).to(image)
+        image, plain, textured = image * gains, plain * gains, textured * gains
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
-    rendering = Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
+    rendering = Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.
     object.__setattr__(rendering, "_passes", passes)
     return rendering

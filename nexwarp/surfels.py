@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from nexwarp import ops
+from nexwarp.exposures import Exposures
 from nexwarp.ops.checks import check_finite, check_tensors
 
 # Raw values stay finite at the ends of the ranges; activated ones come back within 2e-6.
@@ -42,9 +43,13 @@ class Surfels(nn.Module):
     Buffer: `footprints` (N,) world units, depth / focal of the closest look that a training view had at each surfel's
     texture, huge where none had any; None until that is known. A rendering from closer gets the detail of that look:
     else texture levels which no photo resolved come out stronger than training ever saw them.
+
+    Child: `exposures`, the gains of the training photos, which renderings take theirs from; None gives the mean
+    exposure, that which the colours are learned at.
     """
 
     footprints: torch.Tensor | None
+    exposures: Exposures | None
 
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
         """Take the raw values by parameter name, as `state_dict` gives them."""
@@ -65,6 +70,7 @@ class Surfels(nn.Module):
         for name in shapes:
             self.register_parameter(name, nn.Parameter(raw[name]))
         self.register_buffer("footprints", None, persistent=False)
+        self.register_module("exposures", None)
 
     @classmethod
     def from_activated(

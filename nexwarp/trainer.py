@@ -23,6 +23,7 @@ from nexwarp.data import Scene
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
+from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.initial import initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses
 from nexwarp.render import Rendering, render
@@ -36,6 +37,7 @@ from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 CHECK_EVERY = 100
 SNAPSHOTS = 10
 LOWERED_RATES = 0.5
+COOLED = 0.01  # of the learning rates is left at the end of a cooldown
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,9 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[int, torch.Tensor] = {}
-        self.views = TrainingViews(scene.train, self.device)
+        self.exposures = _exposures(scene, config)
+        gains = None if self.exposures is None else self.exposures.log_gains.exp()
+        self.views = TrainingViews(scene.train, self.device, gains)
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
@@ -215,6 +219,7 @@ class Trainer:
     def _step(self) -> Progress:
         self.iteration += 1
         self.surfels.footprints = None  # of surfels that are about to change
+        self.surfels.exposures = None  # the photos are all brought to one
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
         view = self._view(self._next_view(), 2 if coarse else 1)
@@ -297,7 +302,8 @@ class Trainer:
         return self.points[index]
 
     def finish(self) -> Model:
-        """Return the model as it is now, with the footprints that the training views have of its surfels."""
+        """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
+        self.surfels.exposures = None if self.exposures is None else self.exposures.to(self.device)
         if self.config.footprints and self.config.max_hits:
             cameras, options = self.views.cameras, self.render_options()
             self.surfels.footprints = seen_footprints(self.surfels, cameras, options=options)
@@ -465,10 +471,12 @@ class Trainer:
 
     def _schedule_rates(self) -> None:
         progress = (self.iteration - 1) / max(self.config.iterations - 1, 1)
+        cooldown = self.config.rates.cooldown
+        late = max(progress - (1 - cooldown), 0.0) / cooldown if cooldown else 0.0
         for group in self.optimizer.param_groups:
             first, last = group["ends"]
             rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-            group["lr"] = self.rate_factor * rate
+            group["lr"] = self.rate_factor * rate * COOLED**late
 
 
 @dataclass(frozen=True)
@@ -492,6 +500,19 @@ class _Target:
     counts: torch.Tensor | None = None
     empty: torch.Tensor | None = None
     beyond: torch.Tensor | None = None
+
+
+def _exposures(scene: Scene, config: Config) -> Exposures | None:
+    """Of the training photos; None where they have one exposure by their nature, or no points tell theirs."""
+    rendered = scene.background is not None or scene.random_background
+    if not config.exposures or rendered or config.mask_mode == "background":
+        return None
+    seen = [view.points if view.points is not None else scene.points[:0] for view in scene.train]
+    if sum(map(len, seen)) == 0:
+        return None
+    cameras = [view.camera for view in scene.train]
+    log_gains = photo_gains(cameras, [view.image for view in scene.train], seen)
+    return Exposures.of(torch.from_numpy(log_gains), cameras)
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

@@ -21,8 +21,10 @@ class TrainingViews:
     next are copied while a step runs: by a thread into pinned memory, and from there on a stream of their own.
     """
 
-    def __init__(self, views: list[View], device: torch.device) -> None:
+    def __init__(self, views: list[View], device: torch.device, gains: torch.Tensor | None = None) -> None:
+        """Take the views to a device; their photos, as `get` gives them, are over `gains` (V, 3)."""
         self.device = device
+        self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
         self.names = [view.name for view in views]
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
@@ -51,13 +53,14 @@ class TrainingViews:
         return digest.hexdigest()
 
     def get(self, index: int, factor: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
-        """Camera and photo (H, W, 3) float in [0, 1], reduced by a factor; what does not fill a pixel is cut off.
+        """Camera and photo (H, W, 3) float, reduced by a factor; what does not fill a pixel is cut off.
 
         `ahead` are the indices of the views to come, the next one first: up to two are fetched meanwhile.
         """
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
-        return self._camera(index, factor), self._reduce(photo.float() / 255.0, index, factor)
+        scale = self.scales if isinstance(self.scales, float) else self.scales[index]
+        return self._camera(index, factor), self._reduce(photo.float() / scale, index, factor)
 
     def mask(self, index: int, factor: int) -> torch.Tensor | None:
         """Mask (H, W) bool of the photo that `get` gives: a reduced pixel counts where all of its pixels do."""

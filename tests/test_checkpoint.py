@@ -30,6 +30,7 @@ from nexwarp.checkpoint import (
     save_model,
     write_atomically,
 )
+from nexwarp.exposures import Exposures
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -114,6 +115,19 @@ def test_footprints_come_back_exactly(tmp_path):
     assert loaded.surfels.to(torch.float64).footprints.dtype == torch.float64
     model.surfels.footprints = torch.rand(len(model.surfels) + 1)
     with pytest.raises(ValueError, match=r"the tensors do not make a model \(footprints: expected shape"):
+        nw.load(save_model(tmp_path, model))
+
+
+def test_exposures_come_back_exactly(tmp_path):
+    model = make_model()
+    assert nw.load(save_model(tmp_path, model)).surfels.exposures is None
+    model.surfels.exposures = Exposures(*torch.rand(3, 5, 3), torch.rand(2))
+    loaded = nw.load(save_model(tmp_path, model))
+    for name, value in model.surfels.exposures.tensors().items():
+        assert torch.equal(loaded.surfels.exposures.tensors()[name], value), name
+    assert loaded.surfels.to(torch.float64).exposures.lengths.dtype == torch.float64
+    model.surfels.exposures.positions = torch.rand(4, 3)
+    with pytest.raises(ValueError, match=r"the tensors do not make a model \(positions: expected shape"):
         nw.load(save_model(tmp_path, model))
 
 

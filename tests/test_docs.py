@@ -27,6 +27,7 @@ from nexwarp import cli
 from nexwarp.checkpoint import load_cameras, save_model
 from nexwarp.config import PRESETS, Config, preset, setting, with_settings
 from nexwarp.data import write_demo
+from nexwarp.exposures import Exposures
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -41,6 +42,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "coarse": ("", ""),
     "background": ("", "code"),
     "footprints": ("", ""),
+    "exposures": ("", ""),
     "mask_mode": ("", ""),
     "border": ("", ""),
     "border_every": ("", ""),
@@ -68,6 +70,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.shN": ("", "code"),
     "rates.grid": ("", "code"),
     "rates.mlp": ("", "code"),
+    "rates.cooldown": ("", ""),
     "texture.levels": ("L", "Results"),
     "texture.table_size": ("T", "Results"),
     "texture.features": ("F", "Results"),
@@ -278,7 +281,12 @@ def test_tensors(run):
     rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
     shape = meta["texture"]
     sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "3": 3, "1": 1, "2": 2, "4": 4}
-    sizes |= {"L": shape["levels"], "T": shape["table_size"], "F": shape["features"]}
+    sizes |= {
+        "V": len(json.loads((run / "cameras.json").read_text())["train"]),
+        "L": shape["levels"],
+        "T": shape["table_size"],
+        "F": shape["features"],
+    }
     expected = {}
     for name, dtype, dimensions in rows:
         if ".I." in name:
@@ -305,10 +313,14 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
+    others = list(load_cameras(run / "cameras.json")["train"].values())[:3]
     with torch.no_grad():  # more to be seen than after so few steps
         model.texture.grid.normal_(0, 2)
         model.surfels.log_scales += 0.7
         model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
+        model.surfels.exposures = Exposures.of(
+            torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others
+        )
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)

@@ -12,7 +12,7 @@ LAYERS = [
     {"errors"},
     {"kernels"},
     {"ops", "camera", "files"},
-    {"json_files"},
+    {"json_files", "exposures"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
     {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},

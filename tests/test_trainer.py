@@ -258,7 +258,7 @@ def test_rounds_stretch_with_the_run(scene, iterations, rounds):
 
 
 def test_views_are_drawn_without_replacement(scene):
-    trainer, drawn = Trainer(scene, small(iterations=24, border=0.0), "cpu"), []
+    trainer, drawn = Trainer(scene, small(iterations=24, border=0.0, exposures=False), "cpu"), []
     photos = [view.image.float() / 255 for view in scene.train]
 
     def note(progress: Any) -> None:
@@ -281,7 +281,7 @@ def test_paper_is_the_paper():
     assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
     assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
-    assert (p.border, p.mask_mode, p.footprints) == (0.0, "ignore", False)
+    assert (p.border, p.mask_mode, p.footprints, p.exposures) == (0.0, "ignore", False, False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
         quats=1e-3,

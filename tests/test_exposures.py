@@ -1,0 +1,195 @@
+"""Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.camera import Camera
+from nexwarp.config import Config, TextureConfig
+from nexwarp.data import View, write_demo
+from nexwarp.evaluate import evaluate
+from nexwarp.exposures import Exposures, photo_gains
+from nexwarp.metrics import to_uint8
+from nexwarp.passes import render_buffers
+from nexwarp.trainer import Trainer
+from nexwarp.training_views import TrainingViews
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
+
+
+def looking(x: float, turn: float = 0.0) -> Camera:
+    """A camera at (x, 0, 0), turned about y."""
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float32)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ torch.tensor([float(x), 0.0, 0.0])
+    return Camera(viewmat, K, 64, 48)
+
+
+def photographs(log_gains: torch.Tensor, outliers: float = 0.0) -> tuple[list, list, list]:
+    """Photos of coloured points, each a pixel, with gains; some pixels are of something else."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(900, 3, generator=generator) * torch.tensor([3.0, 1.6, 1.0]) + torch.tensor([-1.5, -0.8, 2.2])
+    colors = 0.2 + 0.4 * torch.rand(900, 3, generator=generator)
+    cameras, photos, seen = [], [], []
+    for index, gains in enumerate(log_gains.exp().float()):
+        camera = looking(0.1 * index)
+        pixels, depths = camera.project(points)
+        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([64.0, 48.0])).all(1)
+        column, row = pixels[inside].long().unbind(1)
+        # One point a pixel, or a point's colour would be another's.
+        _, first = np.unique((row * 64 + column).numpy(), return_index=True)
+        kept = inside.nonzero()[:, 0][torch.from_numpy(first)]
+        photo = torch.zeros(48, 64, 3, dtype=torch.uint8)
+        color = colors[kept] * gains
+        wrong = torch.rand(len(kept), generator=generator) < outliers
+        color[wrong] = torch.rand(int(wrong.sum()), 3, generator=generator)
+        photo[row[torch.from_numpy(first)], column[torch.from_numpy(first)]] = to_uint8(color[None])[0]
+        cameras.append(camera), photos.append(photo), seen.append(points[kept])
+    return cameras, photos, seen
+
+
+def test_gains_are_found_up_to_their_mean():
+    expected = 0.3 * torch.randn(7, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    expected -= expected.mean(0)
+    for outliers, bound in ((0.0, 0.01), (0.2, 0.02)):
+        found = photo_gains(*photographs(expected, outliers))
+        assert abs(found.mean(0)).max() < 1e-6
+        assert abs(found - expected.numpy()).max() < bound
+
+
+def test_gains_do_not_depend_on_the_order_of_photos_or_points():
+    cameras, photos, points = photographs(torch.tensor([[0.2, 0.1, 0.0], [-0.3, 0.0, 0.1], [0.1, -0.1, -0.1]]))
+    found = photo_gains(cameras, photos, points)
+    order = [2, 0, 1]
+    shuffled = [points[i].flip(0) for i in order]
+    again = photo_gains([cameras[i] for i in order], [photos[i] for i in order], shuffled)
+    np.testing.assert_allclose(again, found[order], atol=2e-6)
+
+
+def test_photos_that_share_nothing_keep_their_colours():
+    cameras, photos, points = photographs(torch.tensor([[0.2] * 3, [-0.2] * 3]))
+    nothing = [points[0][:0]] * 2
+    assert (photo_gains(cameras, photos, nothing) == 0).all()
+    apart = [points[0][:100], points[1] + 1e-3]  # no point twice
+    assert abs(photo_gains(cameras, photos, apart)).max() < 1e-6
+    white = [torch.full_like(photo, 255) for photo in photos]
+    assert (photo_gains(cameras, white, points) == 0).all()
+
+
+def test_a_camera_gets_the_gains_around_it():
+    cameras = [looking(x) for x in (0.0, 1.0, 2.0, 4.0, 6.0)]
+    log_gains = torch.tensor([[0.0] * 3, [0.1] * 3, [0.3, 0.2, 0.1], [-0.2] * 3, [-0.4] * 3])
+    exposures = Exposures.of(log_gains, cameras)
+    there = torch.stack([exposures.gains(camera).log() for camera in cameras])
+    assert (there - log_gains).abs().max() < 0.05  # neighbours at the usual distance weigh exp(-2) each
+    between = exposures.gains(looking(5.0)).log()
+    torch.testing.assert_close(between, torch.full((3,), -0.3), atol=1e-3, rtol=0)
+    far = exposures.gains(looking(1e4)).log()
+    torch.testing.assert_close(far, log_gains[4], atol=1e-6, rtol=0)
+    low, high = log_gains.min(0).values, log_gains.max(0).values
+    for x in np.linspace(-1, 7, 50):
+        gains = exposures.gains(looking(x)).log()
+        assert (gains >= low - 1e-6).all() and (gains <= high + 1e-6).all()
+
+
+def test_directions_count_as_positions_do():
+    cameras = [looking(0.0, turn) for turn in (-0.4, 0.0, 0.4)] + [looking(3.0)]
+    exposures = Exposures.of(torch.tensor([[0.3] * 3, [0.0] * 3, [-0.3] * 3, [0.1] * 3]), cameras)
+    left, right = (exposures.gains(looking(0.0, turn)).log()[0] for turn in (-0.39, 0.39))
+    assert left > 0.2 and right < -0.2
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_cameras_in_one_place(count):
+    exposures = Exposures.of(torch.full((count, 3), 0.2), [looking(0.0)] * count)
+    torch.testing.assert_close(exposures.gains(looking(1.0)).log(), torch.full((3,), 0.2))
+
+
+def test_gains_follow_a_scene_that_is_moved_and_scaled():
+    cameras = [looking(x, 0.1 * x) for x in (0.0, 0.7, 1.0, 2.5)]
+    log_gains = torch.randn(4, 3, generator=torch.Generator().manual_seed(1)) * 0.2
+    query = looking(0.8, 0.3)
+
+    def changed(camera: Camera) -> Camera:
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] = 100 * viewmat[:3, 3] - viewmat[:3, :3] @ torch.tensor([5.0, 6.0, 7.0])
+        return Camera(viewmat, K, 64, 48)
+
+    before = Exposures.of(log_gains, cameras).gains(query)
+    after = Exposures.of(log_gains, [changed(camera) for camera in cameras]).gains(changed(query))
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+
+
+def test_a_rendering_is_times_its_gains(device: torch.device):
+    scene = random_scene(40, device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+    options = {"max_hits": 2, "background": (0.2, 0.5, 0.9)}
+    plain = nw.render(surfels, texture, camera, **options)
+    cameras = [camera, Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
+    surfels.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras).to(device)
+    gains = surfels.exposures.gains(camera)
+    out = nw.render(surfels, texture, camera, **options)
+    for name in ("image", "plain", "textured"):
+        assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
+    for name in ("alpha", "weights", "depths"):
+        assert torch.equal(getattr(out, name), getattr(plain, name))
+    buffers = render_buffers(surfels, texture, camera, **options)
+    assert_close(buffers.image, out.image, kind="value", name="image of the buffers")
+    total = buffers.plain + buffers.textured + (1 - buffers.alpha)[..., None] * buffers.background
+    assert_close(total, buffers.image, kind="value", name="sum")
+    slots = (buffers.weights[..., None] * buffers.colors).sum(2)
+    assert_close(slots, buffers.textured, kind="value", name="sum over the slots")
+
+
+def test_photos_are_brought_to_one_exposure():
+    camera = looking(0.0)
+    image = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    views = [View(camera, image, None, name) for name in "ab"]
+    gains = torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0]])
+    mine = TrainingViews(views, torch.device("cpu"), gains)
+    torch.testing.assert_close(mine.get(0, 1)[1], image / 255.0 / gains[0])
+    torch.testing.assert_close(mine.get(1, 1)[1], image / 255.0)
+
+
+def test_training_takes_exposures_out(tmp_path):
+    """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
+
+    def gain(view: View) -> float:
+        return 0.75 + 0.08 * view.camera.position[0].item()
+
+    def exposed(views: list[View]) -> list[View]:
+        return [dataclasses.replace(view, image=to_uint8(view.image / 255 * gain(view))) for view in views]
+
+    scene = dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
+    expected = torch.tensor([gain(view) for view in scene.train]).log()
+    expected -= expected.mean()
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    figures = {}
+    for exposures in (False, True):
+        config = Config(iterations=150, max_surfels=400, texture=texture, exposures=exposures)
+        trainer = Trainer(scene, config, "cpu")
+        trainer.run()
+        model = trainer.finish()
+        figures[exposures] = evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+    assert (model.surfels.exposures.log_gains - expected[:, None]).abs().max() < 0.03
+    assert figures[True] > figures[False] + 0.5, figures
+
+
+@pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
+def test_no_exposures_where_none_are_wanted(tmp_path, change):
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60))
+    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
+    config = Config(iterations=2, max_surfels=40, texture=texture, **change)
+    assert Trainer(scene, config, "cpu").finish().surfels.exposures is None
+    # A background that is known is no photo's business.
+    known = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
+    plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
+    assert Trainer(known, plain, "cpu").finish().surfels.exposures is None
+    assert Trainer(scene, plain, "cpu").finish().surfels.exposures is not None
