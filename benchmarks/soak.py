@@ -71,7 +71,7 @@ class Verdict:
 
 
 def spans(count: int) -> tuple[range, range]:
-    """First and last thousand of `count` frames or steps (from 1) after a warm-up; less of either where they are few."""
+    """First and last thousand of `count` frames or steps (from 1), after a warm-up; fewer where there are few."""
     warmup = min(WARMUP, count // 4)
     window = max(min(WINDOW, (count - warmup) // 2), 1)
     return range(warmup + 1, warmup + window + 1), range(count - window + 1, count + 1)
