@@ -206,7 +206,7 @@ def intersect_tiles(
         if count * columns * rows > LARGEST_INT:
             check_entries(int(ends.numpy().sum(dtype="int64")), count, columns * rows)
         wp.utils.array_scan(ends, ends, inclusive=True)
-        total = int(ends[count - 1 :].numpy()[0])
+        total = check_entries(int(ends[count - 1 :].numpy()[0]), count, columns * rows)
     tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
     if total:
         tile_ids = tiles.view(wp.int32)
