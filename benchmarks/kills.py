@@ -3,7 +3,9 @@
     python -m benchmarks.kills --count 20
 
 trains the demo on the CPU, shortened, and lists each kill: after how many seconds, what it left, and whether the
-resumed run ended with the same bytes. The exit code is 1 unless all did.
+resumed run ended with the same bytes. The exit code is 1 unless all did. A GPU repeats itself only when told to:
+
+    python -m benchmarks.kills --device cuda --deterministic --count 5 --iterations 600 --checkpoint-every 20
 """
 
 import json
@@ -16,6 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -91,11 +94,21 @@ class Kills:
     """Budget of the runs."""
     seed: int = 0
     """Of the moments."""
+    device: Annotated[str, tyro.conf.arg(metavar="{cuda,cpu}")] = "cpu"
+    """Where to train."""
+    deterministic: bool = False
+    """Train with --deterministic, without which a GPU does not end with the same bytes even undisturbed."""
+
+    def command(self) -> list[str]:
+        """Return the training, but for its --run."""
+        flags = [f"--iterations={self.iterations}", f"--checkpoint-every={self.checkpoint_every}"]
+        flags += [f"--max-surfels={self.max_surfels}", f"--device={self.device}"]
+        flags += ["--deterministic"] * self.deterministic
+        return [sys.executable, "-m", "nexwarp", "train", "demo", *flags]
 
     def __call__(self) -> int:
         """Run, print, and return the exit code."""
-        flags = [f"--iterations={self.iterations}", f"--checkpoint-every={self.checkpoint_every}", "--device=cpu"]
-        train = [sys.executable, "-m", "nexwarp", "train", "demo", *flags, f"--max-surfels={self.max_surfels}"]
+        train = self.command()
 
         def start(run: Path) -> subprocess.Popen:
             return subprocess.Popen([*train, "--run", str(run)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
