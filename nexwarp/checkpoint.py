@@ -261,7 +261,7 @@ def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, A
     from safetensors.torch import load
 
     try:
-        record = json.loads((folder / "state.json").read_bytes())
+        record = read_json(folder / "state.json")
         version = record.get("format_version") if isinstance(record, dict) else None
         if version != CHECKPOINT_VERSION:
             raise ValueError(f"expected format version {CHECKPOINT_VERSION}, got {version}")

@@ -240,7 +240,9 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
-        return Progress(self.iteration, len(self.surfels), losses, out.image, view.photo)
+        # Without their graph, which would keep this step's lists and buffers until the next one has its own.
+        losses = {name: value.detach() for name, value in losses.items()}
+        return Progress(self.iteration, len(self.surfels), losses, out.image.detach(), view.photo)
 
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments of `nexwarp.render` at this point of the run."""
@@ -386,10 +388,26 @@ class Trainer:
                 raise ValueError("it has seen other training views than the scene has")
             if state["scene"] != self._scene_digest:
                 raise ValueError("the scene's photos, masks or points have changed since")
+            self._check_state(tensors, state)
             self._restore(tensors, state)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
+
+    def _check_state(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
+        """Raise ValueError unless a checkpoint that others may have made says what one of this run can."""
+        wrong = [k for k, v in tensors.items() if not k.startswith("rng.") and v.dtype != torch.float32]
+        if wrong:
+            raise ValueError(f"{wrong[0]}: expected float32, got {tensors[wrong[0]].dtype}")
+        views, total = len(self.views), self.config.iterations
+        for name, good in (
+            ("iteration", lambda x: type(x) is int and 0 <= x <= total),
+            ("seconds", lambda x: type(x) in (int, float) and 0 <= x < math.inf),
+            ("order", lambda x: isinstance(x, list) and all(type(i) is int and 0 <= i < views for i in x)),
+            ("rate_factor", lambda x: type(x) in (int, float) and 0 < x <= 1),
+        ):
+            if not good(state[name]):
+                raise ValueError(f"{name}: cannot be {state[name]!r:.60}")
 
     def _restore(self, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
         # Copies: what is restored may be restored again.

@@ -7,6 +7,10 @@ from collections.abc import Mapping
 import torch
 
 ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
+# Of CUDA's own calls, and of its libraries, which do not say how much they wanted.
+EXHAUSTED = re.compile(
+    r"CUDA (driver )?error:? .*out of memory|_ALLOC_FAILED|cudaErrorMemoryAllocation|bad_alloc", re.I
+)
 UNKNOWN = "more than there is"
 
 
@@ -54,7 +58,8 @@ def needed_memory(error: BaseException) -> str | None:
     match = ALLOCATION.search(str(error))
     if match is not None:
         return _readable(match[1])
-    return UNKNOWN if isinstance(error, (MemoryError, torch.OutOfMemoryError)) else None
+    exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
+    return UNKNOWN if exhausted else None
 
 
 def _readable(amount: str) -> str:

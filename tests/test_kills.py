@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import kill_and_resume
+from benchmarks.kills import Kills, kill_and_resume
 from nexwarp import cli, config
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import write_demo
@@ -68,3 +68,9 @@ def test_a_kill_is_waited_for(tmp_path):
     with pytest.raises(RuntimeError, match="ended by itself, with exit code 7"):
         kill_and_resume(start, lambda _: 0, tmp_path / "run", 60.0, b"")
     assert time.perf_counter() - begun < 30
+
+
+def test_the_command_is_given_the_device_and_the_sums():
+    alone, on_gpu = Kills().command(), Kills(device="cuda", deterministic=True, iterations=600).command()
+    assert "--device=cpu" in alone and "--deterministic" not in alone
+    assert "--device=cuda" in on_gpu and "--deterministic" in on_gpu and "--iterations=600" in on_gpu

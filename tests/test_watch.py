@@ -12,10 +12,11 @@ import torch
 
 import nexwarp as nw
 from nexwarp import cli, config, trainer
+from nexwarp.checkpoint import save_checkpoint
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene, write_demo
 from nexwarp.densify import DensifyConfig
-from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError
+from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
 from nexwarp.trainer import Trainer
 from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 
@@ -266,7 +267,12 @@ def test_the_command_line_gives_up_with_a_report_and_a_model(folder, tmp_path, m
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 5242880 bytes."), "5.00 MiB"),
         (MemoryError(), "more than there is"),
         (MemoryError("Unable to allocate 7.45 GiB for an array"), "7.45 GiB"),
+        (RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be reported later"), "more than there is"),
+        (RuntimeError("Warp CUDA error 2: out of memory (in function wp_alloc_device)"), "more than there is"),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"), "more than there is"),
+        (RuntimeError("std::bad_alloc"), "more than there is"),
         (RuntimeError("shape mismatch"), None),
+        (RuntimeError("CUDA error: an illegal memory access was encountered"), None),
         (ValueError("out of memory of the names"), None),
         (KeyError("x"), None),
     ],
@@ -288,3 +294,73 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     assert cli.main(["train", str(folder), "--run", str(tmp_path / "run"), *FLAGS]) == 2
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: out of memory at iteration 1: it needed 2.50 GiB") and err.count("\n") == 1
+
+
+# Checkpoints that others made: their checksums agree
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"iteration": -1}, "iteration"),
+        ({"iteration": 10**9}, "iteration"),
+        ({"iteration": "3"}, "iteration"),
+        ({"seconds": INF}, "seconds"),
+        ({"seconds": NAN}, "seconds"),
+        ({"order": [0, 77]}, "order"),
+        ({"order": [-1]}, "order"),
+        ({"order": 5}, "order"),
+        ({"rate_factor": 1e9}, "rate_factor"),
+        ({"rate_factor": None}, "rate_factor"),
+        ({"python": [3, [1, 2], None]}, ""),
+        ({"python": 7}, ""),
+        ({"numpy": ["MT19937"]}, ""),
+        ({"config": []}, ""),
+    ],
+)
+def test_states_that_cannot_be_are_refused(scene, tmp_path, changes, match):
+    run = Trainer(scene, SMALL, "cpu")
+    run.step()
+    tensors, state = run._state()
+    save_checkpoint(tmp_path, tensors, state | changes)
+    with pytest.raises(CheckpointError, match=rf"does not fit \(.*{match}") as caught:
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path}: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("surfels.means", lambda x: x.half()),
+        ("surfels.means", lambda x: x[:-1]),
+        ("adam.surfels.means.exp_avg", lambda x: x.long()),
+        ("adam.surfels.means.exp_avg", lambda x: x.T.contiguous()),
+        ("texture.grid", lambda x: x[:, :1]),
+        ("densify.errors", lambda x: x[:1]),
+        ("rng.torch", lambda x: x[:7]),
+        ("rng.views", lambda x: x.float()),
+        ("rng.numpy", lambda x: x[:5]),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(scene, tmp_path, name, value):
+    run = Trainer(scene, SMALL, "cpu")
+    run.step()
+    tensors, state = run._state()
+    save_checkpoint(tmp_path, tensors | {name: value(tensors[name])}, state)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+
+
+def test_a_state_of_endless_depth_is_refused(scene, tmp_path):
+    run = Trainer(scene, SMALL, "cpu")
+    run.save(tmp_path)
+    (tmp_path / "checkpoint" / "state.json").write_text("[" * 100_000)
+    with pytest.raises(CheckpointError, match="nested too deeply"):
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+
+
+def test_a_step_that_was_told_of_keeps_no_graph(scene):
+    """An observer that holds on to it would hold the buffers of the step, too."""
+    step = Trainer(scene, SMALL, "cpu").step()
+    assert not step.image.requires_grad and not any(loss.requires_grad for loss in step.losses.values())
+    assert step.loss() > 0 and math.isfinite(step.psnr())

@@ -10,6 +10,9 @@ import warp as wp
 from nexwarp.kernels.surfel import frame_functions
 from nexwarp.kernels.types import LIMIT_MARGIN, types
 
+# Nobody sees a surfel as small: its inverse is finite, and so are products with what a scene has else.
+SMALLEST_SCALE = 1e-20
+
 
 @functools.cache
 def project_kernel(real: type) -> wp.Kernel:
@@ -17,7 +20,8 @@ def project_kernel(real: type) -> wp.Kernel:
     t = types(real)
     vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
     f = frame_functions(real)
-    TWO, TINY, MARGIN = t.TWO, t.TINY, wp.constant(real(LIMIT_MARGIN))
+    ONE, TWO, TINY, MARGIN = t.ONE, t.TWO, t.TINY, wp.constant(real(LIMIT_MARGIN))
+    SMALLEST = wp.constant(real(SMALLEST_SCALE))
 
     @wp.kernel(module="unique")
     def project(
@@ -42,8 +46,9 @@ def project_kernel(real: type) -> wp.Kernel:
         v1 = f.rotate(viewmat, vec3(axes[0, 0], axes[1, 0], axes[2, 0]))
         v2 = f.rotate(viewmat, vec3(axes[0, 1], axes[1, 1], axes[2, 1]))
         n = f.rotate(viewmat, vec3(axes[0, 2], axes[1, 2], axes[2, 2]))
-        a = wp.cross(v2, center) / scales[i][0]
-        b = wp.cross(center, v1) / scales[i][1]
+        # Not vectors over scalars: the adjoint of those has the square of the scale, which may be too small for it.
+        a = wp.cross(v2, center) * (ONE / wp.max(scales[i][0], SMALLEST))
+        b = wp.cross(center, v1) * (ONE / wp.max(scales[i][1], SMALLEST))
         records[i, 0] = vec4(a[0], a[1], a[2], opacities[i])
         records[i, 1] = vec4(b[0], b[1], b[2], gammas[i][0])
         records[i, 2] = vec4(n[0], n[1], n[2], gammas[i][1])

@@ -20,7 +20,9 @@ from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.project import project_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.tiles import (
+    LARGEST_INT,
     MAX_CORNERS,
+    check_entries,
     depth_keys_kernel,
     footprint_kernel,
     list_kernels,
@@ -201,8 +203,10 @@ def intersect_tiles(
         _silent(depth_keys_kernel(real), count, [centers], [keys, order])
         wp.utils.radix_sort_pairs(keys, order, count)
         _silent(kernels.count, count, arguments, [ends])
+        if count * columns * rows > LARGEST_INT:
+            check_entries(int(ends.numpy().sum(dtype="int64")), count, columns * rows)
         wp.utils.array_scan(ends, ends, inclusive=True)
-        total = int(ends[count - 1 :].numpy()[0])
+        total = check_entries(int(ends[count - 1 :].numpy()[0]), count, columns * rows)
     tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
     if total:
         tile_ids = tiles.view(wp.int32)

@@ -20,8 +20,28 @@ RELATIVE_MARGIN = 1e-6
 LARGEST = 1e30
 # Of a quad that one plane clips.
 MAX_CORNERS = 5
+LARGEST_INT = 2**31 - 1
+# Of the lists: the arrays that are sorted are twice as long, and indices are int32.
+MAX_ENTRIES = 2**30 - 1
 # A typed constant: a bare literal of this size would be an int32.
 SIGN = wp.constant(wp.uint32(2147483648))
+
+
+def check_entries(total: int, count: int, tiles: int) -> int:
+    """Return the number of (tile, surfel) entries; ValueError when lists cannot be as long.
+
+    Args:
+        total: entries; LARGEST_INT stands for any larger number too.
+        count: surfels, for the message.
+        tiles: of the image, for the message.
+    """
+    if total > MAX_ENTRIES:
+        found = f"{total:,}{' or more' if total >= LARGEST_INT else ''}"
+        raise ValueError(
+            f"surfels: expected at most {MAX_ENTRIES:,} (tile, surfel) entries, got {found}, of {count:,} surfels and "
+            f"{tiles:,} tiles; render fewer or smaller surfels, or the image in parts (Camera.crop)"
+        )
+    return total
 
 
 @functools.cache
@@ -292,7 +312,8 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         if thread > 0:
             e = ends[thread - 1]
         end = wp.min(ends[thread], entries.shape[0])
-        if e >= end:
+        # Where there are more entries than an int32 counts, some ends are negative, and the lists will not be used.
+        if e < 0 or e >= end:
             return
         i = order[thread // lanes]
         shape = shapes[i]

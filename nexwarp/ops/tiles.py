@@ -7,7 +7,10 @@ import torch
 import warp as wp
 
 from nexwarp.kernels.tiles import (
+    LARGEST_INT,
     MAX_CORNERS,
+    MAX_ENTRIES,
+    check_entries,
     depth_keys_kernel,
     footprint_kernel,
     list_kernels,
@@ -81,6 +84,9 @@ def intersect_tiles(
         tile_size: pixels along a tile's side, a multiple of 8.
         room: entries to make room for; by default as many as there are (CPU) or as there will hardly be more than
             (CUDA, where the exact number would cost a wait). Too few is slow but right.
+
+    Raises:
+        ValueError: there are more than MAX_ENTRIES entries; on CUDA only when that is noticed without a wait.
     """
     if tile_size % 8 or tile_size < 8:
         raise ValueError(f"tile_size: expected a multiple of 8, got {tile_size}")
@@ -95,11 +101,15 @@ def intersect_tiles(
     arguments = [array(order, wp.int32), *footprints, wp.vec2i(columns, rows), lanes]
     counts = torch.empty(count * lanes, dtype=torch.int32, device=means.device)
     launch(means, kernels.count, count * lanes, arguments, [array(counts, wp.int32)])
+    # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
+    total = counts.sum().clamp_max(LARGEST_INT).view(1) if count * columns * rows > LARGEST_INT else None
     _scan(counts)
     ends = counts[lanes - 1 :: lanes]
+    if total is not None:
+        ends[-1:] = total
     exact = means.device.type == "cpu" and room is None
     if room is None:
-        room = _total(ends) if exact else _room(ends, (columns, rows, low_pass))
+        room = _total(ends, columns * rows) if exact else _room(ends, (columns, rows, low_pass))
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
     fill = {"dtype": torch.int32, "device": means.device}
     entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
@@ -165,8 +175,8 @@ def _scan(counts: torch.Tensor) -> None:
         wp.utils.array_scan(ends, ends, inclusive=True)
 
 
-def _total(ends: torch.Tensor) -> int:
-    return int(ends[-1]) if len(ends) else 0
+def _total(ends: torch.Tensor, tiles: int) -> int:
+    return check_entries(int(ends[-1]), len(ends), tiles) if len(ends) else 0
 
 
 @dataclass
@@ -193,14 +203,19 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     bits = len(ends).bit_length()
     key = (ends.device.index, bits, *kind)
     need = _needs.get(key)
+    arrived = need is not None and need.copied.query()
+    if arrived and int(need.total) > MAX_ENTRIES:
+        # That one was right, but no list is as long: look again whether this one's may be made.
+        del _needs[key]
+        need = None
     if need is None:
-        room = _with_margin(_total(ends))
+        room = _with_margin(_total(ends, kind[0] * kind[1]))
         # A scene that grew by splitting has at least the needs it had: one view may show little of it.
         if fewer := _needs.get((ends.device.index, bits - 1, *kind)):
             room = max(room, fewer.room)
         total = torch.empty(1, dtype=torch.int32, pin_memory=True)
         need = _needs[key] = _Need(room, total, torch.cuda.Event())
-    elif need.copied.query():
+    elif arrived:
         need.room = max(need.room, _with_margin(int(need.total)))
     else:
         return need.room
@@ -210,4 +225,4 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
 
 
 def _with_margin(total: int) -> int:
-    return total + total // 2 + 4096
+    return min(total + total // 2 + 4096, MAX_ENTRIES)

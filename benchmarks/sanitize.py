@@ -1,0 +1,184 @@
+"""Small training steps and a frame, for compute-sanitizer to look at every access of every kernel.
+
+    python -m benchmarks.sanitize --tool memcheck,racecheck
+
+runs itself under each tool, prints a line for each, and exits with 1 when one found an error (2: there is no
+compute-sanitizer). `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by hand.
+
+torch and Warp keep freed memory to hand it out again, which hides an access beyond the end of an array. Here each array
+is an allocation of its own.
+"""
+
+import dataclasses
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+import warp as wp
+
+import nexwarp as nw
+from nexwarp import warmup
+from nexwarp.config import preset
+from nexwarp.trainer import Trainer
+
+TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
+# Iterations of a full run: all degrees of spherical harmonics, then a step beyond the frame with a density round.
+ITERATIONS = (10_001, 10_100)
+SURFELS = 200
+PLACES = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
+# Racecheck looks at shared memory. Of others' kernels it would have much to say, and take long.
+OURS = ("--kernel-name", "kernel_substring=_cuda_kernel_")
+SUMMARIES = (
+    re.compile(r"^=+ RACECHECK SUMMARY: (?P<hazards>\d+) hazards? displayed \((?P<errors>\d+) errors?, .*\)", re.M),
+    re.compile(r"^=+ ERROR SUMMARY: (?P<errors>\d+) errors?", re.M),
+)
+SHOWN = 30  # lines of a report that found errors
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a tool found.
+
+    Attributes:
+        errors: None when it did not come to its summary.
+        told: the summary, or what stands in its place.
+    """
+
+    errors: int | None
+    told: str
+
+
+def parse(output: str) -> Report:
+    """Read the output of compute-sanitizer."""
+    for summary in SUMMARIES:
+        found = list(summary.finditer(output))
+        if found:
+            # One a process: Python may start others.
+            return Report(sum(int(match["errors"]) for match in found), found[-1][0].strip("= "))
+    said = [line.strip("= ") for line in output.splitlines() if line.startswith("=") and line.strip("= ")]
+    return Report(None, said[-1] if said else "no output of compute-sanitizer")
+
+
+def find_tool() -> str | None:
+    """Return where compute-sanitizer is: on the PATH, or where CUDA toolkits and pip put it."""
+    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    packages = [str(Path(folder) / "nvidia/cuda_sanitizer_api/bin") for folder in sys.path]
+    places = [os.environ.get("PATH", ""), *([f"{home}/bin", f"{home}/compute-sanitizer"] if home else [])]
+    return shutil.which("compute-sanitizer", path=os.pathsep.join([*places, *PLACES, *packages]))
+
+
+def work(device: torch.device) -> dict[str, int]:
+    """Train, as by default and with fixed-order sums, and render; returns how many of each there were."""
+    scene = warmup.tiny_scene()
+    base = preset("default")
+    config = dataclasses.replace(
+        base,
+        max_surfels=SURFELS,
+        texture=dataclasses.replace(base.texture, levels=8, table_size=2**10),
+        densify=dataclasses.replace(base.densify, fraction=1.0, prune_opacity=0.02),
+    )
+    done = {"steps": 0, "frames": 0}
+    for deterministic in (False, True):
+        trainer = Trainer(scene, dataclasses.replace(config, deterministic=deterministic), device)
+        for iteration in ITERATIONS:
+            trainer.iteration = iteration - 1
+            trainer.step()
+            done["steps"] += 1
+        trainer.check()
+    with torch.no_grad():
+        for camera in (scene.test[0].camera.to(device), scene.test[0].camera.to(device).crop(-5, 7, 33, 50)):
+            out = nw.render(trainer.surfels, trainer.texture, camera, **trainer.render_options())
+            out.splat_error(out.alpha)
+            if not bool(torch.isfinite(out.image).all()):
+                raise RuntimeError("the frame is not finite")
+            done["frames"] += 1
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return done
+
+
+def isolate_arrays(device: torch.device) -> None:
+    """Make each array on a GPU an allocation of its own; must come before the first one."""
+    os.environ["PYTORCH_NO_CUDA_MEMORY_CACHING"] = "1"
+    if device.type == "cuda":
+        wp.init()
+        wp.set_mempool_enabled(f"cuda:{device.index}", False)
+
+
+def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str] = ()) -> bool:
+    """Run a command under a tool, print what it found, and return whether that is nothing."""
+    options = [*(OURS if tool == "racecheck" else ()), *extra]
+    environment = os.environ | {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    run = subprocess.run(
+        [sanitizer, "--tool", tool, *options, *command],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+    )
+    report = parse(run.stdout)
+    clean = report.errors == 0 and run.returncode == 0
+    code = "" if run.returncode == 0 else f", exit code {run.returncode}"
+    print(f"{tool}: {report.told}{code}: {'clean' if clean else 'NOT CLEAN'}", flush=True)
+    if not clean:
+        lines = [line for line in run.stdout.splitlines() if line.strip()]
+        first = next((i for i, line in enumerate(lines) if line.startswith("========= ") and i), 0)
+        print("\n".join(lines[first : first + SHOWN] if report.errors else lines[-SHOWN:]), flush=True)
+    return clean
+
+
+@dataclass
+class Sanitize:
+    """Train and render a little; under compute-sanitizer with --tool."""
+
+    tool: Annotated[str | None, tyro.conf.arg(metavar="TOOL,...")] = None
+    """Tools of compute-sanitizer to run this under: memcheck, racecheck, initcheck, synccheck. Default: none."""
+    device: Annotated[str, tyro.conf.arg(metavar="{cuda,cpu}")] = "cuda"
+    """Where; compute-sanitizer sees CUDA alone."""
+    extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
+    """More options for compute-sanitizer, such as "--report-api-errors no"."""
+
+    def __call__(self) -> int:
+        """Run, print, and return the exit code."""
+        if self.tool is not None:
+            return self._under(self.tool.split(","))
+        wp.config.log_level = wp.LOG_ERROR
+        if self.device == "cuda" and not torch.cuda.is_available():
+            print("device: expected a CUDA device, found none", file=sys.stderr)
+            return 2
+        device = torch.device("cuda", torch.cuda.current_device()) if self.device == "cuda" else torch.device("cpu")
+        isolate_arrays(device)
+        done = work(device)
+        print(f"{done['steps']} training steps and {done['frames']} frames on {self.device}", flush=True)
+        return 0
+
+    def _under(self, tools: list[str]) -> int:
+        if unknown := [tool for tool in tools if tool not in TOOLS]:
+            print(f"--tool: expected some of {', '.join(TOOLS)}, got {unknown[0]!r}", file=sys.stderr)
+            return 2
+        sanitizer = find_tool()
+        if sanitizer is None:
+            print("compute-sanitizer: expected on the PATH or in a CUDA toolkit, found none", file=sys.stderr)
+            return 2
+        command = [sys.executable, "-m", "benchmarks.sanitize", "--device", self.device]
+        # Once without: what does not run at all, need not be looked at; and all kernels are compiled then.
+        alone = subprocess.run(command)
+        if alone.returncode != 0:
+            print(f"without a tool it ended with exit code {alone.returncode}", file=sys.stderr)
+            return 1
+        # Every one of them, whatever the others found.
+        clean = [check(tool, sanitizer, command, self.extra.split()) for tool in tools]
+        return 0 if all(clean) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(Sanitize)())

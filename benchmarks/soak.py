@@ -1,0 +1,225 @@
+"""Does memory stay as it is, however long it goes on? Frames of the demo, and small training steps on it.
+
+    python -m benchmarks.soak --device cuda --frames 5000 --steps 20000
+
+lists the memory of the GPU and of the host on the way, and compares its mean over the first thousand frames (and steps)
+after a warm-up with that over the last thousand. The exit code is 1 unless each pair is within 1 %.
+"""
+
+import dataclasses
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import psutil
+import torch
+import tyro
+import warp as wp
+
+import nexwarp as nw
+from nexwarp.config import Config, TextureConfig
+from nexwarp.data import Scene, write_demo
+from nexwarp.densify import DensifyConfig
+from nexwarp.runs import keep_freed_memory
+from nexwarp.trainer import Progress, Trainer
+
+MIB = 2**20
+WARMUP, WINDOW = 500, 1000
+TOLERANCE = 0.01
+SLACK = MIB // 4  # what a page, a segment or a cache line more of something small may make
+SAMPLES = 500  # of a phase: a look at the memory of a GPU takes time
+ROWS = 8  # of the table
+SIZES = ((1.0, 0.75), (0.67, 0.5), (0.34, 0.73), (0.84, 0.26), (0.5, 0.5), (1.0, 0.18), (0.17, 0.17))  # of the width
+CYCLE = 84  # different cameras, so that the warm-up has seen all of them
+# Soaking wants many steps, not large ones.
+SMALL = Config(
+    sh_every=1,
+    texture=TextureConfig(levels=8, table_size=2**13, width=32),
+    # The budget is met within the warm-up. Pruning makes room for rounds until the end.
+    densify=DensifyConfig(start=0, stop=60_000, every=30, fraction=1.0, prune_opacity=0.02),
+)
+
+Look = tuple[int, dict[str, int]]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One kind of memory in one phase.
+
+    Attributes:
+        name: of the memory.
+        first: mean over the first frames or steps after the warm-up, in bytes.
+        last: mean over the last ones, in bytes.
+    """
+
+    name: str
+    first: float
+    last: float
+
+    @property
+    def change(self) -> float:
+        """Relative change; 0 where there is none to speak of."""
+        return (self.last - self.first) / self.first if self.first else float(self.last > 0)
+
+    @property
+    def flat(self) -> bool:
+        """Whether first and last are the same, as near as memory comes in pieces."""
+        return abs(self.last - self.first) <= max(TOLERANCE * self.first, SLACK)
+
+
+def spans(count: int) -> tuple[range, range]:
+    """First and last thousand of `count` frames or steps (from 1), after a warm-up; fewer where there are few."""
+    warmup = min(WARMUP, count // 4)
+    window = max(min(WINDOW, (count - warmup) // 2), 1)
+    return range(warmup + 1, warmup + window + 1), range(count - window + 1, count + 1)
+
+
+def judge(looks: Sequence[Look], count: int) -> list[Verdict]:
+    """Compare the memory at the beginning and at the end.
+
+    Args:
+        looks: frame or step, from 1, and bytes by kind of memory.
+        count: how many frames or steps there were.
+
+    Raises:
+        ValueError: nobody looked in the first or in the last span.
+    """
+    chosen = [[memory for number, memory in looks if number in span] for span in spans(count)]
+    if not all(chosen):
+        raise ValueError(f"looks: expected some in {spans(count)}, got {[number for number, _ in looks]}")
+    names = looks[0][1]
+    first, last = ({name: sum(x[name] for x in part) / len(part) for name in names} for part in chosen)
+    return [Verdict(name, first[name], last[name]) for name in names]
+
+
+def memory(device: torch.device) -> dict[str, int]:
+    """Bytes that this process has, of the host's memory and of the GPU's; `GPU used` is that of all processes."""
+    found = {"host": psutil.Process().memory_info().rss}
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        found["torch allocated"] = torch.cuda.memory_allocated(device)
+        found["torch reserved"] = torch.cuda.memory_reserved(device)
+        if wp.is_mempool_supported(f"cuda:{device.index}"):
+            found["Warp's pool"] = wp.get_mempool_used_mem_current(f"cuda:{device.index}")
+        found["GPU used"] = total - free
+    return found
+
+
+def phase(name: str, count: int, looks: Sequence[Look]) -> bool:
+    """Print the table of a phase and its verdicts; returns whether all are flat."""
+    kinds = list(looks[0][1])
+    print(f"{name}: MiB after so many")
+    print("".join(f"{title:>17}" for title in ("", *kinds)))
+    shown = sorted({round(i * (len(looks) - 1) / (ROWS - 1)) for i in range(ROWS)})
+    for number, found in (looks[i] for i in shown):
+        print(f"{number:17,}" + "".join(f"{found[kind] / MIB:17,.2f}" for kind in kinds))
+    verdicts = judge(looks, count)
+    first, last = spans(count)
+    told = f"{first.start:,} to {first.stop - 1:,} and {last.start:,} to {last.stop - 1:,}"
+    for v in verdicts:
+        print(
+            f"{name}, {v.name}: {v.first / MIB:,.2f} and {v.last / MIB:,.2f} MiB in {told}, "
+            f"{100 * v.change:+.2f} %: {'flat' if v.flat else 'NOT FLAT'}"
+        )
+    print(flush=True)
+    return all(v.flat for v in verdicts)
+
+
+def cycle(scene: Scene, device: torch.device, seed: int) -> list[nw.Camera]:
+    """Crops of the scene's cameras, of changing sizes and places, some beyond the frame."""
+    generator = torch.Generator().manual_seed(seed)
+    cameras = [view.camera.to(device) for view in scene.train]
+    made = []
+    for i in range(CYCLE):
+        camera = cameras[i % len(cameras)]
+        width, height = (round(camera.width * share) for share in SIZES[i % len(SIZES)])
+        left, top = ((torch.rand(2, generator=generator) * 0.4 - 0.1) * camera.width).int().tolist()
+        made.append(camera.crop(left, top, width, height))
+    return made
+
+
+def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, look: Callable[[int], None]) -> None:
+    """Render what the trainer has, over and over, as the viewer does."""
+    model = trainer.model()
+    for i in range(count):
+        with torch.no_grad():
+            out = nw.render(model.surfels, model.texture, cameras[i % len(cameras)], **model.render_options)
+        del out
+        look(i + 1)
+
+
+@dataclass
+class Soak:
+    """Render and train for long, and see whether memory stays as it is."""
+
+    device: Annotated[str, tyro.conf.arg(metavar="{cuda,cpu}")] = "cuda"
+    """Where."""
+    frames: int = 5000
+    """Frames to render, from changing cameras and of changing sizes."""
+    steps: int = 20_000
+    """Training steps, density control included, on small photos of the demo."""
+    max_surfels: int = 1500
+    """Budget; soon met."""
+    width: int = 96
+    """Of the photos, and of the largest frames, in pixels."""
+    seed: int = 0
+    """Of the training and of the cameras."""
+
+    def __call__(self) -> int:
+        """Run, print, and return the exit code."""
+        wp.config.log_level = wp.LOG_ERROR
+        if self.device == "cuda":
+            device = torch.device("cuda", torch.cuda.current_device())
+        else:
+            device = torch.device(self.device)
+            keep_freed_memory()
+        with tempfile.TemporaryDirectory() as folder:
+            scene = nw.load_scene(
+                write_demo(Path(folder) / "demo", self.width, self.width * 3 // 4, 16, self.max_surfels)
+            )
+        config = dataclasses.replace(SMALL, iterations=max(self.steps, 1), max_surfels=self.max_surfels, seed=self.seed)
+        trainer = Trainer(scene, config, device)
+        flat = True
+        if self.steps:
+            looks, sizes = self._train(trainer, device)
+            rounds = sum(trainer.densifier.due(i) for i in range(1, self.steps + 1))
+            first, _ = spans(self.steps)
+            compared = [size for number, size in sizes if number >= first.start]
+            print(f"{rounds:,} rounds of density control; {min(compared):,} to {max(compared):,} surfels when compared")
+            flat &= phase("training steps", self.steps, looks)
+        if self.frames:
+            looks = []
+            render_frames(trainer, cycle(scene, device, self.seed), self.frames, _looker(looks, self.frames, device))
+            flat &= phase("frames", self.frames, looks)
+        print("flat: first and last are within 1 % throughout" if flat else "NOT FLAT: memory is not what it was")
+        return 0 if flat else 1
+
+    def _train(self, trainer: Trainer, device: torch.device) -> tuple[list[Look], list[tuple[int, int]]]:
+        looks: list[Look] = []
+        sizes: list[tuple[int, int]] = []
+        look = _looker(looks, self.steps, device)
+
+        def observe(step: Progress) -> None:
+            sizes.append((step.iteration, step.surfels))
+            look(step.iteration)
+
+        trainer.run(observe)
+        return looks, sizes
+
+
+def _looker(looks: list[Look], count: int, device: torch.device) -> Callable[[int], None]:
+    """What notes the memory now and then."""
+    every = max(count // SAMPLES, 1)
+
+    def look(number: int) -> None:
+        if number % every == 0 or number in (1, count):
+            looks.append((number, memory(device)))
+
+    return look
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(Soak)())

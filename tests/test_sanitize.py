@@ -1,0 +1,123 @@
+"""What compute-sanitizer says is understood, and what it is to look at runs. No compute-sanitizer is needed."""
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import sanitize
+from benchmarks.sanitize import Sanitize, check, find_tool, parse, work
+
+BANNER = "========= COMPUTE-SANITIZER\n4 training steps and 2 frames on cuda\n"
+WRITE = """========= Invalid __global__ write of size 4 bytes
+=========     at collect_1a2b_cuda_kernel_forward+0x1f0
+=========     by thread (31,0,0) in block (2,0,0)
+=========     Address 0x7f2a0c000400 is out of bounds
+"""
+
+
+@pytest.mark.parametrize(
+    ("output", "errors"),
+    [
+        (BANNER + "========= ERROR SUMMARY: 0 errors\n", 0),
+        (BANNER + WRITE + "========= ERROR SUMMARY: 1 error\n", 1),
+        (BANNER + "========= ERROR SUMMARY: 17 errors\n", 17),
+        (BANNER + "========= RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)\n", 0),
+        (BANNER + "========= RACECHECK SUMMARY: 3 hazards displayed (2 errors, 1 warning)\n", 2),
+        (BANNER + "========= RACECHECK SUMMARY: 1 hazard displayed (0 errors, 1 warning)\n", 0),
+        ("========= ERROR SUMMARY: 2 errors\n" + BANNER + "========= ERROR SUMMARY: 0 errors\n", 2),  # two processes
+        (BANNER + "========= Error: Target application terminated before first instrumented API call\n", None),
+        (BANNER + "========= Device not supported. Please refer to the documentation\n", None),
+        ("ERROR SUMMARY: 0 errors\n", None),  # said by somebody else
+        ("", None),
+    ],
+)
+def test_summaries_are_understood(output, errors):
+    assert parse(output).errors == errors
+    assert parse(output).told and "=" not in parse(output).told
+
+
+def test_what_stands_in_place_of_a_summary_is_told():
+    assert parse(BANNER + "========= Device not supported.\n").told == "Device not supported."
+    assert parse("").told == "no output of compute-sanitizer"
+
+
+def stub(folder: Path, body: str) -> str:
+    """A compute-sanitizer that notes its arguments, then does as `body` says."""
+    file = folder / "compute-sanitizer"
+    file.write_text(f'#!/bin/sh\necho "$@ $PYTORCH_NO_CUDA_MEMORY_CACHING" >> {folder}/asked\n{body}\n')
+    file.chmod(file.stat().st_mode | stat.S_IXUSR)
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("body", "clean", "told"),
+    [
+        ('echo "========= ERROR SUMMARY: 0 errors"', True, "memcheck: ERROR SUMMARY: 0 errors: clean"),
+        ('echo "========= ERROR SUMMARY: 2 errors"', False, "memcheck: ERROR SUMMARY: 2 errors: NOT CLEAN"),
+        ('echo "========= ERROR SUMMARY: 0 errors"; exit 7', False, "0 errors, exit code 7: NOT CLEAN"),
+        ("exit 13", False, "memcheck: no output of compute-sanitizer, exit code 13: NOT CLEAN"),
+    ],
+)
+def test_a_tool_is_clean_only_when_it_says_so(tmp_path, capsys, body, clean, told):
+    assert check("memcheck", stub(tmp_path, body), ["program"]) == clean
+    assert told in capsys.readouterr().out
+
+
+def test_errors_are_shown(tmp_path, capsys):
+    (tmp_path / "output").write_text(BANNER + WRITE + "========= ERROR SUMMARY: 1 error\n")
+    assert not check("memcheck", stub(tmp_path, f"cat {tmp_path}/output"), ["program"])
+    assert "Invalid __global__ write" in capsys.readouterr().out
+
+
+def test_tools_are_called_as_they_want(tmp_path):
+    path = stub(tmp_path, "true")
+    for tool in ("memcheck", "racecheck"):
+        check(tool, path, ["python", "-m", "x"], ["--report-api-errors", "no"])
+    assert (tmp_path / "asked").read_text().splitlines() == [
+        "--tool memcheck --report-api-errors no python -m x 1",
+        "--tool racecheck --kernel-name kernel_substring=_cuda_kernel_ --report-api-errors no python -m x 1",
+    ]
+
+
+def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsys):
+    found = 'echo "========= ERROR SUMMARY: 1 error"'
+    clean = 'echo "========= RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)"'
+    path = stub(tmp_path, f'case "$2" in memcheck) {found};; *) {clean};; esac')
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setattr(sanitize.sys, "executable", "true")  # which does not even render
+    assert find_tool() == path
+    assert Sanitize(tool="memcheck,racecheck")() == 1
+    out = capsys.readouterr().out
+    assert "memcheck: ERROR SUMMARY: 1 error: NOT CLEAN" in out and "(0 errors, 0 warnings): clean" in out
+    assert Sanitize(tool="racecheck")() == 0
+
+
+def test_a_tool_that_is_missing_or_unknown_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sanitize, "find_tool", lambda: None)
+    assert Sanitize(tool="memcheck")() == 2
+    assert capsys.readouterr().err == "compute-sanitizer: expected on the PATH or in a CUDA toolkit, found none\n"
+    assert Sanitize(tool="memcheck,valgrind")() == 2
+    assert capsys.readouterr().err.startswith(
+        "--tool: expected some of memcheck, racecheck, initcheck, synccheck, got "
+    )
+
+
+def test_a_missing_tool_is_not_found(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sanitize, "PLACES", ())
+    monkeypatch.setattr(sys, "path", [str(tmp_path)])
+    for name in ("CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    assert find_tool() is None
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "cuda"))
+    (tmp_path / "cuda" / "bin").mkdir(parents=True)
+    assert find_tool() is None
+    stub(tmp_path / "cuda" / "bin", "true")
+    assert find_tool() == str(tmp_path / "cuda" / "bin" / "compute-sanitizer")
+
+
+def test_steps_and_frames_run(device):
+    assert work(device) == {"steps": 4, "frames": 2}
