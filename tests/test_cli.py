@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.inputs import write_blender, write_ply
+from benchmarks.inputs import write_blender, write_points
 from nexwarp import cli, config
 from nexwarp.checkpoint import load_cameras
 from nexwarp.config import Config, TextureConfig
@@ -679,7 +679,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
         with Image.open(file) as photo:
             photo.putalpha(Image.linear_gradient("L").resize(photo.size))
             photo.save(file)
-    points = write_ply(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
+    points = write_points(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
     run = tmp_path / "run"
     flags = ["--run", str(run), "--device", "cpu", "--max-surfels", "32"]
     flags += ["--background", "0,0.5,1", "--masks", "alpha", "--points", str(points), "--iterations", "3"]
