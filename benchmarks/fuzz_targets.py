@@ -15,9 +15,10 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load, load_cameras, save_cameras, save_model
 from nexwarp.config import Config
 from nexwarp.data import load_scene
+from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.ply import read_ply
+from nexwarp.data.ply import read_ply, write_ply
 from nexwarp.export import load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.pictures import load_exr, save_exr
@@ -141,6 +142,9 @@ def _ply(folder: Path) -> list[Files]:
             body = np.array([7], f"{order}i4").tobytes() + np.array(rows, dtype).tobytes()
         inputs.append({"points.ply": head + body})
     save_splats_ply(folder / "points.ply", _surfels())
+    inputs.append(_files(folder))
+    known = np.ones(6, np.int32), np.ones(6, np.float32), np.array([[1, 0], [2, 5]])
+    write_ply(folder / "points.ply", Cloud(np.eye(6, 3), np.zeros((6, 3), np.uint8), *known))
     return [*inputs, _files(folder)]
 
 

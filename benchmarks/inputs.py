@@ -9,15 +9,18 @@ import json
 import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from nexwarp.data import load_scene, write_demo
+from nexwarp.data.capture import Cloud
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.images import image_size
 from nexwarp.data.lens import Lens, pycolmap_module
+from nexwarp.data.ply import write_ply
 from nexwarp.data.raytrace import first_hits, shade
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -78,7 +81,20 @@ def write_text(demo: Path, folder: Path) -> Path:
     return folder
 
 
-def write_ply(path: Path, points: np.ndarray, colors: np.ndarray, form: str = "binary_little_endian") -> Path:
+def cloud_of(demo: Path) -> Cloud:
+    """All that COLMAP knows of the demo's points."""
+    points = [point for _, point in sorted(reconstruction_of(demo).points3D.items())]
+    pairs = {(element.image_id, index) for index, point in enumerate(points) for element in point.track.elements}
+    return Cloud(
+        np.array([point.xyz for point in points]),
+        np.array([point.color for point in points]),
+        np.array([point.track.length() for point in points], np.int32),
+        np.array([point.error for point in points], np.float32),
+        np.array(sorted(pairs), np.int64),
+    )
+
+
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray, form: str = "binary_little_endian") -> Path:
     """Write points (P, 3) and colours (P, 3) uint8 as doubles and bytes."""
     order = ">" if form.endswith("big_endian") else "<"
     header = f"ply\nformat {form} 1.0\nelement vertex {len(points)}\n"
@@ -94,8 +110,11 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray, form: str = "b
     return path
 
 
-def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED) -> Path:
-    """Write a COLMAP scene of one camera as nerfstudio does, its world moved by `applied` (3, 4)."""
+def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED, tracks: bool = True) -> Path:
+    """Write a COLMAP scene of one camera as nerfstudio does, its world moved by `applied` (3, 4).
+
+    With `tracks` the points also say what COLMAP knows of them; nerfstudio's own do not.
+    """
     model = reconstruction_of(demo)
     camera = model.camera(1)
     params = dict(zip([p.strip() for p in camera.params_info.split(",")], camera.params, strict=True))
@@ -114,20 +133,23 @@ def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED) ->
     for index in model.reg_image_ids():
         image = model.image(index)
         pose = moved @ np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])) @ OPENGL
-        data["frames"].append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()})
+        frame = {"file_path": f"images/{image.name}", "transform_matrix": pose.tolist(), "colmap_im_id": index}
+        data["frames"].append(frame)
     folder.mkdir(parents=True)
     shutil.copytree(demo / "images", folder / "images")
-    points = sorted(model.points3D.items())
-    positions = np.array([p.xyz for _, p in points]) @ applied[:, :3].T + applied[:, 3]
-    write_ply(folder / "sparse_pc.ply", positions, np.array([p.color for _, p in points]))
+    cloud = cloud_of(demo)
+    positions = cloud.positions @ applied[:, :3].T + applied[:, 3]
+    cloud = replace(cloud, positions=positions) if tracks else Cloud.of(positions, cloud.colors)
+    write_ply(folder / "sparse_pc.ply", cloud)
     (folder / "transforms.json").write_text(json.dumps(data))
     return folder
 
 
-def write_blender(demo: Path, folder: Path, centred: bool = False) -> Path:
+def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool = True) -> Path:
     """Write a COLMAP scene of one camera as Blender's NeRF exports are, every eighth photo in the test file.
 
     The format has one angle for square pixels and a centred image; what `centred` leaves out goes into fl_x and so on.
+    With `points` there is a points3d.ply with what COLMAP knows of them.
     """
     model = reconstruction_of(demo)
     camera = model.camera(1)
@@ -141,10 +163,13 @@ def write_blender(demo: Path, folder: Path, centred: bool = False) -> Path:
         split = "train" if index % 8 else "test"
         pose = np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])) @ OPENGL
         stem = Path(image.name).stem
-        frames[split].append({"file_path": f"./{split}/{stem}", "rotation": 0.01, "transform_matrix": pose.tolist()})
+        frame = {"file_path": f"./{split}/{stem}", "rotation": 0.01, "transform_matrix": pose.tolist()}
+        frames[split].append({**frame, "colmap_im_id": identity})
         target = folder / split / image.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(demo / "images" / image.name, target)
+    if points:
+        write_ply(folder / "points3d.ply", cloud_of(demo))
     for split, listed in frames.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps({**shared, "frames": listed}))
     return folder
@@ -170,6 +195,8 @@ def main(arguments: list[str] | None = None) -> int:
         "text": lambda folder: write_text(demo, folder),
         "nerfstudio": lambda folder: write_nerfstudio(demo, folder),
         "blender": lambda folder: write_blender(demo, folder),
+        "nerfstudio-own": lambda folder: write_nerfstudio(demo, folder, tracks=False),
+        "blender-random": lambda folder: write_blender(demo, folder, points=False),
         "opencv": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV", BARREL)),
         "fisheye": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV_FISHEYE", FISHEYE)),
     }
@@ -187,7 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
         same = evaluate(trainer.surfels, trainer.texture, reference.test, options=options)["psnr"]
         size = scene.train[0].camera
         print(
-            f"{name:10}  {size.width}x{size.height}  own test photos {own:.2f} dB, "
+            f"{name:14}  {size.width}x{size.height}  own test photos {own:.2f} dB, "
             f"pinhole test photos {same:.2f} dB, {len(trainer.surfels):,} surfels, {trainer.seconds:.0f} s",
             flush=True,
         )

@@ -3,10 +3,9 @@
 import dataclasses
 import signal
 import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -53,6 +52,7 @@ from nexwarp.runs import (
     tidy_run,
 )
 from nexwarp.sfm import SfmOptions, reconstruct
+from nexwarp.signals import Stopped, deferred_stop, stopped_by_signals
 from nexwarp.trainer import Trainer
 from nexwarp.watch import needed_memory
 
@@ -543,14 +543,6 @@ def _show(viewer: "Viewer", console: Console) -> None:
         viewer.show()
 
 
-class _Stopped(KeyboardInterrupt):
-    """A signal that ends the program, in an orderly way."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__()
-        self.number = number
-
-
 def _train(
     trainer: Trainer,
     run: Path,
@@ -564,7 +556,7 @@ def _train(
     total = trainer.config.iterations
     every = every or max(total // CHECKPOINTS_A_RUN, 1)
     shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
-    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, _deferred_stop() as asked:
+    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, deferred_stop() as asked:
 
         def observe(step: Any) -> None:
             shown(step)
@@ -576,7 +568,7 @@ def _train(
                 with _rescued(trainer, run):
                     trainer.save(run)
             if (number := asked()) is not None:
-                raise _Stopped(number)
+                raise Stopped(number)
 
         def warn(text: str) -> None:
             _warn(console, text)
@@ -617,47 +609,6 @@ def _warn(console: Console, text: str) -> None:
 
 def _describe(step: Any) -> str:
     return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"
-
-
-@contextmanager
-def _deferred_stop() -> Iterator[Callable[[], int | None]]:
-    """Let a first Ctrl-C, or a request to end, wait until it is asked for, between steps: no half step is saved.
-
-    The function tells the signal's number, or None. A second signal does not wait.
-    """
-    asked: list[int] = []
-
-    def handle(number: int, _frame: Any) -> None:
-        asked.append(number)
-        if len(asked) > 1:
-            raise _Stopped(number)
-
-    with _handled(handle, signal.SIGINT, *_endings()):
-        yield lambda: asked[0] if asked else None
-
-
-def _endings() -> list[int]:
-    """Signals that ask a program to end, those not ignored: after `nohup`, a closed terminal is no reason to."""
-    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    return [number for number in known if signal.getsignal(number) != signal.SIG_IGN]
-
-
-@contextmanager
-def _handled(handle: Callable[[int, Any], None], *numbers: int) -> Iterator[None]:
-    """Handle signals in a block; in a thread, which gets none, it does nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, handle) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _stop(number: int, _frame: Any) -> None:
-    raise _Stopped(number)
 
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
@@ -747,7 +698,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     console = Console()
     try:
-        with _handled(_stop, *_endings()):
+        with stopped_by_signals():
             command(console)
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signal.SIGINT)

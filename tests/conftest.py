@@ -1,7 +1,15 @@
 """Fixtures that every test may use."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 import torch
+
+import nexwarp as nw
+from nexwarp import config
+from nexwarp.data import Scene, write_demo
+from nexwarp.kernels import launch
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -16,3 +24,40 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 def seed() -> None:
     """Start every test from the same random state."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Tensors of a small training are tiny, and torch's threads would wait for each other on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iterator[None]:
+    """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(config.PRESETS, "default", request.module.SMALL)
+        yield
+
+
+@pytest.fixture
+def restore_launch_threads() -> Iterator[None]:
+    """Whatever a test sets, the passes on a CPU use as many threads as before."""
+    before = launch.get_num_threads()
+    yield
+    launch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo, 10 photos of 48x36; not to be changed."""
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=48, height=36, views=10, points=200)
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tiny_folder: Path) -> Scene:
+    """The same, read."""
+    return nw.load_scene(tiny_folder)

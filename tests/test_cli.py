@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.inputs import write_blender, write_ply
-from nexwarp import cli, config
+from benchmarks.inputs import write_blender, write_points
+from nexwarp import cli
 from nexwarp.checkpoint import load_cameras
 from nexwarp.config import Config, TextureConfig
 from nexwarp.console import TrainingDisplay
@@ -27,6 +27,8 @@ from nexwarp.metrics import CONVENTION, psnr, to_uint8
 from nexwarp.pictures import CAPTION_HEIGHT
 from nexwarp.trainer import Trainer
 from tests.test_scene import make_scene
+
+pytestmark = pytest.mark.usefixtures("small_preset")
 
 SMALL = Config(
     texture=TextureConfig(levels=4, table_size=2**10, width=16),
@@ -43,17 +45,6 @@ RUN_FILES = {
     "checkpoint",
 }
 RUN_FILES |= {"checkpoint.old"}  # where there was more than one
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_preset() -> Iterator[None]:
-    """The preset of this module is a small one; the command line has no flags for the texture's shape."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "default", SMALL)
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -679,7 +670,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
         with Image.open(file) as photo:
             photo.putalpha(Image.linear_gradient("L").resize(photo.size))
             photo.save(file)
-    points = write_ply(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
+    points = write_points(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
     run = tmp_path / "run"
     flags = ["--run", str(run), "--device", "cpu", "--max-surfels", "32"]
     flags += ["--background", "0,0.5,1", "--masks", "alpha", "--points", str(points), "--iterations", "3"]

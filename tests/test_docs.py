@@ -227,17 +227,14 @@ def test_settings_on_the_page_can_be_set():
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def run(tmp_path_factory, one_torch_thread: None) -> Path:
     """A small run."""
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
     flags = [x for change in changes for x in ("--set", change)]
     flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
     assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
-    torch.set_num_threads(threads)
     return folder / "run"
 
 

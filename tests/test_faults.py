@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import cli, config
+from nexwarp import cli
 from nexwarp.checkpoint import _read_checkpoint, load_cameras, load_checkpoint
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import write_demo
@@ -22,19 +22,11 @@ from nexwarp.pictures import load_exr
 from nexwarp.runs import check_room, read_metrics, read_run
 from tests.faults import Disk, failing
 
+pytestmark = pytest.mark.usefixtures("small_preset")
+
 SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
 FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
 FULL, BROKEN = errno.ENOSPC, errno.EIO
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_preset() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "default", SMALL)
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import shutil
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,15 +27,17 @@ from benchmarks.inputs import (
     write_blender,
     write_distorted,
     write_nerfstudio,
-    write_ply,
+    write_points,
     write_text,
 )
+from nexwarp.config import preset
 from nexwarp.data import initial_points, load_scene, write_demo
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import Map, pycolmap_module
 from nexwarp.data.random_points import random_points
 from nexwarp.data.raytrace import render
 from nexwarp.data.scene import find_format
+from nexwarp.trainer import Trainer
 from tests.test_scene import make_scene, project, views_of
 
 SIZE = {"width": 96, "height": 72, "views": 10, "points": 300}
@@ -96,8 +99,65 @@ def test_every_format_gives_the_same_scene(demo, tmp_path):
     assert blender.background == (1.0, 1.0, 1.0) and blender.train[0].alpha is None
 
 
+def test_training_starts_from_the_same_surfels_in_every_format(demo, tmp_path):
+    """What a scene is saved as changes no PSNR: the points kept, the surfels on them and what depths follow agree."""
+    config = replace(preset("default"), max_surfels=200)
+    reference = load_scene(demo)
+    expected = Trainer(reference, config, "cpu")
+    dropped = len(reference.points) - len(starting_points(reference))
+    assert 0 < dropped < len(reference.points) / 2, "the demo has outliers"
+    for write in (write_text, write_nerfstudio, write_blender):
+        scene = load_scene(write(demo, tmp_path / write.__name__))
+        torch.testing.assert_close(starting_points(scene), starting_points(reference), rtol=0, atol=1e-6)
+        trainer = Trainer(scene, config, "cpu")
+        for name, raw in expected.surfels.state_dict().items():
+            torch.testing.assert_close(trainer.surfels.state_dict()[name], raw, rtol=1e-6, atol=1e-6, msg=name)
+        assert trainer.texture.resolutions == pytest.approx(expected.texture.resolutions, rel=1e-6)
+        for view, other in zip(scene.train, reference.train, strict=True):
+            torch.testing.assert_close(view.points, other.points, rtol=0, atol=1e-6)
+
+
+def starting_points(scene) -> torch.Tensor:
+    known = {"track_lengths": scene.track_lengths, "errors": scene.reprojection_errors}
+    return initial_points(scene.points, scene.colors, 10**6, **known).means
+
+
+def test_observations_go_with_the_frames_that_are_left(demo, tmp_path):
+    """A frame taken out of the JSON, or one without a number, gives no other the points that it saw."""
+    path = write_nerfstudio(demo, tmp_path / "scene")
+    before = {view.name: view.points for view in load_scene(path).train}
+
+    def change(data):
+        del data["frames"][2]
+        del data["frames"][4]["colmap_im_id"]
+
+    after = {view.name: view.points for view in load_scene(edit(path, change)).train}
+    assert [name for name, points in after.items() if points is None] == ["view_005.png"]
+    both = {name for name in after if name in before and after[name] is not None}
+    assert len(both) == 5 and all(torch.equal(after[name], before[name]) for name in both)
+
+
+def test_points_beside_a_blender_scene(demo, tmp_path):
+    """points3d.ply is taken unless the JSON names others, and may be no link that leads out."""
+    path = write_blender(demo, tmp_path / "scene", points=False)
+    points, colors = np.random.default_rng(0).normal(size=(20, 3)), np.zeros((20, 3))
+    write_points(path / "points3d.ply", points, colors)
+    scene = load_scene(path)
+    assert np.array_equal(scene.points.numpy(), points.astype(np.float32))
+    assert scene.train[0].points is None and scene.track_lengths.eq(0).all()
+    write_points(path / "other.ply", 2 * points, colors)
+    edit(path, lambda data: data.update(ply_file_path="other.ply"), "transforms_train.json")
+    assert np.array_equal(load_scene(path).points.numpy(), (2 * points).astype(np.float32))
+    edit(path, lambda data: data.pop("ply_file_path") and None, "transforms_train.json")
+    (path / "points3d.ply").rename(tmp_path / "elsewhere.ply")
+    (path / "points3d.ply").symlink_to(tmp_path / "elsewhere.ply")
+    with pytest.raises(ValueError, match=r"points .points3d.ply.: a link leaves"):
+        load_scene(path)
+
+
 def test_what_nerfstudio_does_not_say_about_points_is_unknown(demo, tmp_path):
-    scene = load_scene(write_nerfstudio(demo, tmp_path / "scene"))
+    scene = load_scene(write_nerfstudio(demo, tmp_path / "scene", tracks=False))
+    assert all(view.points is None for view in scene.train)
     assert scene.track_lengths.eq(0).all() and scene.reprojection_errors.eq(-1).all()
     chosen = initial_points(
         scene.points, scene.colors, 10**6, track_lengths=scene.track_lengths, errors=scene.reprojection_errors
@@ -128,7 +188,7 @@ def test_applied_transform_and_scale_are_undone(demo, tmp_path, scale):
         edit(path, change)
         points = reconstruction_of(demo).points3D
         positions = scale * (np.array([points[i].xyz for i in sorted(points)]) @ turn.T + applied[:, 3])
-        write_ply(path / "sparse_pc.ply", positions, np.array([points[i].color for i in sorted(points)]))
+        write_points(path / "sparse_pc.ply", positions, np.array([points[i].color for i in sorted(points)]))
     scene, reference = load_scene(path), load_scene(demo)
     assert_same_cameras(scene, reference)
     torch.testing.assert_close(scene.points, reference.points, rtol=0, atol=1e-5)
@@ -137,7 +197,7 @@ def test_applied_transform_and_scale_are_undone(demo, tmp_path, scale):
 def test_points_that_were_left_in_the_original_world_are_noticed(demo, tmp_path):
     path = write_nerfstudio(demo, tmp_path / "scene")
     reference = load_scene(demo)
-    write_ply(path / "sparse_pc.ply", reference.points.double().numpy(), reference.colors.numpy())
+    write_points(path / "sparse_pc.ply", reference.points.double().numpy(), reference.colors.numpy())
     with pytest.warns(UserWarning, match=r"sparse_pc.ply: its points fit the photos only without applied_transform"):
         scene = load_scene(path)
     torch.testing.assert_close(scene.points, reference.points)
@@ -319,7 +379,7 @@ def transparent(tmp_path):
     rgba[..., 0], rgba[..., 1], rgba[..., 3] = 200, 30, alpha
     for file in (path / "images").iterdir():
         Image.fromarray(rgba).save(file)
-    return write_blender(path, tmp_path / "blender", centred=True), rgba
+    return write_blender(path, tmp_path / "blender", centred=True, points=False), rgba
 
 
 @pytest.mark.parametrize(("given", "color"), [(None, (1, 1, 1)), ("black", (0, 0, 0)), ((0.2, 0.4, 0.6),) * 2])
@@ -372,7 +432,7 @@ def test_other_scenes_drop_alpha_unless_asked(transparent, tmp_path):
 
 
 def test_random_points_lie_where_the_cameras_look(demo, tmp_path, transparent):
-    scene = load_scene(write_blender(demo, tmp_path / "opaque"))
+    scene = load_scene(write_blender(demo, tmp_path / "opaque", points=False))
     assert len(scene.points) == 4000 and torch.equal(scene.points, load_scene(tmp_path / "opaque").points)
     seen = torch.zeros(len(scene.points))
     for view in scene.train:
@@ -487,7 +547,7 @@ def test_points_of_a_ply_file(tmp_path, form):
     path = make_scene(tmp_path / "scene")
     rng = np.random.default_rng(0)
     points, colors = rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3))
-    scene = load_scene(path, points=write_ply(tmp_path / "mine.ply", points, colors, form))
+    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", points, colors, form))
     assert np.array_equal(scene.points.numpy(), points.astype(np.float32))
     assert np.array_equal(scene.colors.numpy(), colors)
     assert scene.scale == pytest.approx(load_scene(path).scale)
@@ -495,7 +555,7 @@ def test_points_of_a_ply_file(tmp_path, form):
 
 def test_points_of_one_s_own_make_up_for_none(tmp_path):
     path = make_scene(tmp_path / "scene", points=np.zeros((0, 3)))
-    scene = load_scene(path, points=write_ply(tmp_path / "mine.ply", np.eye(3), np.eye(3)))
+    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", np.eye(3), np.eye(3)))
     assert torch.equal(scene.points, torch.eye(3))
 
 
@@ -667,6 +727,7 @@ BAD = {
     "no such ply": (spoilt(lambda d: d.update(ply_file_path="q.ply")), "ply_file_path: points not found: .*q.ply"),
     "ply elsewhere": (spoilt(lambda d: d.update(ply_file_path="../q.ply")), "ply_file_path: .* leaves the scene"),
     "ply that is none": (file("sparse_pc.ply", b"obj"), "expected a PLY file, but it does not begin with 'ply'"),
+    "id of an image": (frame(colmap_im_id="four"), "frame 3: colmap_im_id: expected an image's id, got 'four'"),
     "no such mask": (frame(mask_path="masks/q.png"), "frame 3 .*: mask not found: .*q.png"),
     "mask elsewhere": (frame(mask_path="../q.png"), "mask_path: '../q.png' leaves the scene's folder"),
     "mask that is none": (file("q.png", b"GIF", mask_path="q.png"), "q.png: expected a complete image file"),

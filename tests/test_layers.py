@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 LAYERS = [
-    {"errors"},
+    {"errors", "signals"},
     {"kernels"},
     {"ops", "camera", "files"},
     {"json_files", "exposures"},

@@ -18,6 +18,8 @@ from nexwarp.densify import DensifyConfig
 from nexwarp.logs import LOG_FILE, TENSORBOARD_FOLDER, TrainingLog, keep_lines, peak_memory
 from nexwarp.trainer import Progress, Trainer
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 CONFIG = Config(
     iterations=12,
     max_surfels=60,
@@ -25,14 +27,6 @@ CONFIG = Config(
     densify=DensifyConfig(every=3),
 )
 CLOCK = ("iterations_per_second", "seconds", "memory_bytes")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

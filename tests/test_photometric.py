@@ -13,17 +13,12 @@ from nexwarp.ops.photometric import photometric_terms
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 
+pytestmark = pytest.mark.usefixtures("restore_launch_threads")
+
 DTYPES = [torch.float32, torch.float64]
 NAMES = ("image", "textured", "weights")
 FACTORS = {"l1": 0.8, "texture": 0.5, "alpha": 0.3}
 SUBSETS = [names for count in (1, 2, 3) for names in itertools.combinations(FACTORS, count)]
-
-
-@pytest.fixture(autouse=True)
-def restore_threads():
-    before = launch.get_num_threads()
-    yield
-    launch.set_num_threads(before)
 
 
 def inputs(height: int = 7, width: int = 9, slots: int = 2) -> dict[str, torch.Tensor]:

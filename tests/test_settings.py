@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -10,28 +9,19 @@ import torch
 import nexwarp as nw
 from nexwarp.config import Config, TextureConfig, with_settings
 from nexwarp.data import Scene, View
-from nexwarp.data.demo import write_demo
 from nexwarp.evaluate import evaluate
 from nexwarp.trainer import Trainer
 from nexwarp.training_views import mean_color
 from tests.tolerances import assert_close
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    folder = tmp_path_factory.mktemp("tiny") / "tiny"
-    return nw.load_scene(write_demo(folder, width=48, height=36, views=10, points=200))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """Tensors are tiny here, and torch's threads would wait for each other on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+@pytest.fixture(scope="session")
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
 
 
 def make_trainer(scene: Scene, **settings) -> Trainer:

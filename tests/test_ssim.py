@@ -12,16 +12,11 @@ from nexwarp.ops.ssim import weighted_dssim
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 
+pytestmark = pytest.mark.usefixtures("restore_launch_threads")
+
 DTYPES = [torch.float32, torch.float64]
 # Smaller than the window, than a block of LANES values, and not a whole number of blocks or of 4 rows.
 SIZES = [(1, 1), (1, 40), (40, 1), (3, 5), (4, 6), (12, 16), (13, 17), (30, 43)]
-
-
-@pytest.fixture(autouse=True)
-def restore_threads():
-    before = launch.get_num_threads()
-    yield
-    launch.set_num_threads(before)
 
 
 @pytest.fixture(params=[LANES, 1], ids=["blocks", "single values"])

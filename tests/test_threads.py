@@ -16,17 +16,12 @@ from nexwarp.trainer import Trainer
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
+pytestmark = pytest.mark.usefixtures("restore_launch_threads")
+
 BUFFERS = ("plain", "base", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
 WIDE = {"width": 300, "height": 200}
-
-
-@pytest.fixture(autouse=True)
-def restore_threads():
-    before = launch.get_num_threads()
-    yield
-    launch.set_num_threads(before)
 
 
 class Passes:

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,15 @@ import torch
 import nexwarp as nw
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
-from nexwarp.data import Scene, View, initial_points, write_demo
+from nexwarp.data import Scene, View, initial_points
 from nexwarp.densify import DensifyConfig
 from nexwarp.evaluate import evaluate
 from nexwarp.initial import initial_surfels, quats_towards, texture_shape
 from nexwarp.losses import LossWeights
 from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 FOX = Path(__file__).parents[2] / "shared" / "data" / "fox"
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
@@ -29,18 +30,8 @@ OFTEN = DensifyConfig(every=3)
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory) -> Scene:
-    folder = tmp_path_factory.mktemp("tiny") / "tiny"
-    return nw.load_scene(write_demo(folder, width=48, height=36, views=10, points=200))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """Tensors are tiny here, and torch's threads would wait for each other on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
 
 
 def small(**changes: Any) -> Config:

@@ -32,16 +32,10 @@ from nexwarp.viewer.server import may_connect
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene, rigid
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 OPTIONS = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 3, "low_pass": False, "clamp_texture": False}
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import cli, config, trainer
+from nexwarp import cli, trainer
 from nexwarp.checkpoint import save_checkpoint
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene, write_demo
@@ -19,6 +19,8 @@ from nexwarp.densify import DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
 from nexwarp.trainer import Trainer
 from nexwarp.watch import LossLog, describe, needed_memory, not_finite
+
+pytestmark = pytest.mark.usefixtures("small_preset")
 
 NAN, INF = math.nan, math.inf
 SMALL = Config(
@@ -28,16 +30,6 @@ SMALL = Config(
     densify=DensifyConfig(every=5),
 )
 FLAGS = ["--iterations", "40", "--max-surfels", "60", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_preset() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "default", SMALL)
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

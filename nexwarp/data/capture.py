@@ -45,12 +45,15 @@ class Cloud:
         colors: (P, 3) uint8 sRGB.
         track_lengths: (P,) int32, how many photos see a point; 0 when unknown.
         reprojection_errors: (P,) float32, mean over the track, in pixels of the photos as taken; -1 when unknown.
+        observations: (M, 2) int64 pairs of a photo's number and the index of a point that it sees; ascending, none
+            twice. None when unknown.
     """
 
     positions: np.ndarray
     colors: np.ndarray
     track_lengths: np.ndarray
     reprojection_errors: np.ndarray
+    observations: np.ndarray | None = None
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> "Cloud":

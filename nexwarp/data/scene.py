@@ -196,7 +196,7 @@ def _load(
     capture = _read_capture(path, images, kind)
     if len(capture.photos) < 2:
         raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
-    cloud = Cloud.of(*read_ply(Path(points))) if points is not None else capture.cloud
+    cloud = read_ply(Path(points)) if points is not None else capture.cloud
     if cloud is None and kind == "colmap":
         raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
     background = capture.background if background is None else background
@@ -314,4 +314,5 @@ def _thinned(cloud: Cloud) -> Cloud:
     if count <= MAX_POINTS:
         return cloud
     keep = np.sort(np.random.default_rng(0).choice(count, MAX_POINTS, replace=False))
-    return Cloud(*(getattr(cloud, field.name)[keep] for field in dataclasses.fields(cloud)))
+    parts = (cloud.positions, cloud.colors, cloud.track_lengths, cloud.reprojection_errors)
+    return Cloud(*(part[keep] for part in parts))

@@ -4,6 +4,7 @@ Both hold camera-to-world matrices with OpenGL's camera axes (x right, y up, z b
 (and `applied_scale`) a file says how its world came from the original one; it is undone, for cameras and points.
 """
 
+import dataclasses
 import math
 import re
 import warnings
@@ -30,6 +31,7 @@ from nexwarp.json_files import read_json
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = {split: f"transforms_{split}.json" for split in ("train", "test", "val")}
+BLENDER_POINTS = "points3d.ply"
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 ROTATION_TOLERANCE = 1e-3  # as of Camera
 WHITE = (1.0, 1.0, 1.0)
@@ -49,13 +51,16 @@ def read_nerfstudio(path: Path, images: str) -> Capture:
     """
     file = path / NERFSTUDIO_FILE
     data = _read_json(file)
-    photos = _photos(file, data, images)
-    photos, test = _split(file, data, photos)
-    return Capture(file, photos, _points(file, data, photos), test)
+    frames = _frames(file, data, images)
+    cloud = _points(file, data, frames)
+    photos, test = _split(file, data, _sorted(file, data, frames, cloud))
+    return Capture(file, photos, cloud, test)
 
 
 def read_blender(path: Path, images: str) -> Capture:
     """Read a Blender scene: train and test files, val in place of a test file that is not there.
+
+    Points are those of `ply_file_path`, else of `points3d.ply` beside the JSON where there is one.
 
     Raises:
         FileNotFoundError: no transforms_train.json, or a photo that a file names is absent.
@@ -65,12 +70,13 @@ def read_blender(path: Path, images: str) -> Capture:
     if not train.is_file():
         raise FileNotFoundError(f"{path}: expected {train.name} of a Blender scene, found none")
     data = _read_json(train)
-    photos = _photos(train, data, images)
-    cloud = _points(train, data, photos)
+    frames = _frames(train, data, images)
+    cloud = _points(train, data, frames, BLENDER_POINTS)
+    photos = _sorted(train, data, frames, cloud)
     for split in ("test", "val"):
         other = path / BLENDER_FILES[split]
         if other.is_file():
-            held_out = _photos(other, _read_json(other), images)
+            held_out = _frames(other, _read_json(other), images)
             names = {photo.name for photo in photos}
             again = [photo.name for photo in held_out if photo.name in names]
             if again:
@@ -90,7 +96,8 @@ def _read_json(file: Path) -> dict[str, Any]:
     return data
 
 
-def _photos(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
+def _frames(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
+    """The photos in the order of the file."""
     to_original = _inverse_applied(file, data)
     photos = []
     for index, frame in enumerate(data["frames"]):
@@ -99,7 +106,7 @@ def _photos(file: Path, data: dict[str, Any], images: str) -> list[Photo]:
             raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
         photos.append(_photo(where, file.parent, data, frame, images, to_original))
     check_unique(file, photos)
-    return sorted(photos, key=lambda photo: photo.name)
+    return photos
 
 
 def _photo(
@@ -314,26 +321,46 @@ def _split(file: Path, data: dict[str, Any], photos: list[Photo]) -> tuple[list[
     return sorted(train + test, key=lambda photo: photo.name), frozenset(photo.name for photo in test)
 
 
-def _points(file: Path, data: dict[str, Any], photos: list[Photo]) -> Cloud | None:
-    """The points that the file names, in the original world."""
-    if data.get("ply_file_path") is None:
+def _points(file: Path, data: dict[str, Any], frames: list[Photo], beside: str | None = None) -> Cloud | None:
+    """The points that the file names, or else those of a file beside it if it is there, in the original world."""
+    key = "ply_file_path"
+    if data.get(key) is not None:
+        path = file.parent / _file_name(str(file), key, data[key])
+        if not path.is_file():
+            raise FileNotFoundError(f"{file}: {key}: points not found: {path}")
+    elif beside is not None and (file.parent / beside).is_file():
+        key, path = "points", file.parent / beside
+    else:
         return None
-    path = file.parent / _file_name(str(file), "ply_file_path", data["ply_file_path"])
-    if not path.is_file():
-        raise FileNotFoundError(f"{file}: ply_file_path: points not found: {path}")
-    positions, colors = read_ply(inside_folder(f"{file}: ply_file_path", path, file.parent))
+    cloud = read_ply(inside_folder(f"{file}: {key}", path, file.parent))
     to_original = _inverse_applied(file, data)
-    moved = positions @ to_original[:3, :3].T + to_original[:3, 3]
+    moved = cloud.positions @ to_original[:3, :3].T + to_original[:3, 3]
     check_points(path, moved, "points in the original world", lambda index: f"vertex {index}")
     # Some releases of nerfstudio left the points in the original world and moved only the cameras.
     if not np.allclose(to_original, np.eye(4)):
-        as_promised, as_they_are = (_color_error(where, colors, photos) for where in (moved, positions))
+        as_promised, as_they_are = (_color_error(where, cloud.colors, frames) for where in (moved, cloud.positions))
         if as_promised > AGREEMENT * as_they_are:
             warnings.warn(
                 f"{path}: its points fit the photos only without applied_transform; left as they are", stacklevel=2
             )
-            moved = positions
-    return Cloud.of(moved, colors)
+            moved = cloud.positions
+    return dataclasses.replace(cloud, positions=moved)
+
+
+def _sorted(file: Path, data: dict[str, Any], frames: list[Photo], cloud: Cloud | None) -> list[Photo]:
+    """The frames' photos by name, those with a number with the points that they are known to see."""
+    if cloud is not None and cloud.observations is not None:
+        image, point = cloud.observations.T
+        positions = cloud.positions.astype(np.float32)
+        for index, (photo, frame) in enumerate(zip(frames, data["frames"], strict=True)):
+            number = frame.get("colmap_im_id")
+            if number is None:
+                continue
+            if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 2**32:
+                raise ValueError(f"{file}: frame {index}: colmap_im_id: expected an image's id, got {short(number)}")
+            first, last = np.searchsorted(image, [number, number + 1])
+            frames[index] = dataclasses.replace(photo, points=positions[point[first:last]])
+    return sorted(frames, key=lambda photo: photo.name)
 
 
 def _color_error(points: np.ndarray, colors: np.ndarray, photos: list[Photo]) -> float:
