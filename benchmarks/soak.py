@@ -184,11 +184,9 @@ class Soak:
         trainer = Trainer(scene, config, device)
         flat = True
         if self.steps:
-            looks, sizes = self._train(trainer, device)
+            looks, least, most = self._train(trainer, device)
             rounds = sum(trainer.densifier.due(i) for i in range(1, self.steps + 1))
-            first, _ = spans(self.steps)
-            compared = [size for number, size in sizes if number >= first.start]
-            print(f"{rounds:,} rounds of density control; {min(compared):,} to {max(compared):,} surfels when compared")
+            print(f"{rounds:,} rounds of density control; {least:,} to {most:,} surfels when compared")
             flat &= phase("training steps", self.steps, looks)
         if self.frames:
             looks = []
@@ -197,17 +195,19 @@ class Soak:
         print("flat: first and last are within 1 % throughout" if flat else "NOT FLAT: memory is not what it was")
         return 0 if flat else 1
 
-    def _train(self, trainer: Trainer, device: torch.device) -> tuple[list[Look], list[tuple[int, int]]]:
+    def _train(self, trainer: Trainer, device: torch.device) -> tuple[list[Look], int, int]:
+        """Train; returns what was seen, and the least and most surfels in the steps that are compared."""
         looks: list[Look] = []
-        sizes: list[tuple[int, int]] = []
-        look = _looker(looks, self.steps, device)
+        extremes: list[int] = []
+        look, (first, _) = _looker(looks, self.steps, device), spans(self.steps)
 
         def observe(step: Progress) -> None:
-            sizes.append((step.iteration, step.surfels))
+            if step.iteration >= first.start:
+                extremes[:] = [min([step.surfels, *extremes]), max([step.surfels, *extremes])]
             look(step.iteration)
 
         trainer.run(observe)
-        return looks, sizes
+        return looks, *extremes
 
 
 def _looker(looks: list[Look], count: int, device: torch.device) -> Callable[[int], None]:

@@ -72,6 +72,7 @@ def test_the_command_is_as_asked_for(tmp_path):
     assert Repeat(data=tmp_path).command()[4:] == ["demo", "--device=cuda"]
 
 
+@pytest.mark.slow
 def test_a_cpu_repeats_itself(tmp_path, capsys):
     """Really trained, twice, by `nexwarp train`."""
     scene = write_demo(tmp_path / "scene", width=32, height=24, views=9, points=100)
