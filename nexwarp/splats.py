@@ -21,6 +21,7 @@ LEVELS = 128
 """Opacities that grids are fitted for; others take the nearest one's, times a factor."""
 LARGEST_ALPHA, LEAST_ALPHA = 0.99, 1.0 / 255.0  # of a surfel's hit
 FITTING_STEPS = 40
+WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
 
 
 @dataclass(frozen=True)
@@ -97,17 +98,35 @@ def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tens
     peak = torch.tensor(level / LEVELS, dtype=torch.float64)
     reach = float(_reach(peak))
     spacing = [reach / n if n else 0.0 for n in (across, along)]
-    size = torch.tensor([step / SPACING if step else 1.0 for step in spacing], dtype=torch.float64)
     steps = [torch.arange(-n, n + 1, dtype=torch.float64) for n in (across, along)]
     grid = torch.cartesian_prod(*steps) * torch.tensor(spacing, dtype=torch.float64)
-    wanted = peak * torch.exp(-0.5 * (grid**2).sum(1))
-    seen = wanted >= LEAST_ALPHA / 2
-    grid, wanted = grid[seen], -torch.log1p(-wanted[seen])
-    falloff = torch.exp(-0.5 * (((grid[:, None] - grid) / size) ** 2).sum(-1))
+    grid = grid[_falloff(grid) * peak >= LEAST_ALPHA / 2]
+    side = torch.linspace(-reach, reach, 41, dtype=torch.float64)
+    places = torch.cartesian_prod(side, side)
+    wanted = peak * _falloff(places)
+    best = math.inf
+    # Across a row of pieces, opaque ones blend to a profile that is wider than theirs.
+    for narrower in WIDTHS if 0.0 in spacing else (1.0,):
+        tried = torch.tensor([step / SPACING if step else narrower for step in spacing], dtype=torch.float64)
+        fitted = _fitted(grid, tried, peak)
+        falloff = _falloff((places[:, None] - grid) / tried)
+        error = float((1 - (1 - fitted * falloff).prod(1) - wanted).square().mean())
+        if error < best:
+            best, size, alpha = error, tried, fitted
+    kept = alpha >= LEAST_ALPHA
+    return grid[kept], size, alpha[kept]
+
+
+def _falloff(apart: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-0.5 * apart.square().sum(-1))
+
+
+def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
+    """Opacities (P,) with which pieces of one size add up to the surfel's optical depth at each one's centre."""
+    wanted = -torch.log1p(-peak * _falloff(grid))
+    falloff = _falloff((grid[:, None] - grid) / size)
     depths = wanted / falloff.sum(1)
     for _ in range(FITTING_STEPS):
         total = -torch.log1p(torch.expm1(-depths) * falloff).sum(1)
         depths = depths * (wanted / total).clamp(0.25, 4.0)
-    alpha = -torch.expm1(-depths)
-    kept = alpha >= LEAST_ALPHA
-    return grid[kept], size, alpha[kept]
+    return -torch.expm1(-depths)
