@@ -386,8 +386,8 @@ class Export:
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Folder to write to."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """Of splats.ply: surfels larger than this share of their distance from the nearest camera become several Gaussians;
-    inf splits none."""
+    """Share of their distance from the nearest camera above which surfels become several Gaussians in splats.ply, or
+    inf."""
 
     def __call__(self, console: Console) -> None:
         """Export."""

@@ -214,7 +214,9 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
         model = load(run)
         files = [folder / "surfels.ply", folder / "splats.ply"]
         save_surfels_ply(files[0], model.surfels)
-        cameras = [camera for members in load_cameras(run / CAMERAS_FILE).values() for camera in members.values()]
+        # A training that was broken off leaves a model without cameras.
+        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
+        cameras = [camera for members in groups for camera in members.values()]
         degree = model.meta["sh_degree"]
         save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
         return files
