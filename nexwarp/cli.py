@@ -33,6 +33,7 @@ from nexwarp.config import Config, parse_settings, preset, setting, with_setting
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, NexwarpError, SceneError, SettingError, StorageError
 from nexwarp.evaluate import evaluate
+from nexwarp.export import MAX_EXTENT
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.logs import TrainingLog, check_tensorboard
 from nexwarp.outputs import RenderOrder, export_run
@@ -384,10 +385,13 @@ class Export:
     """What to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Folder to write to."""
+    max_extent: Annotated[float, option("X")] = MAX_EXTENT
+    """Share of their distance from the nearest camera above which surfels become several Gaussians in splats.ply, or
+    inf."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        for file in export_run(self.run, self.format, self.out or self.run / "export"):
+        for file in export_run(self.run, self.format, self.out or self.run / "export", self.max_extent):
             console.print(str(file), soft_wrap=True)
 
 

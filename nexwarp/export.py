@@ -6,16 +6,21 @@ constant SH coefficient of red, green and blue, `f_rest_*` the others, all of re
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.files import one_line, written_aside
 from nexwarp.ops.checks import check_finite, check_range
+from nexwarp.splats import Pieces, split_large
 from nexwarp.surfels import Surfels
 
+MAX_EXTENT = 0.3
+"""Largest scale of an exported Gaussian, as a share of its distance from the nearest camera."""
 THINNESS = 1e-3
 """Third scale of an exported Gaussian, as a share of the smaller of the surfel's two."""
 SPLAT_COEFFICIENTS = 16
@@ -47,11 +52,20 @@ def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
     _write(path, columns, SURFELS)
 
 
-def save_splats_ply(path: str | os.PathLike[str], surfels: Surfels, sh_degree: int = 3) -> None:
+def save_splats_ply(
+    path: str | os.PathLike[str],
+    surfels: Surfels,
+    sh_degree: int = 3,
+    *,
+    cameras: Sequence[Camera] = (),
+    max_extent: float = MAX_EXTENT,
+) -> None:
     """Write the plain appearance of surfels as a file of 3D Gaussian splatting, which ordinary viewers open.
 
     Each surfel becomes a flat Gaussian: its third scale is a thousandth of its smaller one. That is the rendering of
-    the surfels without texture and with gamma = 1, but for the affine projection and the blur of such viewers.
+    the surfels without texture and with gamma = 1, but for the affine projection and the blur of such viewers. As an
+    affine projection is wrong for what is large beside its distance, surfels that are, from one of the cameras, become
+    several Gaussians; these come last.
 
     Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44` (0 above `sh_degree`), `opacity` (logit),
     `scale_0..2` (logarithms), `rot_0..3` (wxyz, unit).
@@ -60,24 +74,44 @@ def save_splats_ply(path: str | os.PathLike[str], surfels: Surfels, sh_degree: i
         path: where to; written aside, then renamed.
         surfels: on any device.
         sh_degree: 0 to 3, limits the degree of the appearance, as in `nexwarp.render`.
+        cameras: from where the file is to look right; without any, each surfel is one Gaussian.
+        max_extent: the largest scale of a Gaussian, as a share of its distance from the nearest camera; `math.inf`
+            for no splitting.
 
     Raises:
-        ValueError: `sh_degree` out of its range; OSError: `path` cannot be written.
+        ValueError: `sh_degree` out of its range, `max_extent` not > 0; OSError: `path` cannot be written.
     """
     check_range("sh_degree", sh_degree, 0, 3)
+    if not max_extent > 0:
+        raise ValueError(f"max_extent: expected more than 0, got {max_extent}")
     raw = surfels.state_dict()
     kept = raw["shN"][:, : (sh_degree + 1) ** 2 - 1].float()
     rest = kept.new_zeros(len(surfels), SPLAT_COEFFICIENTS - 1, 3)
     rest[:, : kept.shape[1]] = kept
-    thin = raw["log_scales"].amin(dim=1, keepdim=True) + float(np.log(THINNESS))
+    pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
+    ids, count = pieces.ids, pieces.whole
+    geometry = {name: x[ids] for name, x in _geometry(surfels).items()}
+    for name, x in zip("xyz", _moved(surfels, pieces).unbind(1), strict=True):
+        geometry[name][count:] = x
+    scales = torch.cat([raw["log_scales"][ids[:count]], pieces.scales[count:].log()])
+    thin = scales.amin(dim=1, keepdim=True) + float(np.log(THINNESS))
     columns = {
-        **_geometry(surfels),
-        **_harmonics(raw["sh0"], rest),
-        "opacity": raw["logit_opacities"],
-        **_columns("scale", torch.cat([raw["log_scales"], thin], dim=1)),
-        **_columns("rot", surfels.quats.detach()),
+        **geometry,
+        **_harmonics(raw["sh0"][ids], rest[ids]),
+        "opacity": torch.cat([raw["logit_opacities"][ids[:count]], torch.logit(pieces.opacities[count:])]),
+        **_columns("scale", torch.cat([scales, thin], dim=1)),
+        **_columns("rot", surfels.quats.detach()[ids]),
     }
     _write(path, {name: x.float() for name, x in columns.items()}, SPLATS)
+
+
+def _moved(surfels: Surfels, pieces: Pieces) -> torch.Tensor:
+    """Centres of the pieces of surfels that are split, world."""
+    ids, (along_x, along_y) = pieces.ids[pieces.whole :], pieces.offsets[pieces.whole :, :, None].unbind(1)
+    w, x, y, z = surfels.quats.detach()[ids].unbind(-1)
+    axis_x = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
+    axis_y = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
+    return surfels.means.detach()[ids] + along_x * axis_x + along_y * axis_y
 
 
 def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:

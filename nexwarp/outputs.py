@@ -13,7 +13,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load, load_cameras
 from nexwarp.errors import RunError, SettingError
-from nexwarp.export import save_splats_ply, save_surfels_ply
+from nexwarp.export import MAX_EXTENT, save_splats_ply, save_surfels_ply
 from nexwarp.metrics import to_uint8
 from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.passes import render_buffers, save_buffers
@@ -193,17 +193,20 @@ class RenderOrder:
         return resized(camera, *sides)
 
 
-def export_run(run: Path, kind: str, folder: Path) -> Sequence[Path]:
+def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
     """Write a run's files for other programs into a folder (see docs/outputs.md) and return them.
 
     Args:
         run: run folder.
         kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
         folder: made if need be.
+        max_extent: of the Gaussians in splats.ply, see `nexwarp.export.save_splats_ply`.
 
     Raises:
         ValueError, OSError: naming what is not as expected.
     """
+    if not max_extent > 0:
+        raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
         raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
@@ -211,7 +214,11 @@ def export_run(run: Path, kind: str, folder: Path) -> Sequence[Path]:
         model = load(run)
         files = [folder / "surfels.ply", folder / "splats.ply"]
         save_surfels_ply(files[0], model.surfels)
-        save_splats_ply(files[1], model.surfels, model.meta["sh_degree"])
+        # A training that was broken off leaves a model without cameras.
+        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
+        cameras = [camera for members in groups for camera in members.values()]
+        degree = model.meta["sh_degree"]
+        save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
         return files
     sets = load_cameras(run / CAMERAS_FILE)
     # Named as from the scene's folder: a transforms.json lies there.

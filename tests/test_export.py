@@ -7,11 +7,17 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.cli import DEMO_SETTINGS
+from nexwarp.config import preset, with_settings
+from nexwarp.data import write_demo
 from nexwarp.export import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.metrics import psnr, to_uint8
-from nexwarp.paths import look_at
+from nexwarp.paths import look_at, resized
+from nexwarp.splats import Pieces, split_large
+from nexwarp.trainer import Trainer
+from tests.reference import ewa
 from tests.reference.collect import rotations
-from tests.scenes import make_surfels, random_scene
+from tests.scenes import intrinsics, make_surfels, random_scene
 from tests.tolerances import assert_close
 
 
@@ -108,6 +114,80 @@ def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> Non
     assert stack(columns, *numbered("f_dc", 3)).equal(scene["sh"][:, 0])
 
 
+# Large surfels become several Gaussians
+
+
+def blended(pieces: Pieces, at: torch.Tensor) -> torch.Tensor:
+    """Alpha of Gaussians in one plane, at (P, 2) places."""
+    apart = (at[:, None] - pieces.offsets) / pieces.scales
+    return 1 - (1 - pieces.opacities * torch.exp(-0.5 * apart.square().sum(-1))).prod(1)
+
+
+@pytest.mark.parametrize("opacity", [0.03, 0.3, 0.8, 0.97, 1.0])
+@pytest.mark.parametrize("scales", [(0.5, 0.02), (0.6, 0.4), (3.0, 3.0)])
+def test_the_pieces_of_a_surfel_have_its_alpha(opacity: float, scales: tuple[float, float]) -> None:
+    camera = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
+    mean, sizes = torch.tensor([[0.0, 0.0, 1.0]]).double(), torch.tensor([scales]).double()
+    pieces = split_large(mean, sizes, torch.tensor([opacity]).double(), [camera], 0.25)
+    assert pieces.whole == 0 and len(pieces.ids) > 1 and (pieces.ids == 0).all()
+    # A grid has at most 16 pieces on either side, so that of the largest is coarser than asked for.
+    assert (pieces.scales.amax(0) <= (0.25 if scales[0] < 1 else 0.5)).all()
+    places = 3.5 * sizes * (2 * torch.rand(4000, 2, dtype=torch.float64) - 1)
+    expected = min(opacity, 0.99) * torch.exp(-0.5 * (places / sizes).square().sum(1))
+    error = (blended(pieces, places) - expected).abs()
+    assert error.max() < 0.06 and error.mean() < 0.008, (error.max(), error.mean())
+
+
+def test_small_surfels_and_those_of_no_camera_stay_one_gaussian(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene())
+    camera = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
+    with torch.no_grad():
+        surfels.log_scales.fill_(-9.0)
+        surfels.log_scales[::3] = 1.0
+    for name, options in (("none", {}), ("inf", {"cameras": [camera], "max_extent": float("inf")})):
+        save_splats_ply(tmp_path / f"{name}.ply", surfels, **options)
+    assert (tmp_path / "none.ply").read_bytes() == (tmp_path / "inf.ply").read_bytes()
+    save_splats_ply(tmp_path / "split.ply", surfels, cameras=[camera])
+    one, several = read(tmp_path / "none.ply"), read(tmp_path / "split.ply")
+    kept = torch.exp(one["scale_0"]) < 1
+    count = int(kept.sum())
+    assert len(several["x"]) > len(one["x"]) and all(several[n][:count].equal(x[kept]) for n, x in one.items())
+    with pytest.raises(ValueError, match="max_extent: expected more than 0, got 0"):
+        save_splats_ply(tmp_path / "bad.ply", surfels, cameras=[camera], max_extent=0)
+
+
+def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None:
+    """A floor that runs up to the camera: one Gaussian each it is another picture, split it is ours to 35 dB."""
+    x, z = (
+        a.flatten() for a in torch.meshgrid(torch.tensor([-0.7, 0.7]), torch.tensor([0.8, 2.0, 3.2]), indexing="ij")
+    )
+    means = torch.stack([x, torch.full_like(x, 0.6), z], dim=1)
+    quats = torch.tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]]).expand(6, 4)
+    sh = torch.rand(6, 1, 3) * 3 - 1.5
+    surfels = nw.Surfels.from_activated(
+        means, quats, torch.full((6, 2), 0.5), torch.full((6,), 0.9), torch.ones(6, 2), sh
+    )
+    # So fine that the renderer's blur does not count.
+    camera = nw.Camera(torch.eye(4), intrinsics(300, 300, 200, 150).float(), 400, 300)
+    with torch.no_grad():
+        mine = nw.render(surfels, None, camera, background=(0.2, 0.5, 0.8)).image
+    found = []
+    for extent in (float("inf"), 0.1):
+        save_splats_ply(tmp_path / "a.ply", surfels, cameras=[camera], max_extent=extent)
+        columns = {name: x.double() for name, x in read(tmp_path / "a.ply").items()}
+        theirs = ewa.render(
+            stack(columns, "x", "y", "z"),
+            stack(columns, *numbered("rot", 4)),
+            stack(columns, *numbered("scale", 3)).exp(),
+            columns["opacity"].sigmoid(),
+            0.5 + 0.28209479177387814 * stack(columns, *numbered("f_dc", 3)),
+            camera,
+            (0.2, 0.5, 0.8),
+        )
+        found.append(float(psnr(to_uint8(theirs.float()), to_uint8(mine))))
+    assert found[0] < 30 and found[1] >= 35, found
+
+
 # Another renderer
 
 
@@ -129,41 +209,70 @@ def small_surfels(count: int, device: torch.device) -> nw.Surfels:
     return nw.Surfels.from_activated(*(x.to(device) for x in values))
 
 
-@pytest.mark.cuda
-def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path) -> None:
-    """gsplat 1.5.3, its defaults (blur of 0.3 pixel^2 included), against our render without texture at gamma = 1."""
+def drawn_by_gsplat(path: Path, camera: nw.Camera, background: tuple[float, float, float]) -> torch.Tensor:
+    """(H, W, 3) by gsplat 1.5.3 with its defaults (blur of 0.3 pixel^2 included)."""
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    columns = {name: x.to(camera.viewmat.device) for name, x in read(path).items()}
+    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT
+    with torch.no_grad():
+        return gsplat.rasterization(
+            stack(columns, "x", "y", "z"),
+            stack(columns, *numbered("rot", 4)),
+            stack(columns, *numbered("scale", 3)).exp(),
+            columns["opacity"].sigmoid(),
+            torch.cat([stack(columns, *numbered("f_dc", 3))[:, None], rest], dim=1).contiguous(),
+            camera.viewmat[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            sh_degree=3,
+            backgrounds=torch.tensor([background], device=camera.viewmat.device),
+        )[0][0]
+
+
+@pytest.mark.cuda
+def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> None:
+    """Against our render without texture at gamma = 1."""
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     device = torch.device("cuda")
     surfels = small_surfels(20_000, device)
     save_splats_ply(tmp_path / "splats.ply", surfels)
-    columns = {name: x.to(device) for name, x in read(tmp_path / "splats.ply").items()}
-    sh = torch.cat(
-        [stack(columns, *numbered("f_dc", 3))[:, None], stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT],
-        dim=1,
-    )
     size, background = 800, (0.2, 0.5, 0.8)
     K = torch.tensor([[900.0, 0.0, size / 2], [0.0, 900.0, size / 2], [0.0, 0.0, 1.0]], device=device)
     for position in ((0.0, -3.0, 0.5), (2.0, 2.0, 1.0)):
         viewmat = look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])).to(device)
+        camera = nw.Camera(viewmat, K, size, size)
         with torch.no_grad():
-            mine = nw.render(surfels, None, nw.Camera(viewmat, K, size, size), background=background).image
-            theirs = gsplat.rasterization(
-                stack(columns, "x", "y", "z"),
-                stack(columns, *numbered("rot", 4)),
-                stack(columns, *numbered("scale", 3)).exp(),
-                columns["opacity"].sigmoid(),
-                sh.contiguous(),
-                viewmat[None],
-                K[None],
-                size,
-                size,
-                sh_degree=3,
-                backgrounds=torch.tensor([background], device=device),
-            )[0][0]
+            mine = nw.render(surfels, None, camera, background=background).image
+        found = float(psnr(to_uint8(drawn_by_gsplat(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
+        record_property(f"psnr from {position}", found)
         assert mine.std() > 0.1
-        assert psnr(to_uint8(theirs), to_uint8(mine)) >= 35.0
+        assert found >= 35.0
+
+
+@pytest.mark.cuda
+def test_gsplat_renders_a_trained_scene_as_we_do(tmp_path: Path, record_property) -> None:
+    """The demo as `nexwarp train demo` trains it, at 4 times its photos' size, where the blur is small."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    scene = nw.load_scene(write_demo(tmp_path / "demo"))
+    trainer = Trainer(scene, with_settings(preset("default"), DEMO_SETTINGS), "cuda")
+    trainer.run()
+    raw = {name: x.clone() for name, x in trainer.surfels.state_dict().items() if name != "footprints"}
+    raw["raw_gammas"].fill_(-40.0)
+    surfels = nw.Surfels(raw)
+    cameras = [view.camera for view in [*scene.train, *scene.test]]
+    save_splats_ply(tmp_path / "splats.ply", surfels, cameras=cameras)
+    for view in scene.test:
+        camera = resized(view.camera, 4 * view.camera.width, 4 * view.camera.height).to("cuda")
+        with torch.no_grad():
+            mine = nw.render(surfels, None, camera).image
+        theirs = drawn_by_gsplat(tmp_path / "splats.ply", camera, (0.0, 0.0, 0.0))
+        found = float(psnr(to_uint8(theirs), to_uint8(mine)))
+        record_property(f"psnr of {view.name}", found)
+        assert found >= 35.0, view.name
 
 
 # Bad files

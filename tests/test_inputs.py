@@ -96,7 +96,8 @@ def test_every_format_gives_the_same_scene(demo, tmp_path):
     blender = load_scene(write_blender(demo, tmp_path / "blender"))
     assert_same_cameras(blender, reference)
     assert [v.name for v in blender.test] == ["test/view_000.png", "test/view_008.png"]
-    assert blender.background == (1.0, 1.0, 1.0) and blender.train[0].alpha is None
+    assert blender.background is None and blender.train[0].alpha is None, "its photos are opaque"
+    assert load_scene(tmp_path / "blender", background="white").background == (1.0, 1.0, 1.0)
 
 
 def test_training_starts_from_the_same_surfels_in_every_format(demo, tmp_path):

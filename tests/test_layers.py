@@ -14,7 +14,7 @@ LAYERS = [
     {"ops", "camera", "files"},
     {"json_files", "exposures"},
     {"data", "surfels", "texture"},
-    {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "video"},
+    {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "splats", "video"},
     {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},
     {"config"},
     {"initial"},

@@ -208,6 +208,20 @@ def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
 
 
+def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture) -> None:
+    def exported(*options: str) -> bytes:
+        assert command("export", run, *options) == 0
+        return (run / "export" / "splats.ply").read_bytes()
+
+    whole = exported("--max-extent", "inf")
+    assert len(exported("--max-extent", "0.01")) > len(whole)
+    (run / "cameras.json").unlink()
+    assert exported("--max-extent", "0.01") == whole, "a training that was broken off leaves none"
+    capsys.readouterr()
+    assert command("export", run, "--max-extent", "0") == 2
+    assert capsys.readouterr().err == "nexwarp: error: --max-extent: expected more than 0, got 0\n"
+
+
 def test_export_cameras(run: Path) -> None:
     assert command("export", run, "--format", "cameras") == 0
     assert files(run / "export") == {"transforms.json", "camera_path.json"}

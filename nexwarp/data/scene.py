@@ -55,7 +55,8 @@ class Scene:
             of them in one place, the median distance of the points from there.
         path: the folder it was read from.
         background: colour, three numbers in [0, 1], that transparent photos were put on, and that should lie
-            behind a rendering to compare with; None where no photo's transparency was looked at.
+            behind a rendering to compare with; None where no photo's transparency was looked at, or none is
+            transparent and no colour was asked for.
         random_background: whether training was asked to put each photo on a colour of its own instead, which
             `View.alpha` allows; `background` is white then, for comparisons.
     """
@@ -100,8 +101,8 @@ def load_scene(
             exist, and what transforms.json names as a frame's `mask_path` goes before it. "alpha": alpha of one half
             and more counts. None or "none": no masks.
         background: colour that transparent photos are put on, "white", "black" or three numbers in [0, 1]; by
-            default white for a Blender scene, while for others alpha is dropped. "random" puts them on white and
-            marks the scene for training on random colours.
+            default white for a Blender scene with any, while for others alpha is dropped. "random" puts them on white
+            and marks the scene for training on random colours.
         points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
         format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
         progress: called with the number of photos read and their total, from one thread at a time.
@@ -199,7 +200,7 @@ def _load(
     cloud = read_ply(Path(points)) if points is not None else capture.cloud
     if cloud is None and kind == "colmap":
         raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
-    background = capture.background if background is None else background
+    asked, background = background, capture.background if background is None else background
     tests = [
         index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
         for index, photo in enumerate(capture.photos)
@@ -217,6 +218,8 @@ def _load(
     channels = 3 + (background is not None) + (masks == ALPHA or any(job.photo.mask for job in jobs))
     workers = _workers(path, images, downscale, channels, jobs)
     views = _map(lambda job: reader.read(job, NEAR_FRACTION * scale), jobs, workers, progress)
+    if asked is None and all(view.alpha is None for view in views):
+        background = None  # behind opaque photos there is none to see
     train = [view for view, test in zip(views, held_out, strict=True) if not test]
     cloud = _thinned(random_points(train, scale) if cloud is None else cloud)
     return Scene(

@@ -21,8 +21,10 @@ from nexwarp.kernels.types import types
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
 BLOCK_SLACK = 1e-6
-# Bounds for SIMD, where a lane without a hit is computed too: far beyond what a hit can have.
+# Bounds for SIMD, where a lane without a hit is computed too, and for the low-pass, which hits where the surfel does not:
+# far beyond what a hit of the surfel can have, and finite, since their derivatives meet a 0.
 LARGEST_SQUARE = 1e30
+LARGEST_EXPONENT = 80.0
 LEAST_COSINE = 1e-18
 
 
@@ -102,6 +104,7 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
     at_least, at_most = f.at_least, f.at_most
     SLACK = wp.constant(real(BLOCK_SLACK))
     ALPHA_MAX, TINY = t.ALPHA_MAX, t.TINY
+    EXPONENT = wp.constant(real(LARGEST_EXPONENT))
     LARGE, LEAST = wp.constant(real(LARGEST_SQUARE)), wp.constant(real(LEAST_COSINE))
 
     @wp.func
@@ -169,9 +172,12 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
     def power(x: lane, gamma: real):
         """|x|^(2 gamma)."""
         square = at_least(times(x, x), TINY)
-        if wp.static(lanes > 1):
+        if wp.static(lanes > 1 or low_pass):
             square = at_most(square, LARGE)
-        return power_of_e(scaled(gamma, logarithm(square)))
+        exponent = scaled(gamma, logarithm(square))
+        if wp.static(lanes == 1 and low_pass):
+            exponent = at_most(exponent, EXPONENT)
+        return power_of_e(exponent)
 
     @wp.func
     def kernel(
