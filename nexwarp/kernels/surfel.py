@@ -21,8 +21,8 @@ from nexwarp.kernels.types import types
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
 BLOCK_SLACK = 1e-6
-# Bounds for SIMD, where a lane without a hit is computed too, and for the low-pass, which hits where the surfel does not:
-# far beyond what a hit of the surfel can have, and finite, since their derivatives meet a 0.
+# Bounds for SIMD, where a lane without a hit is computed too, and for the low-pass, which hits where the surfel does
+# not: far beyond what a hit of the surfel can have, and finite, since their derivatives meet a 0.
 LARGEST_SQUARE = 1e30
 LARGEST_EXPONENT = 80.0
 LEAST_COSINE = 1e-18
