@@ -706,6 +706,10 @@ BAD = {
         "applied_transform: .* got a singular",
     ),
     "applied scale of 0": (spoilt(lambda data: data.update(applied_scale=0)), "applied_scale: expected a number > 0"),
+    "endless applied scale": (
+        spoilt(lambda data: data.update(applied_scale=1e200)),
+        "applied_transform: .* got a singular",
+    ),
     "focal length of 0": (spoilt(lambda data: data.update(fl_x=0.0)), "K: expected focal lengths > 0, got 0"),
     "no focal length": (spoilt(lambda d: [d.pop(k) for k in ("fl_x", "fl_y")] and None), "expected a focal length"),
     "angle of pi": (

@@ -280,11 +280,13 @@ def _inverse_applied(file: Path, data: dict[str, Any]) -> np.ndarray:
     if scale is not None:
         if not scale > 0:
             raise ValueError(f"{file}: applied_scale: expected a number > 0, got {scale:g}")
-        applied[:3] *= scale
-    volume = np.linalg.det(applied[:3, :3])
-    factor = np.cbrt(volume) if volume > 0 else 1.0
-    what = "a rotation, a position and at most one scale"
-    _check_rotation(str(file), "applied_transform", applied[:3, :3] / factor, what)
+        with np.errstate(over="ignore"):
+            applied[:3] *= scale
+    with np.errstate(over="ignore", invalid="ignore"):
+        volume = np.linalg.det(applied[:3, :3])
+        factor = np.cbrt(volume) if volume > 0 else 1.0
+        linear = applied[:3, :3] / factor
+    _check_rotation(str(file), "applied_transform", linear, "a rotation, a position and at most one scale")
     return np.linalg.inv(applied)
 
 
