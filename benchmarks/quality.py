@@ -2,11 +2,13 @@
 
     python -m benchmarks.quality train --tables peers,hits --data DIR --out results.jsonl
     python -m benchmarks.quality table results.jsonl --out quality.md
+    python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
 several machines too. `table` makes Markdown of them, means and spreads over seeds; nothing is trained twice for two
-tables. Metrics are those of `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be
-had. Speed and memory of a training count when it ran alone (`--jobs 1`).
+tables. `curve` draws a metric over the number of primitives. Metrics are those of `nexwarp.metrics`; LPIPS needs the
+weights of VGG and is left out where they cannot be had. Speed and memory of a training count when it ran alone (`--jobs
+1`).
 """
 
 import argparse
@@ -16,6 +18,7 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -193,7 +196,13 @@ def _scene(path: Path, variant: str) -> Scene:
 
 
 def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path | None) -> dict[str, Any]:
-    """Train, render the test views and compare; see `Result` in the module's tables."""
+    """Train, render the test views and compare.
+
+    Returns:
+        A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
+        `primitives`, `megabytes` of the model file, `seconds` of training, `peak_mib` of GPU memory (torch's),
+        `train_psnr` and `zoom_psnr` of nexwarp; the metrics by view; device, date and commit.
+    """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     scene = _scene(data / job.scene, job.variant)
     if device.type == "cuda":
@@ -236,14 +245,12 @@ def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, model
     trainer = Trainer(scene, config, device)
     trainer.run()
     model = trainer.finish()
-    folder = ROOT / ".quality" if models is None else models
-    folder = folder / f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}".replace(" ", "_")
-    folder.mkdir(parents=True, exist_ok=True)
-    path = save_model(folder, model)
-    megabytes = path.stat().st_size / 1e6
-    if models is None:
-        path.unlink()
-        folder.rmdir()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        if models is not None:
+            folder = models / f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}".replace(" ", "_")
+            folder.mkdir(parents=True, exist_ok=True)
+        megabytes = save_model(folder, model).stat().st_size / 1e6
     facts = {
         "primitives": len(trainer.surfels),
         "megabytes": megabytes,
@@ -415,6 +422,53 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def curve(given: argparse.Namespace) -> int:
+    """Draw a metric over the number of primitives."""
+    curves = curves_of(read_results(given.results), given.scene, given.metric, given.iterations)
+    if not curves:
+        print(f"--scene: expected one with results of {given.iterations:,} iterations, got {given.scene}")
+        return 2
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    for name, points in curves.items():
+        sizes, means, spreads = zip(*points, strict=True)
+        axes.errorbar(sizes, means, yerr=spreads, marker="o", capsize=3, label=name)
+    sizes = sorted({size for points in curves.values() for size, _, _ in points})
+    axes.set(xscale="log", xlabel="primitives", ylabel=UNITS[given.metric], title=given.scene)
+    axes.set_xticks(sizes, [f"{size // 1000}K" for size in sizes])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(given.out, dpi=150)
+    pyplot.close(figure)
+    for name, points in curves.items():
+        print(f"{name}: " + ", ".join(f"{size:,} {mean:.{DIGITS[given.metric]}f}" for size, mean, _ in points))
+    return 0
+
+
+def curves_of(
+    results: dict[Job, dict[str, Any]], scene: str, metric: str, iterations: int
+) -> dict[str, list[tuple[int, float, float]]]:
+    """Curves of our default and of gsplat: (primitives, mean over seeds, their standard deviation), by size."""
+    found: dict[str, dict[int, list[float]]] = {}
+    for job, result in results.items():
+        named = job.row in (DEFAULT.name, GSPLAT) and (job.scene, job.variant, job.iterations) == (
+            scene,
+            "",
+            iterations,
+        )
+        if named and result[metric] is not None:
+            found.setdefault(job.row, {}).setdefault(job.size, []).append(result[metric])
+    return {
+        row: [(n, statistics.fmean(x), statistics.stdev(x) if len(x) > 1 else 0.0) for n, x in sorted(sizes.items())]
+        for row, sizes in found.items()
+    }
+
+
 def _cell(values: list[float | None], digits: int) -> str:
     values = [x for x in values if x is not None]
     if not values:
@@ -445,6 +499,13 @@ def main(arguments: list[str] | None = None) -> int:
     tables.set_defaults(run=table)
     tables.add_argument("results", type=Path, nargs="+")
     tables.add_argument("--out", type=Path, help="file to write; default: the screen")
+    curves = commands.add_parser("curve", help="draw a metric over the number of primitives")
+    curves.set_defaults(run=curve)
+    curves.add_argument("results", type=Path, nargs="+")
+    curves.add_argument("--scene", default="fox", help="default: %(default)s")
+    curves.add_argument("--metric", default="flip", choices=METRICS, help="default: %(default)s")
+    curves.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
+    curves.add_argument("--out", type=Path, required=True, help="picture to write")
     given = parser.parse_args(arguments)
     return given.run(given)
 

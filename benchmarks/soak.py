@@ -32,6 +32,7 @@ TOLERANCE = 0.01
 SLACK = MIB // 4  # what a page, a segment or a cache line more of something small may make
 SAMPLES = 500  # of a phase: a look at the memory of a GPU takes time
 ROWS = 8  # of the table
+EVERYONES = "all processes"  # listed, but what others take is not for us to judge
 SIZES = ((1.0, 0.75), (0.67, 0.5), (0.34, 0.73), (0.84, 0.26), (0.5, 0.5), (1.0, 0.18), (0.17, 0.17))  # of the width
 CYCLE = 84  # different cameras, so that the warm-up has seen all of them
 # Soaking wants many steps, not large ones.
@@ -92,19 +93,20 @@ def judge(looks: Sequence[Look], count: int) -> list[Verdict]:
         raise ValueError(f"looks: expected some in {spans(count)}, got {[number for number, _ in looks]}")
     names = looks[0][1]
     first, last = ({name: sum(x[name] for x in part) / len(part) for name in names} for part in chosen)
-    return [Verdict(name, first[name], last[name]) for name in names]
+    return [Verdict(name, first[name], last[name]) for name in names if name != EVERYONES]
 
 
 def memory(device: torch.device) -> dict[str, int]:
-    """Bytes that this process has, of the host's memory and of the GPU's; `GPU used` is that of all processes."""
+    """Bytes that this process has, of the host's memory and of the GPU's, and those that all processes have there."""
     found = {"host": psutil.Process().memory_info().rss}
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         found["torch allocated"] = torch.cuda.memory_allocated(device)
         found["torch reserved"] = torch.cuda.memory_reserved(device)
-        if wp.is_mempool_supported(f"cuda:{device.index}"):
-            found["Warp's pool"] = wp.get_mempool_used_mem_current(f"cuda:{device.index}")
-        found["GPU used"] = total - free
+        place = f"cuda:{torch.cuda.current_device() if device.index is None else device.index}"
+        if wp.is_mempool_supported(place):
+            found["Warp's pool"] = wp.get_mempool_used_mem_current(place)
+        found[EVERYONES] = total - free
     return found
 
 

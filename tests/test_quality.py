@@ -117,3 +117,31 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert quality.main(["table", str(tmp_path / "out.jsonl"), "--out", str(tmp_path / "table.md")]) == 0
     assert "| mine |" in (tmp_path / "table.md").read_text()
     torch.set_num_threads(threads)
+
+
+def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = []
+    for row, size, seed, figure in (
+        ("default", 5000, 0, 0.2),
+        ("default", 5000, 1, 0.4),
+        ("default", 1000, 0, 0.5),
+        (GSPLAT, 5000, 0, 0.6),
+        ("paper", 5000, 0, 0.1),
+    ):
+        job = Job("fox", "", row, size, seed, 30)
+        lines.append(json.dumps(dataclasses.asdict(job) | {"flip": figure, "psnr": None}))
+    lines.append(json.dumps(dataclasses.asdict(Job("fox", "arc", "default", 5000, 0, 30)) | {"flip": 9.0, "psnr": 1.0}))
+    file = tmp_path / "results.jsonl"
+    file.write_text("\n".join(lines))
+    curves = quality.curves_of(read_results([file]), "fox", "flip", 30)
+    assert curves.keys() == {"default", GSPLAT}
+    assert curves["default"] == [(1000, 0.5, 0.0), (5000, pytest.approx(0.3), pytest.approx(0.02**0.5))]
+    assert curves[GSPLAT] == [(5000, 0.6, 0.0)]
+    assert quality.curves_of(read_results([file]), "fox", "psnr", 30) == {}
+    pytest.importorskip("matplotlib", reason="draws the curves (extra `dev`)")
+    picture = tmp_path / "curve.png"
+    assert quality.main(["curve", str(file), "--iterations", "30", "--out", str(picture)]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == "default: 1,000 0.5000, 5,000 0.3000"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert quality.main(["curve", str(file), "--scene", "car", "--out", str(tmp_path / "no.png")]) == 2
+    assert not (tmp_path / "no.png").exists()
