@@ -42,12 +42,9 @@ class LearningRates:
     """Of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """Of the MLP."""
-    cooldown: float = 0.0
-    """Share of the run, at its end, over which all of them fall to a hundredth of that."""
 
     def __post_init__(self) -> None:
-        check_range("cooldown", self.cooldown, 0.0, 1.0)
-        for rate in dataclasses.fields(self)[:-1]:
+        for rate in dataclasses.fields(self):
             value = getattr(self, rate.name)
             ends = value if isinstance(value, tuple) else (value, value)
             if not (min(ends) > 0 or ends == (0.0, 0.0)):

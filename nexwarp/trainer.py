@@ -37,7 +37,6 @@ from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 CHECK_EVERY = 100
 SNAPSHOTS = 10
 LOWERED_RATES = 0.5
-COOLED = 0.01  # of the learning rates is left at the end of a cooldown
 
 
 @dataclass(frozen=True)
@@ -489,12 +488,10 @@ class Trainer:
 
     def _schedule_rates(self) -> None:
         progress = (self.iteration - 1) / max(self.config.iterations - 1, 1)
-        cooldown = self.config.rates.cooldown
-        late = max(progress - (1 - cooldown), 0.0) / cooldown if cooldown else 0.0
         for group in self.optimizer.param_groups:
             first, last = group["ends"]
             rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-            group["lr"] = self.rate_factor * rate * COOLED**late
+            group["lr"] = self.rate_factor * rate
 
 
 @dataclass(frozen=True)

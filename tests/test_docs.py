@@ -70,7 +70,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.shN": ("", "code"),
     "rates.grid": ("", "code"),
     "rates.mlp": ("", "code"),
-    "rates.cooldown": ("", ""),
     "texture.levels": ("L", "Results"),
     "texture.table_size": ("T", "Results"),
     "texture.features": ("F", "Results"),
