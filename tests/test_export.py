@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from benchmarks.splats import draw, untextured
 from nexwarp.cli import DEMO_SETTINGS
 from nexwarp.config import preset, with_settings
 from nexwarp.data import write_demo
@@ -209,30 +210,11 @@ def small_surfels(count: int, device: torch.device) -> nw.Surfels:
     return nw.Surfels.from_activated(*(x.to(device) for x in values))
 
 
-def drawn_by_gsplat(path: Path, camera: nw.Camera, background: tuple[float, float, float]) -> torch.Tensor:
-    """(H, W, 3) by gsplat 1.5.3 with its defaults (blur of 0.3 pixel^2 included)."""
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
-    columns = {name: x.to(camera.viewmat.device) for name, x in read(path).items()}
-    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT
-    with torch.no_grad():
-        return gsplat.rasterization(
-            stack(columns, "x", "y", "z"),
-            stack(columns, *numbered("rot", 4)),
-            stack(columns, *numbered("scale", 3)).exp(),
-            columns["opacity"].sigmoid(),
-            torch.cat([stack(columns, *numbered("f_dc", 3))[:, None], rest], dim=1).contiguous(),
-            camera.viewmat[None],
-            camera.K[None],
-            camera.width,
-            camera.height,
-            sh_degree=3,
-            backgrounds=torch.tensor([background], device=camera.viewmat.device),
-        )[0][0]
-
-
 @pytest.mark.cuda
 def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> None:
     """Against our render without texture at gamma = 1."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    pytest.importorskip("plyfile", reason="an independent reader of PLY (extra `dev`)")
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     device = torch.device("cuda")
@@ -245,7 +227,7 @@ def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> 
         camera = nw.Camera(viewmat, K, size, size)
         with torch.no_grad():
             mine = nw.render(surfels, None, camera, background=background).image
-        found = float(psnr(to_uint8(drawn_by_gsplat(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
+        found = float(psnr(to_uint8(draw(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
         record_property(f"psnr from {position}", found)
         assert mine.std() > 0.1
         assert found >= 35.0
@@ -260,16 +242,14 @@ def test_gsplat_renders_a_trained_scene_as_we_do(tmp_path: Path, record_property
     scene = nw.load_scene(write_demo(tmp_path / "demo"))
     trainer = Trainer(scene, with_settings(preset("default"), DEMO_SETTINGS), "cuda")
     trainer.run()
-    raw = {name: x.clone() for name, x in trainer.surfels.state_dict().items() if name != "footprints"}
-    raw["raw_gammas"].fill_(-40.0)
-    surfels = nw.Surfels(raw)
+    surfels = untextured(trainer.surfels)
     cameras = [view.camera for view in [*scene.train, *scene.test]]
     save_splats_ply(tmp_path / "splats.ply", surfels, cameras=cameras)
     for view in scene.test:
         camera = resized(view.camera, 4 * view.camera.width, 4 * view.camera.height).to("cuda")
         with torch.no_grad():
             mine = nw.render(surfels, None, camera).image
-        theirs = drawn_by_gsplat(tmp_path / "splats.ply", camera, (0.0, 0.0, 0.0))
+        theirs = draw(tmp_path / "splats.ply", camera, (0.0, 0.0, 0.0))
         found = float(psnr(to_uint8(theirs), to_uint8(mine)))
         record_property(f"psnr of {view.name}", found)
         assert found >= 35.0, view.name

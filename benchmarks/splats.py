@@ -1,0 +1,104 @@
+"""Does another program draw our exported Gaussians as we do? A trained run's splats.ply in gsplat, test view by view.
+
+    python -m benchmarks.splats runs/fox
+
+renders the run without its texture and with gamma = 1, draws what `nexwarp export` writes with gsplat 1.5.3 and its
+defaults (its blur of 0.3 pixel^2 included), and lists the PSNR between the two. Needs CUDA, gsplat and plyfile.
+"""
+
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+import nexwarp as nw
+from nexwarp.checkpoint import load_cameras
+from nexwarp.export import save_splats_ply
+from nexwarp.metrics import psnr, to_uint8
+from nexwarp.runs import CAMERAS_FILE
+
+UNIT_GAMMA = -40.0  # raw: gamma = 1 + exp(raw)
+
+
+def read_ply(path: Path) -> dict[str, torch.Tensor]:
+    """Vertices of a PLY file by property, as a reader of others sees them."""
+    import numpy as np
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(path))["vertex"]
+    return {p.name: torch.from_numpy(np.array(vertex[p.name])) for p in vertex.properties}
+
+
+def draw(path: Path, camera: nw.Camera, background: tuple[float, float, float]) -> torch.Tensor:
+    """(H, W, 3) of a 3DGS PLY by gsplat, on the camera's device."""
+    import gsplat
+
+    columns = {name: x.to(camera.viewmat.device) for name, x in read_ply(path).items()}
+
+    def stack(name: str, *indices: object) -> torch.Tensor:
+        return torch.stack([columns[f"{name}{i}"] for i in indices], dim=1)
+
+    rest = stack("f_rest_", *range(45)).view(-1, 3, 15).mT
+    with torch.no_grad():
+        return gsplat.rasterization(
+            stack("", *"xyz"),
+            stack("rot_", *range(4)),
+            stack("scale_", *range(3)).exp(),
+            columns["opacity"].sigmoid(),
+            torch.cat([stack("f_dc_", *range(3))[:, None], rest], dim=1).contiguous(),
+            camera.viewmat[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            sh_degree=3,
+            backgrounds=torch.tensor([background], device=camera.viewmat.device),
+        )[0][0]
+
+
+def untextured(surfels: nw.Surfels) -> nw.Surfels:
+    """The same surfels with gamma = 1, as Gaussians can show them."""
+    raw = {name: x.clone() for name, x in surfels.state_dict().items() if name != "footprints"}
+    raw["raw_gammas"].fill_(UNIT_GAMMA)
+    return nw.Surfels(raw)
+
+
+def main(
+    run: Annotated[Path, tyro.conf.Positional],
+    max_views: int = 8,
+) -> int:
+    """Compare a trained run's exported Gaussians with our own rendering.
+
+    Args:
+        run: run folder.
+        max_views: at most so many test views.
+    """
+    if not torch.cuda.is_available():
+        print("expected a CUDA device, found none", file=sys.stderr)
+        return 2
+    model = nw.load(run)
+    surfels = untextured(model.surfels).to("cuda")
+    sets = load_cameras(run / CAMERAS_FILE)
+    figures = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "splats.ply"
+        cameras = [camera for members in sets.values() for camera in members.values()]
+        save_splats_ply(path, surfels, model.meta["sh_degree"], cameras=cameras)
+        count = len(read_ply(path)["x"])
+        for name, camera in list(sets["test"].items())[:max_views]:
+            camera = camera.to("cuda")
+            with torch.no_grad():
+                mine = nw.render(surfels, None, camera, sh_degree=model.meta["sh_degree"]).image
+            figures.append(psnr(to_uint8(draw(path, camera, (0.0, 0.0, 0.0))).cpu(), to_uint8(mine).cpu()))
+            print(f"{name}: {figures[-1]:.2f} dB", flush=True)
+    print(
+        f"{len(surfels):,} surfels as {count:,} Gaussians: {statistics.fmean(figures):.2f} dB, least {min(figures):.2f}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
