@@ -20,25 +20,35 @@ ROUNDS = 6  # of reweighted least squares
 NOISE = 0.05  # of log colours: larger differences count as outliers
 PRIOR = 0.1  # observations that speak for a gain of 1
 DECIMALS = 6  # of log gains: the solver's rounding must not make a run another one
-SHARPNESS = 0.5  # reach of a photo's gains over the usual distance to the next one
-CHUNK = 1024
+MOST_PHOTOS = 1000  # that renderings take their gains from
+LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # of the kernel, over the spread of the cameras
+NOISES = (1e-3, 1e-2, 1e-1)  # variance of a photo's own deviation, over that of the process
 
 
 class Exposures(nn.Module):
-    """Gains of photos by the pose of their cameras.
+    """Gains of photos by the pose of their cameras: a Gaussian process with the Matern 3/2 kernel.
 
     Buffers: `log_gains` (V, 3); `positions` (V, 3) of the cameras, world units; `directions` (V, 3) unit, where they
-    look; `lengths` (2,) world units: what a direction's change by 1 counts, and how far a photo's gains reach.
+    look; `coefficients` (V, 3) and `mean` (3,) of the process; `lengths` (2,) world units: what a direction's change by
+    1 counts, and the kernel's length.
     """
 
     def __init__(
-        self, log_gains: torch.Tensor, positions: torch.Tensor, directions: torch.Tensor, lengths: torch.Tensor
+        self,
+        log_gains: torch.Tensor,
+        positions: torch.Tensor,
+        directions: torch.Tensor,
+        coefficients: torch.Tensor,
+        mean: torch.Tensor,
+        lengths: torch.Tensor,
     ) -> None:
         super().__init__()
         shapes = {
             "log_gains": (log_gains, ("V", 3)),
             "positions": (positions, ("V", 3)),
             "directions": (directions, ("V", 3)),
+            "coefficients": (coefficients, ("V", 3)),
+            "mean": (mean, (3,)),
             "lengths": (lengths, (2,)),
         }
         check_tensors(shapes)
@@ -48,12 +58,20 @@ class Exposures(nn.Module):
 
     @classmethod
     def of(cls, log_gains: torch.Tensor, cameras: Sequence[Camera]) -> "Exposures":
-        """Exposures of photos with log gains (V, 3) that these V cameras took, V >= 1; float32 on the CPU."""
+        """Exposures of photos with log gains (V, 3) that these V cameras took, V >= 1; float32 on the CPU.
+
+        How far gains reach and how exact they are is what would have foretold each photo best from the others.
+        """
         viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
-        positions, directions = _poses(viewmats)
-        size = (positions - positions.mean(0)).square().sum(1).mean().sqrt()
-        lengths = torch.stack([size, SHARPNESS * _usual_distance(torch.cat([positions, size * directions], 1))])
-        return cls(*(x.float() for x in (log_gains, positions, directions, lengths)))
+        every = -(-len(cameras) // MOST_PHOTOS)
+        positions, directions = (x[::every] for x in _poses(viewmats))
+        gains = log_gains.double()[::every]
+        size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
+        squares = torch.cdist(*[torch.cat([positions, size * directions], 1)] * 2).square()
+        fits = [(*_fit(squares, gains, length * size, noise), length * size) for length in LENGTHS for noise in NOISES]
+        _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+        tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
+        return cls(*(x.float() for x in tensors))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Its buffers by name; `Exposures(**tensors)` makes it again."""
@@ -61,12 +79,29 @@ class Exposures(nn.Module):
 
     @torch.no_grad()
     def gains(self, camera: Camera) -> torch.Tensor:
-        """Gains (3,) for the colours of a rendering: the mean of the photos around, the nearest counting most."""
+        """Gains (3,) for the colours of a rendering; never beyond those of the photos, and their mean far away."""
         position, direction = _poses(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)
         squares = (self.positions - position).square().sum(1) + turned.square().sum(1)
-        reach = (2 * self.lengths[1].square()).clamp_min(torch.finfo(squares.dtype).tiny)
-        return (torch.softmax(-squares / reach, 0) @ self.log_gains).exp()
+        found = self.mean + _matern(squares, self.lengths[1]) @ self.coefficients
+        return found.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
+
+
+def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
+    """Matern 3/2 kernel of squared distances."""
+    r = (3 * squares).sqrt() / length
+    return (1 + r) * torch.exp(-r)
+
+
+def _fit(
+    squares: torch.Tensor, values: torch.Tensor, length: torch.Tensor, noise: float
+) -> tuple[float, torch.Tensor, torch.Tensor]:
+    """Fit a process to values (V, 3): its squared error on each from the others; coefficients (V, 3); mean (3,)."""
+    inverse = torch.linalg.inv(_matern(squares, length) + noise * torch.eye(len(values), dtype=values.dtype))
+    mean = inverse.sum(0) @ values / inverse.sum()
+    coefficients = inverse @ (values - mean)
+    error = (coefficients / inverse.diagonal()[:, None]).square().sum().item()
+    return round(error, 9), coefficients, mean
 
 
 def photo_gains(
@@ -124,15 +159,3 @@ def _poses(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions and viewing directions (..., 3) of world-to-camera matrices (..., 4, 4)."""
     rotation, shift = viewmats[..., :3, :3], viewmats[..., :3, 3:]
     return -(rotation.mT @ shift)[..., 0], rotation[..., 2, :]
-
-
-def _usual_distance(poses: torch.Tensor) -> torch.Tensor:
-    """Median over poses (V, 6) of the distance to the nearest other one; 0 where there is none."""
-    if len(poses) < 2:
-        return poses.new_zeros(())
-    nearest = []
-    for chunk, first in ((poses[i : i + CHUNK], i) for i in range(0, len(poses), CHUNK)):
-        distances = torch.cdist(chunk, poses, compute_mode="donot_use_mm_for_euclid_dist")
-        distances[torch.arange(len(chunk)), torch.arange(first, first + len(chunk))] = torch.inf
-        nearest.append(distances.amin(1))
-    return torch.cat(nearest).median()

@@ -121,7 +121,7 @@ def test_footprints_come_back_exactly(tmp_path):
 def test_exposures_come_back_exactly(tmp_path):
     model = make_model()
     assert nw.load(save_model(tmp_path, model)).surfels.exposures is None
-    model.surfels.exposures = Exposures(*torch.rand(3, 5, 3), torch.rand(2))
+    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2))
     loaded = nw.load(save_model(tmp_path, model))
     for name, value in model.surfels.exposures.tensors().items():
         assert torch.equal(loaded.surfels.exposures.tensors()[name], value), name

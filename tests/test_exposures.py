@@ -83,26 +83,45 @@ def test_photos_that_share_nothing_keep_their_colours():
 
 
 def test_a_camera_gets_the_gains_around_it():
-    cameras = [looking(x) for x in (0.0, 1.0, 2.0, 4.0, 6.0)]
-    log_gains = torch.tensor([[0.0] * 3, [0.1] * 3, [0.3, 0.2, 0.1], [-0.2] * 3, [-0.4] * 3])
-    exposures = Exposures.of(log_gains, cameras)
+    cameras = [looking(x) for x in np.linspace(0, 6, 25)]
+    course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])
+    exposures = Exposures.of(course, cameras)
     there = torch.stack([exposures.gains(camera).log() for camera in cameras])
-    assert (there - log_gains).abs().max() < 0.05  # neighbours at the usual distance weigh exp(-2) each
-    between = exposures.gains(looking(5.0)).log()
-    torch.testing.assert_close(between, torch.full((3,), -0.3), atol=1e-3, rtol=0)
-    far = exposures.gains(looking(1e4)).log()
-    torch.testing.assert_close(far, log_gains[4], atol=1e-6, rtol=0)
-    low, high = log_gains.min(0).values, log_gains.max(0).values
-    for x in np.linspace(-1, 7, 50):
+    assert (there - course).abs().max() < 0.01
+    low, high = course.min(0).values, course.max(0).values
+    for x in np.linspace(0.1, 5.9, 50):  # between the photos, too
+        expected = 0.3 * np.sin(x) * torch.tensor([1.0, 0.5, -1.0])
+        assert (exposures.gains(looking(x)).log() - expected).abs().max() < 0.01, x
+    for x in np.linspace(-20, 30, 50):
         gains = exposures.gains(looking(x)).log()
         assert (gains >= low - 1e-6).all() and (gains <= high + 1e-6).all()
+    far = exposures.gains(looking(1e6)).log()
+    torch.testing.assert_close(far, exposures.mean, atol=1e-6, rtol=0)
+    assert (far - course.mean(0)).abs().max() < 0.3
+
+
+def test_gains_that_nothing_foretells_are_smoothed():
+    """Each photo's own: the process does not follow what its neighbours do not share."""
+    noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    cameras = [looking(x) for x in np.linspace(0, 4, 40)]
+    exposures = Exposures.of(noise, cameras)
+    between = torch.stack([exposures.gains(looking(x)).log() for x in np.linspace(0.05, 3.95, 39)])
+    assert between.std() < 0.6 * noise.std()
+
+
+def test_many_photos_are_thinned():
+    cameras = [looking(x) for x in np.linspace(0, 4, 2100)]
+    course = torch.linspace(-0.3, 0.3, 2100)[:, None].expand(2100, 3)
+    exposures = Exposures.of(course, cameras)
+    assert len(exposures.log_gains) == 700
+    torch.testing.assert_close(exposures.gains(cameras[1000]).log(), course[1000], atol=0.005, rtol=0)
 
 
 def test_directions_count_as_positions_do():
     cameras = [looking(0.0, turn) for turn in (-0.4, 0.0, 0.4)] + [looking(3.0)]
     exposures = Exposures.of(torch.tensor([[0.3] * 3, [0.0] * 3, [-0.3] * 3, [0.1] * 3]), cameras)
     left, right = (exposures.gains(looking(0.0, turn)).log()[0] for turn in (-0.39, 0.39))
-    assert left > 0.2 and right < -0.2
+    assert left > right + 0.1
 
 
 @pytest.mark.parametrize("count", [1, 2])
