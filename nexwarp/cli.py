@@ -320,8 +320,8 @@ class Eval:
 class Render:
     """Render a run, without its photos, into its renders/: still views, a camera path, a video of it, all passes.
 
-    Without options: the test views and an ellipse of 120 frames. With --path or --video that path alone, with --set
-    those views alone, with both both. docs/outputs.md describes paths and files.
+    Without options: the test views and an ellipse of 120 frames. With --path or --video: that path alone. With --set:
+    those views alone. Together: both. docs/outputs.md describes paths and files.
     """
 
     run: Run_
@@ -342,6 +342,9 @@ class Render:
     """Pixels, such as 1920x1080; what is seen from top to bottom stays."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size, instead of --size."""
+    exposure: Annotated[str, option("{photos,mean}")] = "photos"
+    """Brightness and white balance: those of the photos around each camera, which change along a path; or their mean,
+    one for all pictures."""
     device: Device_ = None
     """Where to compute."""
 
@@ -358,6 +361,7 @@ class Render:
             buffers=self.buffers,
             size=self.size,
             scale=self.scale,
+            exposure=self.exposure,
         )
         device = pick_device(self.device)
         model = load(self.run).to(device)
@@ -386,8 +390,8 @@ class Export:
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Folder to write to."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """Share of their distance from the nearest camera above which surfels become several Gaussians in splats.ply, or
-    inf."""
+    """Surfels larger than this share of their distance from the nearest camera become several Gaussians in
+    splats.ply; inf splits none."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
@@ -445,6 +449,7 @@ class Info:
                 "K": str(model.meta["max_hits"]),
                 "texture": f"{texture['levels']} levels of {texture['table_size']:,}, "
                 f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
+                "exposures": _exposures(model),
                 "model file": f"{(self.run / MODEL_FILE).stat().st_size / 1e6:.1f} MB",
             }
         else:
@@ -522,6 +527,14 @@ COMMANDS: dict[str, Any] = {
     "sfm": Sfm,
     "warmup": Warmup,
 }
+
+
+def _exposures(model: Model) -> str:
+    """How far the photos that a model was learned from differ."""
+    if model.surfels.exposures is None:
+        return "one for all photos"
+    gains = model.surfels.exposures.log_gains.exp()
+    return f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean"
 
 
 def _name(device: torch.device) -> str:
