@@ -1,12 +1,14 @@
 """Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `sfm`, `warmup`."""
 
 import dataclasses
+import io
+import re
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -447,7 +449,9 @@ class Info:
             rows |= {
                 "surfels": f"{len(model.surfels):,} (budget {config.max_surfels:,})",
                 "K": str(model.meta["max_hits"]),
-                "texture": f"{texture['levels']} levels of {texture['table_size']:,}, "
+                "texture": "not used"
+                if model.meta["max_hits"] == 0
+                else f"{texture['levels']} levels of {texture['table_size']:,}, "
                 f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
                 "exposures": _exposures(model),
                 "model file": f"{(self.run / MODEL_FILE).stat().st_size / 1e6:.1f} MB",
@@ -693,6 +697,45 @@ def _evaluate(
     return metrics
 
 
+def _parse(arguments: list[str]) -> Any:
+    """The command that the arguments ask for; exits with 2 where they are none, after one line on stderr."""
+    boxed = io.StringIO()
+    try:
+        with redirect_stderr(boxed):
+            return tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="nexwarp",
+                description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, "
+                "each shows the full trace of an error.",
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if stop.code:
+            help_of = f"nexwarp {arguments[0]}" if arguments and arguments[0] in COMMANDS else "nexwarp"
+            _complain(f"error: {_unboxed(boxed.getvalue())}; see {help_of} --help", None)
+        raise
+
+
+def _unboxed(text: str) -> str:
+    """What tyro says in a box of several paragraphs, in one sentence."""
+    lines = [line.strip("│╭╮╰╯|+ ") for line in text.splitlines()]
+    # After the title; terminals without such characters get lines of "-".
+    parts = [part for part in re.split(r"\n[─-]*\n", "\n".join(["", *lines[1:]])) if part]
+    fault = " ".join(parts[0].split()).removesuffix(".")
+    value = re.fullmatch(
+        r"Error parsing (\S+): (?:no type matching \S*(INT|FLOAT)\b|invalid literal for (int)|"
+        r"could not convert string to (float)).*?'(.*)'.*",
+        fault,
+    )
+    if value is not None:
+        option, *kinds, given = value.groups()
+        kind = "an integer" if "int" in [(k or "").lower() for k in kinds] else "a number"
+        return f"{option}: expected {kind}, got {given!r}"
+    meant = next((part.split("\n")[1] for part in parts if part.startswith("Perhaps you meant:")), None)
+    return fault if meant is None else f"{fault}; perhaps you meant {meant}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
@@ -705,14 +748,7 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_ERROR
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
-        prog="nexwarp",
-        description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, each shows "
-        "the full trace of an error.",
-        args=[argument for argument in given if argument != "--debug"],
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    command = _parse([argument for argument in given if argument != "--debug"])
     console = Console()
     try:
         with stopped_by_signals():
