@@ -485,7 +485,10 @@ def test_truncated_photo(tmp_path, refuses):
     folder = make_scene(tmp_path / "scene")
     photo = folder / "images" / "03.png"
     photo.write_bytes(photo.read_bytes()[:2000])
-    refuses(folder, [], str(photo), "expected a complete image file")
+    refuses(folder, [], f"{photo}: expected a complete image file")
+    photo.write_text("no image")
+    refuses(folder, [], f"{photo}: expected a complete image file, could not decode it: no format is known\n")
+    refuses(photo, [], f"{photo}: expected the folder of a scene, got a file; give {photo.parent}")
 
 
 def test_lens_that_is_no_number(tmp_path, refuses):
