@@ -1,12 +1,14 @@
 """Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `sfm`, `warmup`."""
 
 import dataclasses
+import io
+import re
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -320,8 +322,8 @@ class Eval:
 class Render:
     """Render a run, without its photos, into its renders/: still views, a camera path, a video of it, all passes.
 
-    Without options: the test views and an ellipse of 120 frames. With --path or --video that path alone, with --set
-    those views alone, with both both. docs/outputs.md describes paths and files.
+    Without options: the test views and an ellipse of 120 frames. With --path or --video: that path alone. With --set:
+    those views alone. Together: both. docs/outputs.md describes paths and files.
     """
 
     run: Run_
@@ -342,6 +344,9 @@ class Render:
     """Pixels, such as 1920x1080; what is seen from top to bottom stays."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size, instead of --size."""
+    exposure: Annotated[str, option("{photos,mean}")] = "photos"
+    """Brightness and white balance: those of the photos around each camera, which change along a path; or their mean,
+    one for all pictures."""
     device: Device_ = None
     """Where to compute."""
 
@@ -358,6 +363,7 @@ class Render:
             buffers=self.buffers,
             size=self.size,
             scale=self.scale,
+            exposure=self.exposure,
         )
         device = pick_device(self.device)
         model = load(self.run).to(device)
@@ -386,8 +392,8 @@ class Export:
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Folder to write to."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """Share of their distance from the nearest camera above which surfels become several Gaussians in splats.ply, or
-    inf."""
+    """Surfels larger than this share of their distance from the nearest camera become several Gaussians in
+    splats.ply; inf splits none."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
@@ -443,8 +449,11 @@ class Info:
             rows |= {
                 "surfels": f"{len(model.surfels):,} (budget {config.max_surfels:,})",
                 "K": str(model.meta["max_hits"]),
-                "texture": f"{texture['levels']} levels of {texture['table_size']:,}, "
+                "texture": "not used"
+                if model.meta["max_hits"] == 0
+                else f"{texture['levels']} levels of {texture['table_size']:,}, "
                 f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
+                "exposures": _exposures(model),
                 "model file": f"{(self.run / MODEL_FILE).stat().st_size / 1e6:.1f} MB",
             }
         else:
@@ -522,6 +531,14 @@ COMMANDS: dict[str, Any] = {
     "sfm": Sfm,
     "warmup": Warmup,
 }
+
+
+def _exposures(model: Model) -> str:
+    """How far the photos that a model was learned from differ."""
+    if model.surfels.exposures is None:
+        return "one for all photos"
+    gains = model.surfels.exposures.log_gains.exp()
+    return f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean"
 
 
 def _name(device: torch.device) -> str:
@@ -680,6 +697,45 @@ def _evaluate(
     return metrics
 
 
+def _parse(arguments: list[str]) -> Any:
+    """The command that the arguments ask for; exits with 2 where they are none, after one line on stderr."""
+    boxed = io.StringIO()
+    try:
+        with redirect_stderr(boxed):
+            return tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="nexwarp",
+                description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, "
+                "each shows the full trace of an error.",
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as stop:
+        if stop.code:
+            help_of = f"nexwarp {arguments[0]}" if arguments and arguments[0] in COMMANDS else "nexwarp"
+            _complain(f"error: {_unboxed(boxed.getvalue())}; see {help_of} --help", None)
+        raise
+
+
+def _unboxed(text: str) -> str:
+    """What tyro says in a box of several paragraphs, in one sentence."""
+    lines = [line.strip("│╭╮╰╯|+ ") for line in text.splitlines()]
+    # After the title; terminals without such characters get lines of "-".
+    parts = [part for part in re.split(r"\n[─-]*\n", "\n".join(["", *lines[1:]])) if part]
+    fault = " ".join(parts[0].split()).removesuffix(".")
+    value = re.fullmatch(
+        r"Error parsing (\S+): (?:no type matching \S*(INT|FLOAT)\b|invalid literal for (int)|"
+        r"could not convert string to (float)).*?'(.*)'.*",
+        fault,
+    )
+    if value is not None:
+        option, *kinds, given = value.groups()
+        kind = "an integer" if "int" in [(k or "").lower() for k in kinds] else "a number"
+        return f"{option}: expected {kind}, got {given!r}"
+    meant = next((part.split("\n")[1] for part in parts if part.startswith("Perhaps you meant:")), None)
+    return fault if meant is None else f"{fault}; perhaps you meant {meant}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
@@ -692,14 +748,7 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_ERROR
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
-        prog="nexwarp",
-        description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, each shows "
-        "the full trace of an error.",
-        args=[argument for argument in given if argument != "--debug"],
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    command = _parse([argument for argument in given if argument != "--debug"])
     console = Console()
     try:
         with stopped_by_signals():

@@ -267,7 +267,8 @@ def _find_setting(config: Config, name: str) -> tuple[str, str]:
     if name in known:
         return part, key
     close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part or name}.")]
-    raise ValueError(f"{name}: expected a setting, such as {', '.join(close or known[:4])}")
+    # Not the first one of all, the preset, which has a flag of its own.
+    raise ValueError(f"{name}: expected a setting, such as {', '.join(close or known[1:5])}")
 
 
 def _typed(name: str, value: Any, annotation: Any) -> Any:

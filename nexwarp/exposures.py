@@ -105,7 +105,10 @@ def _fit(
 
 
 def photo_gains(
-    cameras: Sequence[Camera], photos: Sequence[torch.Tensor], points: Sequence[torch.Tensor]
+    cameras: Sequence[Camera],
+    photos: Sequence[torch.Tensor],
+    points: Sequence[torch.Tensor],
+    masks: Sequence[torch.Tensor | None] | None = None,
 ) -> np.ndarray:
     """Estimate log gains (V, 3) float64, mean 0, of photos from the sparse points that they share.
 
@@ -116,19 +119,23 @@ def photo_gains(
         cameras: of the V photos.
         photos: (H, W, 3) uint8 each.
         points: (M, 3) each, world positions that were triangulated from the photo; the same point has the same bits.
+        masks: (H, W) bool each, True where the photo counts; None where all of it does.
     """
     from scipy.sparse import coo_array, csc_array, diags_array, eye_array
     from scipy.sparse.linalg import spsolve
 
     count = len(cameras)
     views, places, colors = [], [], []
-    for index, (camera, photo, seen) in enumerate(zip(cameras, photos, points, strict=True)):
+    masks = [None] * count if masks is None else masks
+    for index, (camera, photo, seen, mask) in enumerate(zip(cameras, photos, points, masks, strict=True)):
         pixels, depths = camera.project(seen)
         inside = (depths > 0) & (pixels >= 0).all(1)
         inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
         column, row = pixels[inside].long().unbind(1)
         color = photo[row, column]
         usable = (color >= CLIPPED[0]).all(1) & (color <= CLIPPED[1]).all(1)
+        if mask is not None:
+            usable &= mask[row, column]
         colors.append(color[usable].double().div(255).log().numpy())
         places.append(seen[inside][usable].numpy())
         views.append(np.full(len(colors[-1]), index))

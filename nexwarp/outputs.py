@@ -27,6 +27,7 @@ FRAMES, FPS = 120, 30.0
 PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
 SETS = {"test": ("test",), "train": ("train",), "all": ("train", "test"), None: ()}
 FORMATS = ("ply", "cameras")
+EXPOSURES = ("photos", "mean")
 LARGEST_SIDE = 16384
 
 
@@ -42,11 +43,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Pictures to render, in order, and the video that their frames make."""
+    """Pictures to render, in order, the video that their frames make, and the exposure of all (see `RenderOrder`)."""
 
     pictures: list[Picture]
     video: Path | None
     fps: float
+    exposure: str = "photos"
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -61,6 +63,9 @@ class RenderJob:
         """Render and write everything; `done` is called after each picture. A broken-off video leaves nothing."""
         frames = [picture for picture in self.pictures if picture.is_frame]
         with ExitStack() as stack:
+            if self.exposure == "mean":
+                stack.callback(setattr, model.surfels, "exposures", model.surfels.exposures)
+                model.surfels.exposures = None
             append = None
             if self.video is not None:  # before the work: where it cannot be written, nothing is
                 size = (frames[0].camera.width, frames[0].camera.height)
@@ -94,6 +99,7 @@ class RenderOrder:
         buffers: also write passes: of the still views or, where there are none, of the frames.
         size: "WIDTHxHEIGHT", or None for that of the cameras.
         scale: factor on the size of the cameras.
+        exposure: "photos", that of the photos around each camera, or "mean", one for all.
 
     Raises:
         ValueError: naming the option that is not as expected, in `prepare` too.
@@ -107,6 +113,7 @@ class RenderOrder:
     buffers: bool = False
     size: str | None = None
     scale: float = 1.0
+    exposure: str = "photos"
 
     def __post_init__(self) -> None:
         if self.views not in SETS:
@@ -121,6 +128,8 @@ class RenderOrder:
             raise SettingError("--frames: expected with --path or --video, got it with --set alone")
         if self.fps is not None and self.video is None:
             raise SettingError("--fps: expected with --video, got it without")
+        if self.exposure not in EXPOSURES:
+            raise SettingError(f"--exposure: expected {' or '.join(EXPOSURES)}, got {self.exposure!r}")
         self._size()
         if self.video is not None:
             _check_video(self.video, FPS if self.fps is None else self.fps)
@@ -148,7 +157,7 @@ class RenderOrder:
                 pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
-        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps)
+        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, self.exposure)
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
         """Folder of the frames, cameras, frames a second."""

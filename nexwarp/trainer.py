@@ -526,7 +526,8 @@ def _exposures(scene: Scene, config: Config) -> Exposures | None:
     if sum(map(len, seen)) == 0:
         return None
     cameras = [view.camera for view in scene.train]
-    log_gains = photo_gains(cameras, [view.image for view in scene.train], seen)
+    photos, masks = [view.image for view in scene.train], [view.mask for view in scene.train]
+    log_gains = photo_gains(cameras, photos, seen, masks)
     return Exposures.of(torch.from_numpy(log_gains), cameras)
 
 

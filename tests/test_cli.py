@@ -485,7 +485,10 @@ def test_truncated_photo(tmp_path, refuses):
     folder = make_scene(tmp_path / "scene")
     photo = folder / "images" / "03.png"
     photo.write_bytes(photo.read_bytes()[:2000])
-    refuses(folder, [], str(photo), "expected a complete image file")
+    refuses(folder, [], f"{photo}: expected a complete image file")
+    photo.write_text("no image")
+    refuses(folder, [], f"{photo}: expected a complete image file, could not decode it: no format is known\n")
+    refuses(photo, [], f"{photo}: expected the folder of a scene, got a file; give {photo.parent}")
 
 
 def test_lens_that_is_no_number(tmp_path, refuses):
@@ -620,13 +623,31 @@ def test_negative_frames(finished, capsys):
     refused(capsys, ["render", str(finished), "--frames", "-1"], "--frames", "expected at least 0", "got -1")
 
 
+@pytest.mark.parametrize("columns", [40, 80, 200])
 @pytest.mark.parametrize(
-    "arguments", [[], ["fly"], ["train"], ["train", "x", "--iterations", "many"], ["train", "x", "--colour", "red"]]
+    ("arguments", "words"),
+    [
+        ([], ["expected one of {train, eval", "see nexwarp --help"]),
+        (["fly"], ["unrecognized options: fly", "see nexwarp --help"]),
+        (["train"], ["missing from nexwarp train: scene folder of a colmap", "see nexwarp train --help"]),
+        (["train", "x", "--iterations", "many"], ["--iterations: expected an integer, got 'many'; see nexwarp train"]),
+        (["train", "x", "--port", "8o80"], ["--port: expected an integer, got '8o80'; see nexwarp train --help"]),
+        (["render", "x", "--scale", "big"], ["--scale: expected a number, got 'big'; see nexwarp render --help"]),
+        (["render", "x", "--fps", "3O"], ["--fps: expected a number, got '3o'; see nexwarp render --help"]),
+        (["train", "x", "--colour", "red"], ["unrecognized options: --colour, red"]),
+        (["train", "x", "--itertions", "3"], ["options: --itertions, 3; perhaps you meant --iterations n; see"]),
+        (["train", "x", "--run"], ["missing value for argument '--run'. expected 1 values; see nexwarp train"]),
+        (["sfm", "x", "y", "--matching", "no"], ["invalid choice 'no' for argument '--matching'. expected one of"]),
+    ],
 )
-def test_wrong_arguments(arguments, capsys):
+def test_wrong_arguments(arguments, words, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
     with pytest.raises(SystemExit) as exited:
         cli.main(arguments)
-    assert exited.value.code == 2 and capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert exited.value.code == 2 and out == ""
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1 and not set(err) & set("│─╭╰")
+    assert all(word in err.lower() for word in words), err
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["render", "--help"]])

@@ -82,6 +82,16 @@ def test_photos_that_share_nothing_keep_their_colours():
     assert (photo_gains(cameras, white, points) == 0).all()
 
 
+def test_what_masks_leave_out_tells_nothing():
+    """A shade over the middle of one photo, in which most of its points lie, is masked."""
+    cameras, photos, points = photographs(torch.zeros(4, 3))
+    shade = torch.ones(48, 64, dtype=torch.bool)
+    shade[4:44, 4:60] = False
+    photos[1] = torch.where(shade[..., None], photos[1], photos[1] // 2)
+    assert abs(photo_gains(cameras, photos, points)).max() > 0.1
+    assert abs(photo_gains(cameras, photos, points, [None, shade, None, None])).max() < 0.01
+
+
 def test_a_camera_gets_the_gains_around_it():
     cameras = [looking(x) for x in np.linspace(0, 6, 25)]
     course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])

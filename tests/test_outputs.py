@@ -15,8 +15,10 @@ from nexwarp import cli
 from nexwarp.checkpoint import Model, load_cameras, save_cameras, save_model
 from nexwarp.config import Config
 from nexwarp.export import load_surfels_ply
+from nexwarp.exposures import Exposures
 from nexwarp.metrics import to_uint8
 from nexwarp.nerfstudio import load_camera_path, load_transforms, save_camera_path
+from nexwarp.outputs import RenderOrder
 from nexwarp.passes import load_buffers
 from nexwarp.paths import ellipse, interpolate, resized, spiral
 from nexwarp.runs import SceneSource, create_run
@@ -93,6 +95,29 @@ def test_sizes(run: Path) -> None:
     for flags, size in ((["--size", "80x20"], (80, 20)), (["--scale", "1.5"], (96, 72)), (["--scale", "0.01"], (1, 1))):
         assert command("render", run, "--set", "test", *flags) == 0
         assert picture(run / "renders" / "test" / "a.png").equal(rendered(run, resized(camera, *size)))
+
+
+def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.CaptureFixture) -> None:
+    cameras = load_cameras(run / "cameras.json")
+    model = nw.load(run)
+    log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
+    model.surfels.exposures = Exposures.of(log_gains, list(cameras["train"].values()))
+    save_model(run, model)
+    assert command("info", run) == 0
+    assert "of 4 photos, 0.67 to 1.35 times the mean" in capsys.readouterr().out
+    assert command("render", run, "--set", "test", "--buffers") == 0
+    assert torch.equal(picture(run / "renders/test/a.png"), rendered(run, cameras["test"]["a.png"]))
+    exposed = load_buffers(run / "renders/test/a.exr")
+    assert command("render", run, "--set", "test", "--buffers", "--exposure", "mean") == 0
+    mean, gains = load_buffers(run / "renders/test/a.exr"), model.surfels.exposures.gains(cameras["test"]["a.png"])
+    assert (gains - 1).abs().max() > 0.05
+    for name in ("image", "plain", "textured", "colors", "background"):
+        torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
+    # The model of the caller is as it was.
+    order = RenderOrder(path=None, views="test", exposure="mean")
+    order.prepare(run).render(model)
+    assert model.surfels.exposures is not None
+    assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))
 
 
 # Paths
@@ -279,6 +304,7 @@ def refuses(run: Path, capsys: pytest.CaptureFixture) -> Callable[..., None]:
         (["--scale", "0"], ["--scale: expected a number above 0, got 0"]),
         (["--scale", "nan"], ["--scale: expected a number above 0, got nan"]),
         (["--scale", "1000"], ["--scale: expected at most 16384 pixels a side, got 64000x48000"]),
+        (["--exposure", "auto"], ["--exposure: expected photos or mean, got 'auto'"]),
         (["--scale", "2", "--size", "9x9"], ["--size, --scale: expected at most one"]),
     ],
 )

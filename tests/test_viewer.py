@@ -22,6 +22,7 @@ from nexwarp import cli, config
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import write_demo
 from nexwarp.densify import DensifyConfig
+from nexwarp.exposures import Exposures
 from nexwarp.runs import keep_camera_path
 from nexwarp.trainer import Trainer
 from nexwarp.viewer import Viewer
@@ -72,6 +73,17 @@ def test_colour_modes_are_the_buffers(model, camera, mode):
     picture = draw(*model, [camera], Settings(mode, max_hits=3, sh_degree=1), OPTIONS)
     assert picture.span is None
     np.testing.assert_array_equal(picture.pixels, eight_bit(getattr(out, mode)))
+
+
+def test_colours_are_at_the_exposure_of_the_photos_or_the_mean(camera):
+    surfels, texture = make_surfels(random_scene(60, width=64, height=48)), make_texture()
+    mean = {mode: draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels for mode in MODES}
+    surfels.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera])
+    for mode in MODES:
+        exposed = draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels
+        assert np.array_equal(exposed, mean[mode]) == (mode not in ("image", "plain", "textured")), mode
+        again = draw(surfels, texture, [camera], Settings(mode, photo_exposure=False), OPTIONS).pixels
+        np.testing.assert_allclose(again.astype(int), mean[mode].astype(int), atol=1, err_msg=mode)
 
 
 def test_buffer_modes_tell_what_the_buffers_hold(model, camera):
@@ -175,7 +187,14 @@ def test_no_surfels_and_no_texture_can_be_looked_at(camera, model):
 def test_settings_take_what_can_be_meant():
     settings = Settings().changed(max_hits=99, sh_degree=-5, slot=0)
     assert (settings.max_hits, settings.sh_degree, settings.slot) == (8, 0, 1)
-    for bad in ({"mode": "rm -rf"}, {"max_hits": "2"}, {"max_hits": 2.5}, {"slot": True}, {"as_trained": 1}):
+    for bad in (
+        {"mode": "rm -rf"},
+        {"max_hits": "2"},
+        {"max_hits": 2.5},
+        {"slot": True},
+        {"as_trained": 1},
+        {"photo_exposure": "no"},
+    ):
         with pytest.raises(ValueError, match=next(iter(bad))):
             Settings().changed(**bad)
 

@@ -45,7 +45,7 @@ class _Bounded(io.BufferedReader):
 @contextmanager
 def _opened(path: Path) -> Iterator:
     """A PIL image; whatever goes wrong with it until the end is told in one line."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
@@ -63,6 +63,8 @@ def _opened(path: Path) -> Iterator:
         raise ValueError(
             f"{path}: expected an image of at most {MAX_PIXELS // 10**6} megapixels, got more; reduce it first"
         ) from None
+    except UnidentifiedImageError:
+        raise ValueError(f"{path}: expected a complete image file, could not decode it: no format is known") from None
     except Exception as error:  # PIL's decoders raise whatever a damaged file leads them to
         raise ValueError(f"{path}: expected a complete image file, could not decode it: {one_line(error)}") from error
 

@@ -111,6 +111,7 @@ def load_scene(
         The scene, all tensors on the CPU.
 
     Raises:
+        NotADirectoryError: a file, not a folder.
         FileNotFoundError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
             scene names are absent.
         TypeError: an argument has the wrong type.
@@ -129,6 +130,8 @@ def load_scene(
     _check_downscale(downscale)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
+    if path.is_file():
+        raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
     with quiet_pillow():

@@ -43,6 +43,7 @@ class Settings:
         sh_degree: 0 to 3.
         slot: which hit to show in the modes of `BY_SLOT`, 1 (heaviest) to 8.
         as_trained: weight the texture's levels as at the photos' resolution where the picture's is finer.
+        photo_exposure: show colours at the exposure of the photos around, not at the mean one.
     """
 
     mode: str = "image"
@@ -50,6 +51,7 @@ class Settings:
     sh_degree: int = 3
     slot: int = 1
     as_trained: bool = True
+    photo_exposure: bool = True
 
     def changed(self, **values: Any) -> "Settings":
         """Return these settings with other values, which may be anything; ValueError for what cannot be meant."""
@@ -61,8 +63,9 @@ class Settings:
             if isinstance(values[name], bool) or not isinstance(values[name], int):
                 raise ValueError(f"{name}: expected an integer, got {values[name]!r}")
             values[name] = min(max(values[name], low), high)
-        if not isinstance(values.get("as_trained", True), bool):
-            raise ValueError(f"as_trained: expected True or False, got {values['as_trained']!r}")
+        for name in {"as_trained", "photo_exposure"} & values.keys():
+            if not isinstance(values[name], bool):
+                raise ValueError(f"{name}: expected True or False, got {values[name]!r}")
         return replace(self, **values)
 
 
@@ -118,8 +121,13 @@ def draw(
 def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
     """What a mode shows: (H, W, 3) colours, or (H, W) numbers, NaN where there is nothing to tell."""
     mode, slot = settings.mode, settings.slot - 1
-    if mode in ("image", "plain", "textured", "alpha"):
-        return getattr(out, mode)
+    if mode in ("image", "plain", "textured"):
+        colours = getattr(out, mode)
+        if surfels.exposures is None or settings.photo_exposure:
+            return colours
+        return colours / surfels.exposures.gains(camera).to(colours)
+    if mode == "alpha":
+        return out.alpha
     if mode == "hit count":
         count = (out.weights >= COUNTED).sum(dim=2).to(out.weights)
         return _where_any(count > 0, count)

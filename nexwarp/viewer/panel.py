@@ -101,9 +101,14 @@ class Panel:
             settings.as_trained,
             hint="Where pixels are finer than the photos', leave out texture detail that no photo has shown",
         )
+        self.photo_exposure = gui.add_checkbox(
+            "Photo exposure",
+            settings.photo_exposure,
+            hint="Brightness and white balance of the photos around, which differ from place to place; off: their mean",
+        )
         self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, _within(round(fov), FOV_DEGREES), hint="Vertical")
         self.status = gui.add_html("")
-        for name in ("mode", "slot", "max_hits", "sh_degree", "as_trained"):
+        for name in ("mode", "slot", "max_hits", "sh_degree", "as_trained", "photo_exposure"):
             self._on(getattr(self, name), lambda value, name=name: self._change(**{name: value}))
         self._on(self.fov, lambda value: self.actions.look(_within(value, FOV_DEGREES)))
         self.show(None, None)
