@@ -164,40 +164,45 @@ def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor)
 
 
 def depth_loss(
-    depths: torch.Tensor, weights: torch.Tensor, pixels: torch.Tensor, expected: torch.Tensor
+    depths: torch.Tensor, weights: torch.Tensor, places: torch.Tensor, expected: torch.Tensor
 ) -> torch.Tensor:
-    """Mean over points of |expected depth of their pixel's hits / their depth - 1|; those outside the image give 0.
+    """Mean over points of |expected depth of their pixel's hits / their depth - 1|.
 
     Args:
         depths: (H, W, K) z-depths of the textured hits, world units.
         weights: (H, W, K), W.
-        pixels: (M, 2) pixel coordinates of the points, x and y.
-        expected: (M,) their z-depths, those <= 0 being behind the camera.
+        places: (M,) int64, row * W + column of the points' pixels, M >= 1; see `visible_points`.
+        expected: (M,) their z-depths, > 0.
     """
-    check_tensors(
-        {
-            "depths": (depths, ("H", "W", "K")),
-            "weights": (weights, depths.shape),
-            "pixels": (pixels, ("M", 2)),
-            "expected": (expected, pixels.shape[:1]),
-        }
-    )
-    height, width = depths.shape[:2]
-    counts = (expected > 0) & (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
-    # Points behind the camera have coordinates of any size, or none.
-    column, row = torch.where(counts[:, None], pixels, 0.0).long().unbind(-1)
-    shares, places = _at(weights, row, column), _at(depths, row, column)
-    found = (shares * places).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
-    errors = found / torch.where(counts, expected, 1.0) - 1
-    return torch.where(counts, errors.abs(), 0.0).mean()
+    check_tensors({"depths": (depths, ("H", "W", "K")), "weights": (weights, depths.shape)})
+    check_tensors({"places": (places, ("M",))}, dtype=torch.int64, device=depths.device)
+    check_tensors({"expected": (expected, places.shape)}, device=depths.device)
+    # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
+    shares, found = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
+    means = (shares * found).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
+    return (means / expected - 1).abs().mean()
 
 
-def _at(values: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
-    """values[row, column] of an (H, W, K) tensor."""
-    if values.device.type != "cpu":
-        return values[row, column]
-    # On a CPU, indexing adds its gradients, where there are many, by atomics in any order; this does not.
-    return values.flatten(0, 1).index_select(0, row * values.shape[1] + column)
+def visible_points(
+    pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Return `places` and `expected` of `depth_loss` for the points that an image shows; None when it shows none.
+
+    Args:
+        pixels: (M, 2) pixel coordinates of the points, x and y, of any size or none behind the camera.
+        depths: (M,) their z-depths, those <= 0 being behind the camera.
+        width: of the image.
+        height: of the image.
+        mask: (H, W) bool, True where the photograph counts; None is everywhere.
+    """
+    size = torch.tensor([width, height], device=pixels.device)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+    column, row = pixels[inside].long().unbind(-1)
+    places, expected = row * width + column, depths[inside]
+    if mask is not None:
+        counts = mask.flatten()[places]
+        places, expected = places[counts], expected[counts]
+    return (places, expected) if len(places) else None
 
 
 def opacity_loss(opacities: torch.Tensor) -> torch.Tensor:

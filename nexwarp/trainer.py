@@ -25,7 +25,7 @@ from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, Sce
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.initial import initial_surfels, texture_shape
-from nexwarp.losses import border_loss, depth_loss, training_losses
+from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
 from nexwarp.render import Rendering, render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
@@ -82,7 +82,7 @@ class Trainer:
         self.iteration = 0
         self.seconds = 0.0
         self.order: list[int] = []
-        self.points: dict[int, torch.Tensor] = {}
+        self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor] | None] = {}
         self.exposures = _exposures(scene, config)
         gains = None if self.exposures is None else self.exposures.log_gains.exp()
         self.views = TrainingViews(scene.train, self.device, gains)
@@ -293,14 +293,22 @@ class Trainer:
             beyond=~inside if known is None else ~inside & known,
         )
 
-    def _points(self, index: int) -> torch.Tensor | None:
-        """Points (M, 3) that a view's depths are compared with; None when there are none, or nobody asks."""
-        points = self.scene.train[index].points
-        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None or len(points) == 0:
+    def _points(self, view: "_Target") -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Points that a view's depths are compared with, as `depth_loss` takes them.
+
+        None when there are none, or nobody asks. Looks beyond the frame go without: theirs would be found anew for
+        each, and a step is short.
+        """
+        points = self.scene.train[view.index].points
+        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None or view.beyond is not None:
             return None
-        if index not in self.points:
-            self.points[index] = points.to(self.device)
-        return self.points[index]
+        camera = view.camera
+        key = (view.index, camera.width)
+        if key not in self.points:
+            mask = view.counts if view.empty is None else ~view.empty
+            seen = camera.project(points.to(self.device))
+            self.points[key] = visible_points(*seen, camera.width, camera.height, mask)
+        return self.points[key]
 
     def finish(self) -> Model:
         """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
@@ -481,9 +489,9 @@ class Trainer:
             losses["border"] = factors.border * border_loss(out.image, view.photo, view.beyond)
         if view.empty is not None and factors.empty > 0:
             losses["empty"] = factors.empty * (out.alpha * view.empty).mean()
-        points = self._points(view.index)
+        points = self._points(view)
         if points is not None:
-            losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, *view.camera.project(points))
+            losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, *points)
         return losses
 
     def _schedule_rates(self) -> None:

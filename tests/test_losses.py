@@ -288,20 +288,31 @@ def test_border_loss_by_hand() -> None:
     assert losses.border_loss(image, target, beyond).item() == pytest.approx(0.3 * 2 / 8)
 
 
+def test_visible_points_by_hand() -> None:
+    """Those outside, behind or masked are left out."""
+    nan = float("nan")
+    pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [nan, 1.0], [2.5, 1.5], [0.0, 2.999], [1.0, 3.0]])
+    depths = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0, 5.0, 1.0])
+    places, expected = losses.visible_points(pixels, depths, 4, 3)
+    assert places.tolist() == [1 * 4 + 2, 2 * 4 + 0] and expected.tolist() == [2.0, 5.0]
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    mask[1, 2] = False
+    places, expected = losses.visible_points(pixels, depths, 4, 3, mask)
+    assert places.tolist() == [8] and expected.tolist() == [5.0]
+    assert losses.visible_points(pixels, depths, 4, 3, torch.zeros(3, 4, dtype=torch.bool)) is None
+    assert losses.visible_points(pixels, -depths.abs(), 4, 3) is None
+
+
 def test_depth_loss_by_hand() -> None:
-    """Two slots of weights 0.3 and 0.1 at depths 2 and 4: 2.5 in the mean; what is outside or behind gives 0."""
+    """Two slots of weights 0.3 and 0.1 at depths 2 and 4: 2.5 in the mean, against 2; and a pixel without hits."""
     depths, weights = torch.zeros(3, 4, 2), torch.zeros(3, 4, 2)
     depths[1, 2], weights[1, 2] = torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1])
-    pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [float("nan"), 1.0], [2.5, 1.5]])
-    expected = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0])
-    assert losses.depth_loss(depths, weights, pixels, expected).item() == pytest.approx(0.25 / 5, abs=1e-5)
-    untouched = losses.depth_loss(depths, weights, torch.tensor([[0.5, 0.5]]), torch.tensor([3.0]))
-    assert untouched.item() == pytest.approx(1.0)
+    places, expected = torch.tensor([6, 6, 0]), torch.tensor([2.0, 2.5, 3.0])
+    assert losses.depth_loss(depths, weights, places, expected).item() == pytest.approx((0.25 + 0 + 1) / 3, abs=1e-5)
 
 
 def test_depth_loss_against_finite_differences() -> None:
     depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
-    pixels = torch.tensor([[0.5, 0.5], [3.2, 2.8], [1.5, 9.0], [0.7, 0.2]], dtype=torch.float64)
-    expected = torch.tensor([1.5, 4.0, 2.0, 3.9], dtype=torch.float64)
-    assert gradcheck(lambda d, w: losses.depth_loss(d, w, pixels, expected), [depths, weights])
+    places, expected = torch.tensor([0, 11, 0, 5]), torch.tensor([1.5, 4.0, 3.9, 2.0], dtype=torch.float64)
+    assert gradcheck(lambda d, w: losses.depth_loss(d, w, places, expected), [depths, weights])
