@@ -1,0 +1,63 @@
+"""How far photos differ in exposure, and how well a camera's gains are foretold from the photos around it.
+
+    python -m benchmarks.exposures fox saharov kitchen25
+
+estimates the gains of each scene's training photos, foretells those of its test views from their poses, and compares
+with the gains that the test photos have when they are estimated together with the others (only here are test photos
+looked at). On a CPU; nothing is trained.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from benchmarks.timing import ROOT
+from nexwarp.data import View, load_scene
+from nexwarp.exposures import Exposures, photo_gains
+
+
+def gains_of(views: list[View]) -> torch.Tensor:
+    """Log gains (V, 3) of photos, mean 0."""
+    points = [torch.zeros(0, 3) if view.points is None else view.points for view in views]
+    cameras, photos = [view.camera for view in views], [view.image for view in views]
+    return torch.from_numpy(photo_gains(cameras, photos, points, [view.mask for view in views]))
+
+
+def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | float]:
+    """Spread of the training photos' gains by channel (3,), and the test views' errors as root mean squares.
+
+    Returns:
+        "spread": standard deviation of the log gains; "foretold": error of what the pose foretells; "ignored": that of
+        a gain of 1.
+    """
+    mine, all_together = gains_of(train), gains_of([*train, *test])
+    # Both have the mean 0 of their own photos.
+    own = all_together[len(train) :] - (all_together[: len(train)] - mine).mean(0)
+    exposures = Exposures.of(mine, [view.camera for view in train])
+    foretold = torch.stack([exposures.gains(view.camera).double().log() for view in test])
+    rms = {"foretold": foretold - own, "ignored": own}
+    return {"spread": mine.std(0), **{name: x.square().mean().sqrt().item() for name, x in rms.items()}}
+
+
+def main(scenes: Annotated[tuple[str, ...], tyro.conf.Positional], data: Path = ROOT.parent / "shared" / "data") -> int:
+    """Print a Markdown table.
+
+    Args:
+        scenes: folders of scenes, or names of those in --data.
+        data: folder of scenes.
+    """
+    print("| scene | spread of the gains: red, green, blue | error of test views: foretold | left at 1 |")
+    print("|---|---|---|---|")
+    for name in scenes:
+        scene = load_scene(name if Path(name).exists() else data / name)
+        found = compare(scene.train, scene.test)
+        spread = ", ".join(f"{100 * x:.1f}" for x in found["spread"].tolist())
+        print(f"| {Path(name).name} | {spread} % | {100 * found['foretold']:.1f} % | {100 * found['ignored']:.1f} % |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
