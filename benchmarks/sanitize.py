@@ -33,6 +33,7 @@ TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 # Iterations of a full run: all degrees of spherical harmonics, then a step beyond the frame with a density round.
 ITERATIONS = (10_001, 10_100)
 SURFELS = 200
+PACKAGED = ("nvidia/cu13/compute-sanitizer", "nvidia/cuda_sanitizer_api/bin")  # nvidia-cuda-sanitizer-api, by version
 PLACES = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
 # Racecheck looks at shared memory. Of others' kernels it would have much to say, and take long.
 OURS = ("--kernel-name", "kernel_substring=_cuda_kernel_")
@@ -68,11 +69,11 @@ def parse(output: str) -> Report:
 
 
 def find_tool() -> str | None:
-    """Return where compute-sanitizer is: on the PATH, or where CUDA toolkits and pip put it."""
+    """Return where compute-sanitizer is: where pip put it, on the PATH, or where CUDA toolkits put it."""
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
-    packages = [str(Path(folder) / "nvidia/cuda_sanitizer_api/bin") for folder in sys.path]
+    packages = [str(Path(folder) / place) for folder in sys.path for place in PACKAGED]
     places = [os.environ.get("PATH", ""), *([f"{home}/bin", f"{home}/compute-sanitizer"] if home else [])]
-    return shutil.which("compute-sanitizer", path=os.pathsep.join([*places, *PLACES, *packages]))
+    return shutil.which("compute-sanitizer", path=os.pathsep.join([*packages, *places, *PLACES]))
 
 
 def work(device: torch.device) -> dict[str, int]:

@@ -55,6 +55,7 @@ def draw(path: Path, camera: nw.Camera, background: tuple[float, float, float]) 
             camera.width,
             camera.height,
             sh_degree=3,
+            packed=False,  # packed, gsplat 1.5.3 takes no backgrounds
             backgrounds=torch.tensor([background], device=camera.viewmat.device),
         )[0][0]
 

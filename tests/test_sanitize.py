@@ -117,6 +117,11 @@ def test_a_missing_tool_is_not_found(tmp_path, monkeypatch):
     assert find_tool() is None
     stub(tmp_path / "cuda" / "bin", "true")
     assert find_tool() == str(tmp_path / "cuda" / "bin" / "compute-sanitizer")
+    # One that was installed with pip is there on purpose.
+    packaged = tmp_path / "nvidia" / "cu13" / "compute-sanitizer"
+    packaged.mkdir(parents=True)
+    stub(packaged, "true")
+    assert find_tool() == str(packaged / "compute-sanitizer")
 
 
 def test_steps_and_frames_run(device):
