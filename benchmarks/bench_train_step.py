@@ -50,7 +50,9 @@ def make_trainer(scene: Scene, options: Options) -> Trainer:
     """Trainer with default settings (small tables on scenes for a CPU) that goes on from the scene's surfels."""
     count = len(scene.surfels)
     large = count >= 20_000
-    shape = TextureConfig() if large else TextureConfig(levels=8, table_size=2**15, width=32)
+    # The garden of the paper has photos enough for the largest table, whatever is drawn here.
+    table = 2**20 if count >= GARDEN else None
+    shape = TextureConfig(table_size=table) if large else TextureConfig(levels=8, table_size=2**15, width=32)
     config = Config(max_surfels=count, texture=shape)
     surfels = scene.surfels.to(options.device)
     trainer = Trainer(photos(scene, options), config, options.device)

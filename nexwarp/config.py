@@ -11,6 +11,7 @@ from nexwarp.densify import DensifyConfig
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.losses import LossWeights
 from nexwarp.ops.checks import check_range
+from nexwarp.render import MAX_JITTER
 
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
@@ -57,8 +58,8 @@ class TextureConfig:
 
     levels: int = 16
     """L, resolution levels."""
-    table_size: int = 2**20
-    """T, entries a level, a power of two."""
+    table_size: int | None = None
+    """T, entries a level, a power of two; None follows the number of the training photos' pixels."""
     features: int = 2
     """F, features an entry."""
     min_resolution: float | None = None
@@ -107,6 +108,8 @@ class Config:
     """Largest shift, in shares of the frame, of steps that look beyond it, where the photo's edge goes on; 0: none."""
     border_every: int = 4
     """Every how many steps that is."""
+    depth_jitter: float = 2.0
+    """Random shifts, along their rays, of where a step looks its texture up: standard deviation in pixels there."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     clamp_texture: bool = False
@@ -140,6 +143,7 @@ class Config:
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
+        check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
         if self.clamp_texture and self.texture.residual:
@@ -305,13 +309,14 @@ PRESETS: dict[str, Config] = {
         preset="paper",
         background=(0.0, 0.0, 0.0),
         border=0.0,
+        depth_jitter=0.0,
         footprints=False,
         exposures=False,
         clamp_image=True,
         filter_points=False,
         orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
-        texture=TextureConfig(min_resolution=16.0, max_resolution=256.0, residual=False),
+        texture=TextureConfig(table_size=2**20, min_resolution=16.0, max_resolution=256.0, residual=False),
         losses=LossWeights(depth=0.0),
         densify=DensifyConfig(prune_at_cap=False),
     ),

@@ -1,6 +1,7 @@
 """What a run starts from: surfels on points of the cloud, and a texture as fine as the photos."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from nexwarp.surfels import Surfels
 
 INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0
+NUMBERS_A_PIXEL = 0.4  # of the hash grid, for each pixel of the training photos
+TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 
 def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
@@ -70,16 +73,26 @@ def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
     """Arguments of `NeuralTexture`, with resolutions that follow the scene when the config leaves them open.
 
     The finest level's cells are as small as the pixels of nearly all training views at the points they see (95th
-    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing.
+    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing. The table is as
+    large as the photos can fill: with more numbers than pixels, it learns each photo by heart.
     """
     shape = dataclasses.asdict(config.texture)
     if shape["sh_degree"] is None:
         shape["sh_degree"] = config.sh_degree
+    if shape["table_size"] is None:
+        shape["table_size"] = _table_size(scene, shape["levels"] * shape["features"])
     if shape["max_resolution"] is None:
         shape["max_resolution"] = _pixel_resolution(scene)
     if shape["min_resolution"] is None:
         shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
     return shape
+
+
+def _table_size(scene: Scene, width: int) -> int:
+    """Entries of tables of `width` numbers an entry, a power of two, that hold `NUMBERS_A_PIXEL`."""
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    power = round(math.log2(NUMBERS_A_PIXEL * pixels / width))
+    return 2 ** min(max(power, TABLE_POWERS[0]), TABLE_POWERS[1])
 
 
 def _pixel_resolution(scene: Scene) -> float:

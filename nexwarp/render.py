@@ -13,6 +13,8 @@ from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
+MAX_JITTER = 1000.0  # pixels
+
 
 @dataclass(frozen=True)
 class Passes:
@@ -77,6 +79,7 @@ def render(
     sh_degree: int = 3,
     low_pass: bool = False,
     clamp_texture: bool = False,
+    depth_jitter: float = 0.0,
 ) -> Rendering:
     """Render surfels as a camera sees them.
 
@@ -92,11 +95,15 @@ def render(
         sh_degree: 0 to 3, limits the degree of both appearances.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
         clamp_texture: limit textured colours to >= 0; not for residual textures.
+        depth_jitter: for training: where the texture is looked up moves along the ray, at random by torch's generator,
+            with this standard deviation in units of depth / focal, a pixel's size there. The buffers' depths stay.
 
     Raises:
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
-    background = _check(surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture)
+    background = _check(
+        surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter
+    )
     shape = surfels.activated()
     pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
@@ -107,7 +114,10 @@ def render(
         texels, weights = hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
     else:
         weights = hits.weights
-        positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)
+        looked_up = hits.depths
+        if depth_jitter > 0:
+            looked_up = looked_up * torch.randn_like(looked_up).mul_(depth_jitter / camera.focal).add_(1)
+        positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
         depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
@@ -163,6 +173,7 @@ def _check(
     sh_degree: int,
     low_pass: bool,
     clamp_texture: bool,
+    depth_jitter: float,
 ) -> torch.Tensor:
     """Check types, shapes and devices only, so as never to wait for a GPU; return the background as a tensor."""
     for name, value, kind in (("surfels", surfels, Surfels), ("camera", camera, Camera)):
@@ -177,6 +188,9 @@ def _check(
     for name, value in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
         if not isinstance(value, bool):
             raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
+    if isinstance(depth_jitter, bool) or not isinstance(depth_jitter, numbers.Real):
+        raise TypeError(f"depth_jitter: expected a number, got {type(depth_jitter).__name__}")
+    check_range("depth_jitter", depth_jitter, 0.0, MAX_JITTER)
     if clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
     means = surfels.means

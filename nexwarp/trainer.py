@@ -225,7 +225,7 @@ class Trainer:
         self._schedule_rates()
         if config.border > 0 and self.iteration % config.border_every == 0:
             view = self._beyond_the_frame(view)
-        options = self.render_options() | {"background": view.background}
+        options = self.render_options() | {"background": view.background, "depth_jitter": config.depth_jitter}
         out = render(self.surfels, self.texture if config.max_hits else None, view.camera, **options)
         losses = self._losses(out, view)
         watch = None

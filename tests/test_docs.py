@@ -46,6 +46,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "mask_mode": ("", ""),
     "border": ("", ""),
     "border_every": ("", ""),
+    "depth_jitter": ("", ""),
     "low_pass": ("", ""),
     "clamp_texture": ("", "code"),
     "clamp_image": ("", "code"),

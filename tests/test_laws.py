@@ -297,6 +297,89 @@ def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
         draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
 
 
+class Lookups:
+    """A texture's lookups: what `render` asks of it, and the answers."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        colors = nw.NeuralTexture.colors
+        self.positions: list[torch.Tensor] = []
+
+        def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
+            self.positions.append(positions.detach())
+            return colors(texture, positions, *arguments, **options)
+
+        monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
+
+
+@pytest.mark.parametrize("jitter", [0.5, 3.0])
+def test_jitter_moves_lookups_along_their_rays(
+    jitter: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
+    scene = random_scene(width=120, height=90, device=device)
+    texture, lookups = make_texture(device=device), Lookups(monkeypatch)
+    still = draw(scene, texture)
+    torch.manual_seed(3)
+    moved = draw(scene, texture, depth_jitter=jitter)
+    assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
+    assert torch.equal(moved.ids, still.ids)
+    camera, hit = make_camera(scene), still.ids >= 0
+    before, after = (x[hit] - camera.position.detach() for x in lookups.positions)
+    share = after.norm(dim=-1) / before.norm(dim=-1)
+    assert_close(after, before * share[:, None], kind="value", name="along the ray")
+    pixels = (share - 1) * camera.focal
+    assert len(pixels) > 5000
+    error = 5 / len(pixels) ** 0.5  # five standard deviations of what is estimated
+    assert abs(pixels.mean().item()) < error * jitter
+    assert abs(pixels.std().item() - jitter) < error * jitter
+    assert not torch.equal(moved.textured, still.textured)
+    torch.manual_seed(3)
+    assert_same(draw(scene, texture, depth_jitter=jitter), moved)
+    assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
+
+
+def test_without_jitter_no_random_number_is_drawn(device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    torch.manual_seed(3)
+    expected = torch.rand((), device=device)
+    torch.manual_seed(3)
+    assert_same(draw(scene, texture, depth_jitter=0.0), draw(scene, texture))
+    assert torch.rand((), device=device) == expected
+
+
+@pytest.mark.parametrize("max_hits", [1, 2, 4])
+def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -> None:
+    """Values and gradients of what was drawn at random: surfels and camera move the points that are looked up."""
+    scene, jitter = random_scene(dtype=torch.float64, device=device), 2.0
+    surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(dtype=torch.float64, device=device)
+    surfels64, camera64, texture64 = (
+        twin(surfels),
+        make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")}),
+        twin(texture),
+    )
+    options = {"max_hits": max_hits, "background": BACKGROUND}
+    torch.manual_seed(3)
+    drawn = torch.randn(camera.height, camera.width, max_hits, dtype=torch.float64, device=device)
+    shares = (1 + drawn * jitter / camera.focal).cpu()
+    expected = reference_render(surfels64, texture64, camera64, shares=shares, **options)
+    torch.manual_seed(3)
+    out = nw.render(surfels, texture, camera, depth_jitter=jitter, **options)
+    loss(out).backward()
+    loss(expected).backward()
+    for buffer in BUFFERS:
+        assert_close(getattr(out, buffer), getattr(expected, buffer), kind="value", name=buffer)
+    assert_gradients(surfels, surfels64, torch.float64)
+    assert_gradients(texture, texture64, torch.float64)
+    moved = rigid_gradient(camera.viewmat), rigid_gradient(camera64.viewmat)
+    assert_close(*moved, kind="gradient", name="viewmat", precision=torch.float64)
+
+
+@pytest.mark.parametrize(("jitter", "error"), [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError)])
+def test_jitter_that_cannot_be_is_refused(jitter: Any, error: type[Exception], device: torch.device) -> None:
+    with pytest.raises(error, match=r"^depth_jitter: expected "):
+        draw(random_scene(device=device), make_texture(device=device), depth_jitter=jitter)
+
+
 def test_background_may_be_a_tensor(device: torch.device) -> None:
     scene = random_scene(device=device)
     out = draw(scene, background=torch.tensor(BACKGROUND, device=device))

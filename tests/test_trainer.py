@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene, View, initial_points
@@ -400,6 +401,20 @@ def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
     expected = torch.tensor(densities).double().quantile(0.95).item()
     assert shape["max_resolution"] == pytest.approx(expected, rel=1e-3)
     assert shape["min_resolution"] == pytest.approx(min(64 / scene.scale, expected / 4), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "power"), [(21_600_000, 18), (9_000_000, 17), (330_000_000, 20), (1000, 12), (10**12, 20)]
+)
+def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, power):
+    """0.4 numbers for each pixel, 16 levels of 2 numbers an entry, and at most the paper's size."""
+    each = pixels // len(scene.train)
+    camera = Camera(torch.eye(4), torch.eye(3), 1000, each // 1000) if each >= 1000 else scene.train[0].camera
+    views = [dataclasses.replace(view, camera=camera) for view in scene.train]
+    sized = dataclasses.replace(scene, train=views)
+    shape = texture_shape(sized, small(texture=TextureConfig(max_resolution=64.0)))
+    assert shape["table_size"] == 2**power
+    assert texture_shape(sized, small())["table_size"] == TEXTURE.table_size
 
 
 def test_given_resolutions_are_kept(scene):

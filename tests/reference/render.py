@@ -69,8 +69,12 @@ def render(
     sh_degree: int = 3,
     low_pass: bool = False,
     clamp_texture: bool = False,
+    shares: torch.Tensor | None = None,
 ) -> Rendering:
-    """Render; differentiable with respect to every float tensor, those of `texture` included."""
+    """Render; differentiable with respect to every float tensor, those of `texture` included.
+
+    `shares` (H, W, K), a constant: depth at which each hit's texture is looked up, over the hit's own.
+    """
     rotation = viewmat[:3, :3]
     position = -rotation.T @ viewmat[:3, 3]
     colors = plain_colors(sh, means, position, sh_degree)
@@ -87,7 +91,8 @@ def render(
         rays = camera_rays(pixel_centers(width, height, means), fx, fy, cx, cy) @ rotation
         rays = rays.reshape(height, width, 1, 3).expand(-1, -1, max_hits, -1)[filled]
         depths = hits.depths[filled]
-        coefficients = field(texture, position + depths[:, None] * rays, depths, (fx * fy) ** 0.5)
+        looked_up = depths if shares is None else depths * shares[filled]
+        coefficients = field(texture, position + looked_up[:, None] * rays, depths, (fx * fy) ** 0.5)
         directions = rays / rays.norm(dim=-1, keepdim=True)
         values = evaluate(coefficients, directions, sh_degree)
         values = values + (colors[hits.ids[filled]] if texture.residual else 0.5)
