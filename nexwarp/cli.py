@@ -67,6 +67,7 @@ DEMO_SETTINGS: dict[str, Any] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
+    "depth_jitter": 0.5,
     "texture.levels": 12,
     "texture.table_size": 2**15,
     "texture.width": 32,

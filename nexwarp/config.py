@@ -108,7 +108,7 @@ class Config:
     """Largest shift, in shares of the frame, of steps that look beyond it, where the photo's edge goes on; 0: none."""
     border_every: int = 4
     """Every how many steps that is."""
-    depth_jitter: float = 2.0
+    depth_jitter: float = 1.0
     """Random shifts, along their rays, of where a step looks its texture up: standard deviation in pixels there."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
