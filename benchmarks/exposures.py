@@ -7,6 +7,7 @@ with the gains that the test photos have when they are estimated together with t
 looked at). On a CPU; nothing is trained.
 """
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -19,11 +20,12 @@ from nexwarp.data import View, load_scene
 from nexwarp.exposures import Exposures, photo_gains
 
 
-def gains_of(views: list[View]) -> torch.Tensor:
-    """Log gains (V, 3) of photos, mean 0."""
+def gains_of(views: list[View]) -> tuple[torch.Tensor, tuple[float, float, float]]:
+    """Log gains (V, 3) of photos, mean 0, and the falloff of their lens."""
     points = [torch.zeros(0, 3) if view.points is None else view.points for view in views]
     cameras, photos = [view.camera for view in views], [view.image for view in views]
-    return torch.from_numpy(photo_gains(cameras, photos, points, [view.mask for view in views]))
+    log_gains, falloff = photo_gains(cameras, photos, points, [view.mask for view in views])
+    return torch.from_numpy(log_gains), falloff
 
 
 def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | float]:
@@ -31,15 +33,16 @@ def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | flo
 
     Returns:
         "spread": standard deviation of the log gains; "foretold": error of what the pose foretells; "ignored": that of
-        a gain of 1.
+        a gain of 1; "edge": what the lens leaves of the light at the farthest point from its axis.
     """
-    mine, all_together = gains_of(train), gains_of([*train, *test])
+    (mine, falloff), (all_together, _) = gains_of(train), gains_of([*train, *test])
     # Both have the mean 0 of their own photos.
     own = all_together[len(train) :] - (all_together[: len(train)] - mine).mean(0)
     exposures = Exposures.of(mine, [view.camera for view in train])
     foretold = torch.stack([exposures.gains(view.camera).double().log() for view in test])
     rms = {"foretold": foretold - own, "ignored": own}
-    return {"spread": mine.std(0), **{name: x.square().mean().sqrt().item() for name, x in rms.items()}}
+    errors = {name: x.square().mean().sqrt().item() for name, x in rms.items()}
+    return {"spread": mine.std(0), "edge": math.exp(falloff[0] + falloff[1]), **errors}
 
 
 def main(scenes: Annotated[tuple[str, ...], tyro.conf.Positional], data: Path = ROOT.parent / "shared" / "data") -> int:
@@ -49,13 +52,16 @@ def main(scenes: Annotated[tuple[str, ...], tyro.conf.Positional], data: Path = 
         scenes: folders of scenes, or names of those in --data.
         data: folder of scenes.
     """
-    print("| scene | spread of the gains: red, green, blue | error of test views: foretold | left at 1 |")
-    print("|---|---|---|---|")
+    print(
+        "| scene | spread of the gains: red, green, blue | error of test views: foretold | left at 1 | light at edge |"
+    )
+    print("|---|---|---|---|---|")
     for name in scenes:
         scene = load_scene(name if Path(name).exists() else data / name)
         found = compare(scene.train, scene.test)
         spread = ", ".join(f"{100 * x:.1f}" for x in found["spread"].tolist())
-        print(f"| {Path(name).name} | {spread} % | {100 * found['foretold']:.1f} % | {100 * found['ignored']:.1f} % |")
+        errors = " | ".join(f"{100 * found[key]:.1f} %" for key in ("foretold", "ignored", "edge"))
+        print(f"| {Path(name).name} | {spread} % | {errors} |")
     return 0
 
 

@@ -538,8 +538,9 @@ def _exposures(model: Model) -> str:
     """How far the photos that a model was learned from differ."""
     if model.surfels.exposures is None:
         return "one for all photos"
-    gains = model.surfels.exposures.log_gains.exp()
-    return f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean"
+    exposures = model.surfels.exposures
+    gains, corner = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
+    return f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean, {corner:.2f} at the edge"
 
 
 def _name(device: torch.device) -> str:

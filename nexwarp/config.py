@@ -101,7 +101,7 @@ class Config:
     footprints: bool = True
     """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
     exposures: bool = True
-    """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
+    """Learn the scene at the photos' mean exposure, gains and vignetting taken out; renderings get what is around."""
     mask_mode: str = "ignore"
     """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08

@@ -1,8 +1,9 @@
 """Exposures: how bright each training photo is, a gain a channel, and what a camera between them would take.
 
-Phones and cameras set their exposure and white balance anew for every photo. A model that has to explain the
-differences by its surfels learns what no other view agrees with; here it learns the scene as at the mean exposure, and
-a rendering takes the gains of the photos around it.
+Phones and cameras set their exposure and white balance anew for every photo, and lenses darken the corners
+(vignetting). A model that has to explain the differences by its surfels learns what no other view agrees with; here it
+learns the scene as at the mean exposure and through an even lens, and a rendering takes the gains of the photos around
+it and the falloff of the lens.
 """
 
 from collections.abc import Sequence
@@ -19,8 +20,11 @@ CLIPPED = (8, 247)
 ROUNDS = 6  # of reweighted least squares
 NOISE = 0.05  # of log colours: larger differences count as outliers
 PRIOR = 0.1  # observations that speak for a gain of 1
+EVEN_PRIOR = 1.0  # observations that speak for an even lens
+FURTHER = 1.3  # how much farther from its axis than points were seen, in squared tangents, a lens is known
 DECIMALS = 6  # of log gains: the solver's rounding must not make a run another one
 MOST_PHOTOS = 1000  # that renderings take their gains from
+EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without any
 LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # of the kernel, over the spread of the cameras
 NOISES = (1e-3, 1e-2, 1e-1)  # variance of a photo's own deviation, over that of the process
 
@@ -30,7 +34,8 @@ class Exposures(nn.Module):
 
     Buffers: `log_gains` (V, 3); `positions` (V, 3) of the cameras, world units; `directions` (V, 3) unit, where they
     look; `coefficients` (V, 3) and `mean` (3,) of the process; `lengths` (2,) world units: what a direction's change by
-    1 counts, and the kernel's length.
+    1 counts, and the kernel's length; `falloff` (3,): a, b and the largest T > 0 of the lens, which leaves
+    exp(a t + b t^2) of the light, where t = min(tan^2 / T, 1) and tan that of the angle to the optical axis.
     """
 
     def __init__(
@@ -41,8 +46,11 @@ class Exposures(nn.Module):
         coefficients: torch.Tensor,
         mean: torch.Tensor,
         lengths: torch.Tensor,
+        falloff: torch.Tensor | None = None,
     ) -> None:
         super().__init__()
+        if falloff is None:  # as in files from before there was one
+            falloff = lengths.new_tensor(EVEN)
         shapes = {
             "log_gains": (log_gains, ("V", 3)),
             "positions": (positions, ("V", 3)),
@@ -50,15 +58,24 @@ class Exposures(nn.Module):
             "coefficients": (coefficients, ("V", 3)),
             "mean": (mean, (3,)),
             "lengths": (lengths, (2,)),
+            "falloff": (falloff, (3,)),
         }
         check_tensors(shapes)
         # Not persistent: they go with the surfels to another device, but are no part of their state.
         for name, (tensor, _) in shapes.items():
             self.register_buffer(name, tensor, persistent=False)
+        # Numbers, so that nobody has to wait for a GPU to know them.
+        self._lens = tuple(falloff.tolist())
+        if not self._lens[2] > 0:
+            raise ValueError(f"falloff: expected a largest squared tangent > 0, got {self._lens[2]:g}")
 
     @classmethod
-    def of(cls, log_gains: torch.Tensor, cameras: Sequence[Camera]) -> "Exposures":
+    def of(
+        cls, log_gains: torch.Tensor, cameras: Sequence[Camera], falloff: Sequence[float] | None = None
+    ) -> "Exposures":
         """Exposures of photos with log gains (V, 3) that these V cameras took, V >= 1; float32 on the CPU.
+
+        `falloff` (3,) is the lens's, None is an even one.
 
         How far gains reach and how exact they are is what would have foretold each photo best from the others.
         """
@@ -71,7 +88,7 @@ class Exposures(nn.Module):
         fits = [(*_fit(squares, gains, length * size, noise), length * size) for length in LENGTHS for noise in NOISES]
         _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
-        return cls(*(x.float() for x in tensors))
+        return cls(*(x.float() for x in tensors), torch.tensor([float(x) for x in falloff or EVEN]))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Its buffers by name; `Exposures(**tensors)` makes it again."""
@@ -85,6 +102,23 @@ class Exposures(nn.Module):
         squares = (self.positions - position).square().sum(1) + turned.square().sum(1)
         found = self.mean + _matern(squares, self.lengths[1]) @ self.coefficients
         return found.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
+
+    @torch.no_grad()
+    def factors(self, camera: Camera) -> torch.Tensor:
+        """What the colours (H, W, 3) of a rendering are times: (H, W, 3), or (3,) where the lens is even."""
+        gains, light = self.gains(camera), self.falloff_of(camera)
+        return gains if light is None else light * gains
+
+    @torch.no_grad()
+    def falloff_of(self, camera: Camera) -> torch.Tensor | None:
+        """What the lens leaves of the light at each pixel, (H, W, 1); None where it leaves all of it."""
+        a, b, largest = self._lens
+        if a == b == 0:
+            return None
+        x = (torch.arange(camera.width, device=self.falloff.device) + 0.5 - camera.cx) / camera.fx
+        y = (torch.arange(camera.height, device=self.falloff.device) + 0.5 - camera.cy) / camera.fy
+        t = ((x**2 + (y**2)[:, None]) / largest).clamp(max=1.0)
+        return (t * (a + b * t)).exp()[..., None]
 
 
 def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
@@ -109,11 +143,12 @@ def photo_gains(
     photos: Sequence[torch.Tensor],
     points: Sequence[torch.Tensor],
     masks: Sequence[torch.Tensor | None] | None = None,
-) -> np.ndarray:
-    """Estimate log gains (V, 3) float64, mean 0, of photos from the sparse points that they share.
+) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Estimate log gains (V, 3) float64, mean 0, of photos, and the falloff of their lens, from points that they share.
 
-    A point's colour in a photo is its own times the photo's gain. Least squares over the logarithms, reweighted so that
-    highlights and occluders do not count; a photo with few points stays near the mean.
+    A point's colour in a photo is its own times the photo's gain times what the lens leaves of the light there, one
+    function of the angle to the axis for all photos (`Exposures`). Least squares over the logarithms, reweighted so
+    that highlights and occluders do not count; a photo with few points stays near the mean, and so does the lens.
 
     Args:
         cameras: of the V photos.
@@ -121,12 +156,38 @@ def photo_gains(
         points: (M, 3) each, world positions that were triangulated from the photo; the same point has the same bits.
         masks: (H, W) bool each, True where the photo counts; None where all of it does.
     """
-    from scipy.sparse import coo_array, csc_array, diags_array, eye_array
-    from scipy.sparse.linalg import spsolve
-
     count = len(cameras)
-    views, places, colors = [], [], []
-    masks = [None] * count if masks is None else masks
+    view, point, color, squares = _observations(cameras, photos, points, masks)
+    gains = np.zeros((count, 3))
+    if len(view) == 0:
+        return gains, EVEN
+    largest = max(min(FURTHER * float(squares.max()), max(_corner(camera) for camera in cameras)), 10.0**-DECIMALS)
+    largest = round(largest, DECIMALS)
+    t = squares / largest
+    powers = np.stack([t, t**2], axis=1)
+    lens = np.zeros(2)
+    weights = np.ones(color.shape)
+    for _ in range(ROUNDS):
+        observed = color - (powers @ lens)[:, None]
+        for channel in range(3):
+            gains[:, channel] = _solve_gains(view, point, observed[:, channel], weights[:, channel], count)
+        lens = _solve_lens(point, powers, color - gains[view], weights)
+        left = color - gains[view] - (powers @ lens)[:, None]
+        left -= _means(point, left, weights)
+        weights = 1 / (1 + (left / NOISE) ** 2)
+    a, b = lens.round(DECIMALS).tolist()
+    return gains.round(DECIMALS), (a, b, largest)
+
+
+def _observations(
+    cameras: Sequence[Camera],
+    photos: Sequence[torch.Tensor],
+    points: Sequence[torch.Tensor],
+    masks: Sequence[torch.Tensor | None] | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Who sees what how: indices of photo and point (M,), log colours (M, 3), squared tangents to the axis (M,)."""
+    views, places, colors, squares = [], [], [], []
+    masks = [None] * len(cameras) if masks is None else masks
     for index, (camera, photo, seen, mask) in enumerate(zip(cameras, photos, points, masks, strict=True)):
         pixels, depths = camera.project(seen)
         inside = (depths > 0) & (pixels >= 0).all(1)
@@ -136,30 +197,52 @@ def photo_gains(
         usable = (color >= CLIPPED[0]).all(1) & (color <= CLIPPED[1]).all(1)
         if mask is not None:
             usable &= mask[row, column]
+        x, y = pixels[inside][usable].double().unbind(1)
+        squares.append((((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2).numpy())
         colors.append(color[usable].double().div(255).log().numpy())
         places.append(seen[inside][usable].numpy())
         views.append(np.full(len(colors[-1]), index))
-    view, color = np.concatenate(views), np.concatenate(colors)
-    gains = np.zeros((count, 3))
-    if len(view) == 0:
-        return gains
     _, point = np.unique(np.concatenate(places), axis=0, return_inverse=True)
-    point = point.reshape(-1)
-    weights = np.ones(color.shape)
-    for _ in range(ROUNDS):
-        for channel in range(3):
-            # The points' own colours, eliminated, leave a Laplacian of the photos.
-            w, observed = weights[:, channel], color[:, channel]
-            totals = 1 / np.bincount(point, w).clip(1e-9)
-            shared = coo_array((w, (view, point)), shape=(count, len(totals))).tocsr()
-            normal = diags_array(np.bincount(view, w, count)) - shared @ diags_array(totals) @ shared.T
-            right = np.bincount(view, w * observed, count) - shared @ (totals * np.bincount(point, w * observed))
-            found = spsolve(csc_array(normal + PRIOR * eye_array(count)), right)
-            gains[:, channel] = found - found.mean()
-            plain = totals * np.bincount(point, w * (observed - gains[view, channel]))
-            left = observed - gains[view, channel] - plain[point]
-            weights[:, channel] = 1 / (1 + (left / NOISE) ** 2)
-    return gains.round(DECIMALS)
+    return np.concatenate(views), point.reshape(-1), np.concatenate(colors), np.concatenate(squares)
+
+
+def _corner(camera: Camera) -> float:
+    """Squared tangent between the optical axis and the farthest corner of the image."""
+    x, y = max(camera.cx, camera.width - camera.cx) / camera.fx, max(camera.cy, camera.height - camera.cy) / camera.fy
+    return x**2 + y**2
+
+
+def _solve_gains(view: np.ndarray, point: np.ndarray, observed: np.ndarray, w: np.ndarray, count: int) -> np.ndarray:
+    """Log gains (V,), mean 0, of one channel, by least squares with weights (M,)."""
+    from scipy.sparse import coo_array, csc_array, diags_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    # The points' own colours, eliminated, leave a Laplacian of the photos.
+    totals = 1 / np.bincount(point, w).clip(1e-9)
+    shared = coo_array((w, (view, point)), shape=(count, len(totals))).tocsr()
+    normal = diags_array(np.bincount(view, w, count)) - shared @ diags_array(totals) @ shared.T
+    right = np.bincount(view, w * observed, count) - shared @ (totals * np.bincount(point, w * observed))
+    found = spsolve(csc_array(normal + PRIOR * eye_array(count)), right)
+    return found - found.mean()
+
+
+def _solve_lens(point: np.ndarray, powers: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Factors (2,) of the lens's powers (M, 2) in log colours (M, 3) without gains, by weighted least squares."""
+    normal, right = EVEN_PRIOR * np.eye(2), np.zeros(2)
+    for channel in range(3):
+        w = weights[:, channel : channel + 1].repeat(2, axis=1)
+        apart = powers - _means(point, powers, w)
+        normal += apart.T @ (w * apart)
+        right += apart.T @ (w[:, 0] * observed[:, channel])
+    return np.linalg.solve(normal, right)
+
+
+def _means(point: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """For each of values (M, C) the weighted mean over those of its point."""
+    means = [
+        np.bincount(point, w * x) / np.bincount(point, w).clip(1e-9) for x, w in zip(values.T, weights.T, strict=True)
+    ]
+    return np.stack(means, axis=1)[point]
 
 
 def _poses(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

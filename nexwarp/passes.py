@@ -41,7 +41,7 @@ class Buffers:
         normal: (H, W, 3) unit normal of the heaviest hit's surfel, world frame, on the side that faces the camera;
             0 where nothing is hit.
         camera: what was looked through.
-        background: (3,) colour behind everything.
+        background: (3,) colour behind everything; (H, W, 3) where a lens darkens it towards the corners.
     """
 
     image: torch.Tensor
@@ -80,8 +80,8 @@ def render_buffers(
     background = torch.as_tensor(background).to(out.image).expand(3).clone()
     colors = _slot_colors(surfels, texture, camera, out.ids, out.depths, sh_degree, clamp_texture)
     if surfels.exposures is not None:
-        gains = surfels.exposures.gains(camera).to(out.image)
-        background, colors = background * gains, colors * gains
+        factors = surfels.exposures.factors(camera).to(out.image)
+        background, colors = background * factors, colors * (factors if factors.ndim == 1 else factors[:, :, None])
     return Buffers(
         **{name: getattr(out, name) for name in ("image", "plain", "textured", "alpha", "ids", "depths", "weights")},
         colors=colors,
@@ -98,7 +98,8 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
 
     Parts: `image`, `plain`, `textured`, `normal`, `colors.0` to `colors.K-1` (channels R, G, B); `alpha`,
     `expected_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty slots). Camera,
-    background and K are in the text attribute `nexwarp`, as JSON.
+    background and K are in the text attribute `nexwarp`, as JSON; a background of one colour a pixel is a part
+    `background` (R, G, B), and null there.
 
     Raises:
         TypeError: buffers that are not float32; OSError: `path` cannot be written.
@@ -110,11 +111,13 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
             parts |= {f"{field.name}.{k}": value[:, :, k] for k in range(value.shape[2])}
         elif field.name not in ("camera", "background"):
             parts[field.name] = value
-    camera = buffers.camera
+    camera, background = buffers.camera, buffers.background
+    if background.ndim > 1:
+        parts["background"] = background
     metadata = {
         "format": FORMAT,
         "max_hits": buffers.ids.shape[2],
-        "background": buffers.background.tolist(),
+        "background": None if background.ndim > 1 else background.tolist(),
         "camera": {
             "viewmat": camera.viewmat.tolist(),
             "K": camera.K.tolist(),
@@ -151,7 +154,8 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
             else:
                 shape = (camera.height, camera.width, 0, *((3,) if name == "colors" else ()))
                 found[name] = torch.empty(shape, dtype=torch.int32 if name == "ids" else torch.float32)
-        background = torch.tensor(metadata["background"], dtype=torch.float32)
+        color = metadata["background"]
+        background = parts["background"] if color is None else torch.tensor(color, dtype=torch.float32)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: expected the passes of a nexwarp rendering ({error})") from None
     return Buffers(**found, camera=camera, background=background)

@@ -84,7 +84,7 @@ def render(
     """Render surfels as a camera sees them.
 
     Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`. With
-    `surfels.exposures`, all colours, the background's too, are times the gains there, which count as constants.
+    `surfels.exposures`, all colours, the background's too, are times the gains and the lens's falloff there, constants.
 
     Args:
         surfels: the N surfels, N may be 0.
@@ -124,8 +124,8 @@ def render(
     plain = hits.plain
     image, textured = ops.compose(plain, texels, weights, hits.alpha, background, base)
     if surfels.exposures is not None:
-        gains = surfels.exposures.gains(camera).to(image)
-        image, plain, textured = image * gains, plain * gains, textured * gains
+        factors = surfels.exposures.factors(camera).to(image)
+        image, plain, textured = image * factors, plain * factors, textured * factors
     passes = Passes(projection, tiles, hits, pinhole, low_pass)
     rendering = Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.

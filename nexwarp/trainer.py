@@ -85,7 +85,7 @@ class Trainer:
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor] | None] = {}
         self.exposures = _exposures(scene, config)
         gains = None if self.exposures is None else self.exposures.log_gains.exp()
-        self.views = TrainingViews(scene.train, self.device, gains)
+        self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
@@ -535,8 +535,8 @@ def _exposures(scene: Scene, config: Config) -> Exposures | None:
         return None
     cameras = [view.camera for view in scene.train]
     photos, masks = [view.image for view in scene.train], [view.mask for view in scene.train]
-    log_gains = photo_gains(cameras, photos, seen, masks)
-    return Exposures.of(torch.from_numpy(log_gains), cameras)
+    log_gains, falloff = photo_gains(cameras, photos, seen, masks)
+    return Exposures.of(torch.from_numpy(log_gains), cameras, falloff)
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

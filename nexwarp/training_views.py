@@ -1,5 +1,6 @@
 """The photos that training looks at, on the device that it runs on."""
 
+import copy
 import hashlib
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -8,9 +9,11 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.data import View
+from nexwarp.exposures import Exposures
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
+MOST_FALLOFFS = 16  # of different cameras, to be kept
 AHEAD = 2  # photos to fetch meanwhile where they do not
 
 
@@ -21,10 +24,18 @@ class TrainingViews:
     next are copied while a step runs: by a thread into pinned memory, and from there on a stream of their own.
     """
 
-    def __init__(self, views: list[View], device: torch.device, gains: torch.Tensor | None = None) -> None:
-        """Take the views to a device; their photos, as `get` gives them, are over `gains` (V, 3)."""
+    def __init__(
+        self,
+        views: list[View],
+        device: torch.device,
+        gains: torch.Tensor | None = None,
+        lens: Exposures | None = None,
+    ) -> None:
+        """Take the views to a device; their photos, as `get` gives them, are over `gains` (V, 3) and the falloff."""
         self.device = device
         self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
+        self.lens = None if lens is None else copy.deepcopy(lens).to(device)
+        self.falloffs: dict[tuple, torch.Tensor | None] = {}
         self.names = [view.name for view in views]
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
@@ -60,7 +71,11 @@ class TrainingViews:
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
         scale = self.scales if isinstance(self.scales, float) else self.scales[index]
-        return self._camera(index, factor), self._reduce(photo.float() / scale, index, factor)
+        photo = photo.float() / scale
+        falloff = self._falloff(self.cameras[index])
+        if falloff is not None:
+            photo /= falloff
+        return self._camera(index, factor), self._reduce(photo, index, factor)
 
     def mask(self, index: int, factor: int) -> torch.Tensor | None:
         """Mask (H, W) bool of the photo that `get` gives: a reduced pixel counts where all of its pixels do."""
@@ -78,6 +93,17 @@ class TrainingViews:
         return self._reduce(alpha.to(self.device, non_blocking=True).float()[:, :, None] / 255.0, index, factor)[
             :, :, 0
         ]
+
+    def _falloff(self, camera: Camera) -> torch.Tensor | None:
+        """What the lens leaves of the light in a camera's photo, (H, W, 1); None where it leaves all of it."""
+        if self.lens is None:
+            return None
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        if key not in self.falloffs:
+            if len(self.falloffs) >= MOST_FALLOFFS:
+                self.falloffs.clear()
+            self.falloffs[key] = self.lens.falloff_of(camera)
+        return self.falloffs[key]
 
     def _on_device(self, index: int) -> torch.Tensor:
         coming = self.coming.pop(index, None)

@@ -121,13 +121,23 @@ def test_footprints_come_back_exactly(tmp_path):
 def test_exposures_come_back_exactly(tmp_path):
     model = make_model()
     assert nw.load(save_model(tmp_path, model)).surfels.exposures is None
-    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2))
+    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2), torch.rand(3))
     loaded = nw.load(save_model(tmp_path, model))
     for name, value in model.surfels.exposures.tensors().items():
         assert torch.equal(loaded.surfels.exposures.tensors()[name], value), name
     assert loaded.surfels.to(torch.float64).exposures.lengths.dtype == torch.float64
     model.surfels.exposures.positions = torch.rand(4, 3)
     with pytest.raises(ValueError, match=r"the tensors do not make a model \(positions: expected shape"):
+        nw.load(save_model(tmp_path, model))
+
+
+@pytest.mark.parametrize("largest", [0.0, -1.0, float("nan")])
+def test_a_falloff_that_cannot_be_is_refused(tmp_path, largest):
+    model = make_model()
+    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2))
+    assert model.surfels.exposures.falloff.tolist() == [0.0, 0.0, 1.0]  # as in files from before there was one
+    model.surfels.exposures.falloff = torch.tensor([0.1, 0.1, largest])
+    with pytest.raises(ValueError, match=r"\(falloff: expected a largest squared tangent > 0, got "):
         nw.load(save_model(tmp_path, model))
 
 

@@ -316,7 +316,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         model.surfels.log_scales += 0.7
         model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
         model.surfels.exposures = Exposures.of(
-            torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others
+            torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others, (-0.3, -0.4, 0.15)
         )
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)

@@ -12,9 +12,9 @@ from nexwarp.camera import Camera
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import View, write_demo
 from nexwarp.evaluate import evaluate
-from nexwarp.exposures import Exposures, photo_gains
+from nexwarp.exposures import EVEN, Exposures, photo_gains
 from nexwarp.metrics import to_uint8
-from nexwarp.passes import render_buffers
+from nexwarp.passes import load_buffers, render_buffers, save_buffers
 from nexwarp.trainer import Trainer
 from nexwarp.training_views import TrainingViews
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -32,8 +32,17 @@ def looking(x: float, turn: float = 0.0) -> Camera:
     return Camera(viewmat, K, 64, 48)
 
 
-def photographs(log_gains: torch.Tensor, outliers: float = 0.0) -> tuple[list, list, list]:
-    """Photos of coloured points, each a pixel, with gains; some pixels are of something else."""
+def light(camera: Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> torch.Tensor:
+    """What a lens leaves of the light at pixel coordinates (N, 2), its powers being of tan^2."""
+    tangents = (pixels - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
+    t = tangents.square().sum(1, keepdim=True)
+    return (lens[0] * t + lens[1] * t**2).exp()
+
+
+def photographs(
+    log_gains: torch.Tensor, outliers: float = 0.0, lens: tuple[float, float] = (0.0, 0.0)
+) -> tuple[list, list, list]:
+    """Photos of coloured points, each a pixel, with gains, through a lens; some pixels are of something else."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(900, 3, generator=generator) * torch.tensor([3.0, 1.6, 1.0]) + torch.tensor([-1.5, -0.8, 2.2])
     colors = 0.2 + 0.4 * torch.rand(900, 3, generator=generator)
@@ -47,7 +56,7 @@ def photographs(log_gains: torch.Tensor, outliers: float = 0.0) -> tuple[list, l
         _, first = np.unique((row * 64 + column).numpy(), return_index=True)
         kept = inside.nonzero()[:, 0][torch.from_numpy(first)]
         photo = torch.zeros(48, 64, 3, dtype=torch.uint8)
-        color = colors[kept] * gains
+        color = colors[kept] * gains * light(camera, pixels[kept], lens)
         wrong = torch.rand(len(kept), generator=generator) < outliers
         color[wrong] = torch.rand(int(wrong.sum()), 3, generator=generator)
         photo[row[torch.from_numpy(first)], column[torch.from_numpy(first)]] = to_uint8(color[None])[0]
@@ -59,28 +68,64 @@ def test_gains_are_found_up_to_their_mean():
     expected = 0.3 * torch.randn(7, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
     expected -= expected.mean(0)
     for outliers, bound in ((0.0, 0.01), (0.2, 0.02)):
-        found = photo_gains(*photographs(expected, outliers))
+        found, falloff = photo_gains(*photographs(expected, outliers))
+        assert abs(falloff[0]) + abs(falloff[1]) < 0.03  # the lens is even
         assert abs(found.mean(0)).max() < 1e-6
         assert abs(found - expected.numpy()).max() < bound
 
 
 def test_gains_do_not_depend_on_the_order_of_photos_or_points():
     cameras, photos, points = photographs(torch.tensor([[0.2, 0.1, 0.0], [-0.3, 0.0, 0.1], [0.1, -0.1, -0.1]]))
-    found = photo_gains(cameras, photos, points)
+    found, falloff = photo_gains(cameras, photos, points)
     order = [2, 0, 1]
     shuffled = [points[i].flip(0) for i in order]
-    again = photo_gains([cameras[i] for i in order], [photos[i] for i in order], shuffled)
+    again, same = photo_gains([cameras[i] for i in order], [photos[i] for i in order], shuffled)
     np.testing.assert_allclose(again, found[order], atol=2e-6)
+    np.testing.assert_allclose(same, falloff, atol=2e-6)
+
+
+@pytest.mark.parametrize("lens", [(-0.5, 0.0), (-0.1, -1.0), (0.3, -1.8)])
+def test_the_falloff_of_the_lens_is_found(lens):
+    """With gains and outliers beside it; as a function, since its two powers are alike."""
+    gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    gains -= gains.mean(0)
+    cameras, photos, points = photographs(gains, 0.1, lens)
+    found, falloff = photo_gains(cameras, photos, points)
+    assert abs(found - gains.numpy()).max() < 0.03
+    camera = cameras[0]
+    exposures = Exposures.of(torch.from_numpy(found), cameras, falloff)
+    row, column = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
+    assert expected.min() < 0.85
+    assert (exposures.falloff_of(camera) / expected - 1).abs().max() < 0.01
+
+
+def test_the_falloff_is_the_angle_s():
+    """A window sees what the whole does there, and so does a camera of twice the pixels; beyond all points it ends."""
+    cameras = [looking(0.0), looking(1.0)]
+    exposures = Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.25))
+    whole = exposures.falloff_of(cameras[0])
+    assert whole.shape == (48, 64, 1) and whole.max() > 0.999
+    torch.testing.assert_close(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30)), whole[5:35, 10:30])
+    K2 = K * torch.tensor([[3.0], [3.0], [1.0]])
+    fine = exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144))
+    torch.testing.assert_close(fine[1::3, 1::3], whole)
+    wide = exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000))
+    assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
+    assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
+    with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
+        Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
 
 
 def test_photos_that_share_nothing_keep_their_colours():
     cameras, photos, points = photographs(torch.tensor([[0.2] * 3, [-0.2] * 3]))
     nothing = [points[0][:0]] * 2
-    assert (photo_gains(cameras, photos, nothing) == 0).all()
+    found, falloff = photo_gains(cameras, photos, nothing)
+    assert (found == 0).all() and falloff == EVEN
     apart = [points[0][:100], points[1] + 1e-3]  # no point twice
-    assert abs(photo_gains(cameras, photos, apart)).max() < 1e-6
+    assert abs(photo_gains(cameras, photos, apart)[0]).max() < 1e-6
     white = [torch.full_like(photo, 255) for photo in photos]
-    assert (photo_gains(cameras, white, points) == 0).all()
+    assert (photo_gains(cameras, white, points)[0] == 0).all()
 
 
 def test_what_masks_leave_out_tells_nothing():
@@ -89,8 +134,8 @@ def test_what_masks_leave_out_tells_nothing():
     shade = torch.ones(48, 64, dtype=torch.bool)
     shade[4:44, 4:60] = False
     photos[1] = torch.where(shade[..., None], photos[1], photos[1] // 2)
-    assert abs(photo_gains(cameras, photos, points)).max() > 0.1
-    assert abs(photo_gains(cameras, photos, points, [None, shade, None, None])).max() < 0.01
+    assert abs(photo_gains(cameras, photos, points)[0]).max() > 0.1
+    assert abs(photo_gains(cameras, photos, points, [None, shade, None, None])[0]).max() < 0.01
 
 
 def test_a_camera_gets_the_gains_around_it():
@@ -156,20 +201,25 @@ def test_gains_follow_a_scene_that_is_moved_and_scaled():
     torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
 
 
-def test_a_rendering_is_times_its_gains(device: torch.device):
+@pytest.mark.parametrize("falloff", [None, (-0.3, -0.2, 0.4)])
+def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff):
     scene = random_scene(40, device=device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     options = {"max_hits": 2, "background": (0.2, 0.5, 0.9)}
     plain = nw.render(surfels, texture, camera, **options)
     cameras = [camera, Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
-    surfels.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras).to(device)
+    surfels.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
     gains = surfels.exposures.gains(camera)
+    if falloff is not None:
+        gains = gains * surfels.exposures.falloff_of(camera)
+        assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
     out = nw.render(surfels, texture, camera, **options)
     for name in ("image", "plain", "textured"):
         assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
     for name in ("alpha", "weights", "depths"):
         assert torch.equal(getattr(out, name), getattr(plain, name))
-    buffers = render_buffers(surfels, texture, camera, **options)
+    save_buffers(tmp_path / "a.exr", render_buffers(surfels, texture, camera, **options))
+    buffers = load_buffers(tmp_path / "a.exr")
     assert_close(buffers.image, out.image, kind="value", name="image of the buffers")
     total = buffers.plain + buffers.textured + (1 - buffers.alpha)[..., None] * buffers.background
     assert_close(total, buffers.image, kind="value", name="sum")
@@ -185,6 +235,12 @@ def test_photos_are_brought_to_one_exposure():
     mine = TrainingViews(views, torch.device("cpu"), gains)
     torch.testing.assert_close(mine.get(0, 1)[1], image / 255.0 / gains[0])
     torch.testing.assert_close(mine.get(1, 1)[1], image / 255.0)
+    lens = Exposures.of(gains.log(), [camera, camera], (-0.3, -0.2, 0.4))
+    even = TrainingViews(views, torch.device("cpu"), gains, lens)
+    expected = image / 255.0 / gains[0] / lens.falloff_of(camera)
+    torch.testing.assert_close(even.get(0, 1)[1], expected)
+    halves = expected.view(24, 2, 32, 2, 3).mean((1, 3))
+    torch.testing.assert_close(even.get(0, 2)[1], halves)
 
 
 def test_training_takes_exposures_out(tmp_path):
@@ -238,3 +294,4 @@ def test_the_benchmark_tells_spread_and_errors():
     expected = (course[2::4] - kept.mean(0)).square().mean().sqrt().item()
     assert found["ignored"] == pytest.approx(expected, abs=0.01)
     assert found["foretold"] < 0.2 * found["ignored"]
+    assert found["edge"] == pytest.approx(1.0, abs=0.03)

@@ -75,10 +75,11 @@ def test_colour_modes_are_the_buffers(model, camera, mode):
     np.testing.assert_array_equal(picture.pixels, eight_bit(getattr(out, mode)))
 
 
-def test_colours_are_at_the_exposure_of_the_photos_or_the_mean(camera):
+@pytest.mark.parametrize("falloff", [None, (-0.2, -0.1, 0.3)])
+def test_colours_are_at_the_exposure_of_the_photos_or_the_mean(camera, falloff):
     surfels, texture = make_surfels(random_scene(60, width=64, height=48)), make_texture()
     mean = {mode: draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels for mode in MODES}
-    surfels.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera])
+    surfels.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera], falloff)
     for mode in MODES:
         exposed = draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels
         assert np.array_equal(exposed, mean[mode]) == (mode not in ("image", "plain", "textured")), mode

@@ -125,7 +125,7 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
         colours = getattr(out, mode)
         if surfels.exposures is None or settings.photo_exposure:
             return colours
-        return colours / surfels.exposures.gains(camera).to(colours)
+        return colours / surfels.exposures.factors(camera).to(colours)
     if mode == "alpha":
         return out.alpha
     if mode == "hit count":
