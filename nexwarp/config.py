@@ -101,7 +101,9 @@ class Config:
     footprints: bool = True
     """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
     exposures: bool = True
-    """Learn the scene at the photos' mean exposure, gains and vignetting taken out; renderings get what is around."""
+    """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
+    vignetting: bool = True
+    """With them, take the darkening of the lens towards the corners out, too."""
     mask_mode: str = "ignore"
     """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08
@@ -312,6 +314,7 @@ PRESETS: dict[str, Config] = {
         depth_jitter=0.0,
         footprints=False,
         exposures=False,
+        vignetting=False,
         clamp_image=True,
         filter_points=False,
         orient_points=False,

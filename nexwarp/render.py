@@ -80,6 +80,7 @@ def render(
     low_pass: bool = False,
     clamp_texture: bool = False,
     depth_jitter: float = 0.0,
+    generator: torch.Generator | None = None,
 ) -> Rendering:
     """Render surfels as a camera sees them.
 
@@ -95,8 +96,9 @@ def render(
         sh_degree: 0 to 3, limits the degree of both appearances.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
         clamp_texture: limit textured colours to >= 0; not for residual textures.
-        depth_jitter: for training: where the texture is looked up moves along the ray, at random by torch's generator,
-            with this standard deviation in units of depth / focal, a pixel's size there. The buffers' depths stay.
+        depth_jitter: for training: where the texture is looked up moves along the ray, at random, with this standard
+            deviation in units of depth / focal, a pixel's size there. The buffers' depths stay.
+        generator: of those random numbers, on the surfels' device; None is torch's own.
 
     Raises:
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
@@ -116,7 +118,8 @@ def render(
         weights = hits.weights
         looked_up = hits.depths
         if depth_jitter > 0:
-            looked_up = looked_up * torch.randn_like(looked_up).mul_(depth_jitter / camera.focal).add_(1)
+            noise = torch.randn(looked_up.shape, generator=generator, dtype=looked_up.dtype, device=looked_up.device)
+            looked_up = looked_up * noise.mul_(depth_jitter / camera.focal).add_(1)
         positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
         depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)

@@ -75,6 +75,7 @@ class Trainer:
         self.scene, self.config, self.device = scene, config, torch.device(device)
         _seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
+        self.noise = torch.Generator(self.device).manual_seed(config.seed)
         self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.optimizer = _make_optimizer(self.surfels, self.texture, config, scene.scale)
@@ -225,7 +226,8 @@ class Trainer:
         self._schedule_rates()
         if config.border > 0 and self.iteration % config.border_every == 0:
             view = self._beyond_the_frame(view)
-        options = self.render_options() | {"background": view.background, "depth_jitter": config.depth_jitter}
+        options = self.render_options() | {"background": view.background}
+        options |= {"depth_jitter": config.depth_jitter, "generator": self.noise}
         out = render(self.surfels, self.texture if config.max_hits else None, view.camera, **options)
         losses = self._losses(out, view)
         watch = None
@@ -358,6 +360,7 @@ class Trainer:
                 tensors[f"adam.{name}.{key}"] = torch.as_tensor(value)
         tensors["densify.errors"] = self.densifier.errors
         tensors["rng.views"] = self.generator.get_state()
+        tensors["rng.noise"] = self.noise.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         if self.device.type == "cuda":
             tensors["rng.cuda"] = torch.cuda.get_rng_state(self.device)
@@ -439,6 +442,7 @@ class Trainer:
             raise ValueError(f"densify.errors: expected one for each of {len(self.surfels)} surfels")
         self.densifier.errors = tensors["densify.errors"].to(self.device)
         self.generator.set_state(tensors["rng.views"])
+        self.noise.set_state(tensors["rng.noise"])
         torch.set_rng_state(tensors["rng.torch"])
         if self.device.type == "cuda" and "rng.cuda" in tensors:
             torch.cuda.set_rng_state(tensors["rng.cuda"], self.device)
@@ -536,7 +540,7 @@ def _exposures(scene: Scene, config: Config) -> Exposures | None:
     cameras = [view.camera for view in scene.train]
     photos, masks = [view.image for view in scene.train], [view.mask for view in scene.train]
     log_gains, falloff = photo_gains(cameras, photos, seen, masks)
-    return Exposures.of(torch.from_numpy(log_gains), cameras, falloff)
+    return Exposures.of(torch.from_numpy(log_gains), cameras, falloff if config.vignetting else None)
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

@@ -43,6 +43,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "background": ("", "code"),
     "footprints": ("", ""),
     "exposures": ("", ""),
+    "vignetting": ("", ""),
     "mask_mode": ("", ""),
     "border": ("", ""),
     "border_every": ("", ""),

@@ -268,6 +268,31 @@ def test_training_takes_exposures_out(tmp_path):
     assert figures[True] > figures[False] + 0.5, figures
 
 
+def test_training_takes_vignetting_out(tmp_path):
+    """Photos through a lens that leaves 60 % of the light in the corners."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
+    cameras = [view.camera for view in scene.train]
+    corner = max(((c.width / 2 / c.fx) ** 2 + (c.height / 2 / c.fy) ** 2) for c in cameras)
+    lens = Exposures.of(torch.zeros(len(cameras), 3), cameras, (0.0, float(np.log(0.6)), corner))
+
+    def dark(views: list[View]) -> list[View]:
+        return [dataclasses.replace(v, image=to_uint8(v.image / 255 * lens.falloff_of(v.camera))) for v in views]
+
+    scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    figures = {}
+    for vignetting in (False, True):
+        config = Config(iterations=150, max_surfels=400, texture=texture, vignetting=vignetting)
+        trainer = Trainer(scene, config, "cpu")
+        trainer.run()
+        model = trainer.finish()
+        found = model.surfels.exposures.falloff_of(scene.test[0].camera)
+        assert (found is None) == (not vignetting)
+        figures[vignetting] = evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+    assert (found - lens.falloff_of(scene.test[0].camera)).abs().max() < 0.08
+    assert figures[True] > figures[False] + 0.2, figures
+
+
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
 def test_no_exposures_where_none_are_wanted(tmp_path, change):
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60))

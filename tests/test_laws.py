@@ -335,6 +335,8 @@ def test_jitter_moves_lookups_along_their_rays(
     assert not torch.equal(moved.textured, still.textured)
     torch.manual_seed(3)
     assert_same(draw(scene, texture, depth_jitter=jitter), moved)
+    own = [torch.Generator(device).manual_seed(3) for _ in range(2)]
+    assert_same(*(draw(scene, texture, depth_jitter=jitter, generator=generator) for generator in own))
     assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
 
 
