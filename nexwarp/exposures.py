@@ -26,6 +26,7 @@ DECIMALS = 6  # of log gains: the solver's rounding must not make a run another 
 MOST_PHOTOS = 1000  # that renderings take their gains from
 EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without any
 LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # of the kernel, over the spread of the cameras
+MOST_FALLOFFS = 16  # of different cameras, to be kept
 NOISES = (1e-3, 1e-2, 1e-1)  # variance of a photo's own deviation, over that of the process
 
 
@@ -66,6 +67,7 @@ class Exposures(nn.Module):
             self.register_buffer(name, tensor, persistent=False)
         # Numbers, so that nobody has to wait for a GPU to know them.
         self._lens = tuple(falloff.tolist())
+        self._falloffs: dict[tuple, torch.Tensor] = {}
         if not self._lens[2] > 0:
             raise ValueError(f"falloff: expected a largest squared tangent > 0, got {self._lens[2]:g}")
 
@@ -111,14 +113,21 @@ class Exposures(nn.Module):
 
     @torch.no_grad()
     def falloff_of(self, camera: Camera) -> torch.Tensor | None:
-        """What the lens leaves of the light at each pixel, (H, W, 1); None where it leaves all of it."""
+        """What the lens leaves of the light at each pixel, (H, W, 1), not to be written to; None where it is even."""
         a, b, largest = self._lens
         if a == b == 0:
             return None
-        x = (torch.arange(camera.width, device=self.falloff.device) + 0.5 - camera.cx) / camera.fx
-        y = (torch.arange(camera.height, device=self.falloff.device) + 0.5 - camera.cy) / camera.fy
-        t = ((x**2 + (y**2)[:, None]) / largest).clamp(max=1.0)
-        return (t * (a + b * t)).exp()[..., None]
+        device = self.falloff.device
+        key = (device, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        found = self._falloffs.get(key)
+        if found is None:
+            x = (torch.arange(camera.width, device=device) + 0.5 - camera.cx) / camera.fx
+            y = (torch.arange(camera.height, device=device) + 0.5 - camera.cy) / camera.fy
+            t = ((x**2 + (y**2)[:, None]) / largest).clamp(max=1.0)
+            if len(self._falloffs) >= MOST_FALLOFFS:
+                self._falloffs.clear()
+            found = self._falloffs[key] = (t * (a + b * t)).exp()[..., None]
+        return found
 
 
 def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:

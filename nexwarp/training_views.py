@@ -13,7 +13,6 @@ from nexwarp.exposures import Exposures
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
-MOST_FALLOFFS = 16  # of different cameras, to be kept
 AHEAD = 2  # photos to fetch meanwhile where they do not
 
 
@@ -35,7 +34,6 @@ class TrainingViews:
         self.device = device
         self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
         self.lens = None if lens is None else copy.deepcopy(lens).to(device)
-        self.falloffs: dict[tuple, torch.Tensor | None] = {}
         self.names = [view.name for view in views]
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
@@ -72,7 +70,7 @@ class TrainingViews:
         self._fetch(ahead[:AHEAD])
         scale = self.scales if isinstance(self.scales, float) else self.scales[index]
         photo = photo.float() / scale
-        falloff = self._falloff(self.cameras[index])
+        falloff = None if self.lens is None else self.lens.falloff_of(self.cameras[index])
         if falloff is not None:
             photo /= falloff
         return self._camera(index, factor), self._reduce(photo, index, factor)
@@ -93,17 +91,6 @@ class TrainingViews:
         return self._reduce(alpha.to(self.device, non_blocking=True).float()[:, :, None] / 255.0, index, factor)[
             :, :, 0
         ]
-
-    def _falloff(self, camera: Camera) -> torch.Tensor | None:
-        """What the lens leaves of the light in a camera's photo, (H, W, 1); None where it leaves all of it."""
-        if self.lens is None:
-            return None
-        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        if key not in self.falloffs:
-            if len(self.falloffs) >= MOST_FALLOFFS:
-                self.falloffs.clear()
-            self.falloffs[key] = self.lens.falloff_of(camera)
-        return self.falloffs[key]
 
     def _on_device(self, index: int) -> torch.Tensor:
         coming = self.coming.pop(index, None)

@@ -113,6 +113,10 @@ def test_the_falloff_is_the_angle_s():
     wide = exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000))
     assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
     assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
+    assert exposures.falloff_of(cameras[1]) is whole  # made once
+    for left in range(50):
+        exposures.falloff_of(cameras[0].crop(left, 0, 20, 30))
+    assert torch.equal(exposures.falloff_of(cameras[0]), whole)
     with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
         Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
 
