@@ -33,7 +33,7 @@ def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | flo
 
     Returns:
         "spread": standard deviation of the log gains; "foretold": error of what the pose foretells; "ignored": that of
-        a gain of 1; "edge": what the lens leaves of the light at the farthest point from its axis.
+        a gain of 1; "edge": what the lens leaves of the light where its falloff ends, mostly the corners.
     """
     (mine, falloff), (all_together, _) = gains_of(train), gains_of([*train, *test])
     # Both have the mean 0 of their own photos.

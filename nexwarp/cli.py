@@ -539,8 +539,9 @@ def _exposures(model: Model) -> str:
     if model.surfels.exposures is None:
         return "one for all photos"
     exposures = model.surfels.exposures
-    gains, corner = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
-    return f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean, {corner:.2f} at the edge"
+    gains, edge = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
+    told = f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean"
+    return f"{told}; light at the edge: {edge:.0%}"
 
 
 def _name(device: torch.device) -> str:

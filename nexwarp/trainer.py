@@ -84,8 +84,7 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor] | None] = {}
-        self.exposures = _exposures(scene, config)
-        gains = None if self.exposures is None else self.exposures.log_gains.exp()
+        self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
@@ -529,18 +528,22 @@ class _Target:
     beyond: torch.Tensor | None = None
 
 
-def _exposures(scene: Scene, config: Config) -> Exposures | None:
-    """Of the training photos; None where they have one exposure by their nature, or no points tell theirs."""
+def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] | tuple[None, None]:
+    """Of the training photos, and each one's gains (V, 3), which exposures have of some alone where photos are many.
+
+    None where the photos have one exposure by their nature, or no points tell theirs.
+    """
     rendered = scene.background is not None or scene.random_background
     if not config.exposures or rendered or config.mask_mode == "background":
-        return None
+        return None, None
     seen = [view.points if view.points is not None else scene.points[:0] for view in scene.train]
     if sum(map(len, seen)) == 0:
-        return None
+        return None, None
     cameras = [view.camera for view in scene.train]
     photos, masks = [view.image for view in scene.train], [view.mask for view in scene.train]
     log_gains, falloff = photo_gains(cameras, photos, seen, masks)
-    return Exposures.of(torch.from_numpy(log_gains), cameras, falloff if config.vignetting else None)
+    found = torch.from_numpy(log_gains)
+    return Exposures.of(found, cameras, falloff if config.vignetting else None), found.float().exp()
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

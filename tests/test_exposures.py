@@ -8,9 +8,11 @@ import torch
 
 import nexwarp as nw
 from benchmarks.exposures import compare
+from nexwarp import exposures
 from nexwarp.camera import Camera
+from nexwarp.checkpoint import Model
 from nexwarp.config import Config, TextureConfig
-from nexwarp.data import View, write_demo
+from nexwarp.data import Scene, View, write_demo
 from nexwarp.evaluate import evaluate
 from nexwarp.exposures import EVEN, Exposures, photo_gains
 from nexwarp.metrics import to_uint8
@@ -247,6 +249,15 @@ def test_photos_are_brought_to_one_exposure():
     torch.testing.assert_close(even.get(0, 2)[1], halves)
 
 
+def trained(scene: Scene, **changes: bool) -> tuple[Model, float]:
+    """A small training with some settings changed, and the PSNR of its test views."""
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    trainer = Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
+    trainer.run()
+    model = trainer.finish()
+    return model, evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+
+
 def test_training_takes_exposures_out(tmp_path):
     """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
@@ -260,16 +271,10 @@ def test_training_takes_exposures_out(tmp_path):
     scene = dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
     expected = torch.tensor([gain(view) for view in scene.train]).log()
     expected -= expected.mean()
-    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    figures = {}
-    for exposures in (False, True):
-        config = Config(iterations=150, max_surfels=400, texture=texture, exposures=exposures)
-        trainer = Trainer(scene, config, "cpu")
-        trainer.run()
-        model = trainer.finish()
-        figures[exposures] = evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+    _, without = trained(scene, exposures=False)
+    model, figure = trained(scene, exposures=True)
     assert (model.surfels.exposures.log_gains - expected[:, None]).abs().max() < 0.03
-    assert figures[True] > figures[False] + 0.5, figures
+    assert figure > without + 0.5
 
 
 def test_training_takes_vignetting_out(tmp_path):
@@ -283,18 +288,25 @@ def test_training_takes_vignetting_out(tmp_path):
         return [dataclasses.replace(v, image=to_uint8(v.image / 255 * lens.falloff_of(v.camera))) for v in views]
 
     scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
-    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    figures = {}
-    for vignetting in (False, True):
-        config = Config(iterations=150, max_surfels=400, texture=texture, vignetting=vignetting)
-        trainer = Trainer(scene, config, "cpu")
-        trainer.run()
-        model = trainer.finish()
-        found = model.surfels.exposures.falloff_of(scene.test[0].camera)
-        assert (found is None) == (not vignetting)
-        figures[vignetting] = evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
-    assert (found - lens.falloff_of(scene.test[0].camera)).abs().max() < 0.08
-    assert figures[True] > figures[False] + 0.2, figures
+    camera = scene.test[0].camera
+    even, without = trained(scene, vignetting=False)
+    assert even.surfels.exposures.falloff_of(camera) is None
+    model, figure = trained(scene, vignetting=True)
+    assert (model.surfels.exposures.falloff_of(camera) - lens.falloff_of(camera)).abs().max() < 0.08
+    assert figure > without + 0.2
+
+
+def test_each_of_many_photos_has_its_own_gains(tmp_path, monkeypatch):
+    """Renderings take theirs from some of the photos; training takes out what each has."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60))
+    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
+    config = Config(iterations=20, max_surfels=40, texture=texture)
+    expected = Trainer(scene, config, "cpu").views.scales
+    monkeypatch.setattr(exposures, "MOST_PHOTOS", 4)
+    trainer = Trainer(scene, config, "cpu")
+    assert len(trainer.exposures.log_gains) <= 4 < len(scene.train)
+    assert torch.equal(trainer.views.scales, expected) and expected.shape == (len(scene.train), 3)
+    trainer.run()
 
 
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
