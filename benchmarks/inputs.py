@@ -11,8 +11,10 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import tyro
 from PIL import Image
 
 from nexwarp.data import load_scene, write_demo
@@ -175,21 +177,21 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
     return folder
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Train every form of the demo with the settings of `nexwarp train demo` and print a table."""
+def main(
+    base: Annotated[Path, tyro.conf.Positional], names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+) -> int:
+    """Train forms of the demo with the settings of `nexwarp train demo` and print a line each.
+
+    Args:
+        base: folder for the scenes; those that are there are taken as they are.
+        names: which forms; by default all.
+    """
     from nexwarp.cli import DEMO_SETTINGS
     from nexwarp.config import preset, with_settings
     from nexwarp.evaluate import evaluate
     from nexwarp.trainer import Trainer
 
-    given = sys.argv[1:] if arguments is None else arguments
-    if not given:
-        print("usage: python -m benchmarks.inputs FOLDER [NAME ...]", file=sys.stderr)
-        return 2
-    base = Path(given[0])
     demo = base / "pinhole"
-    if not demo.exists():
-        write_demo(demo)
     forms = {
         "pinhole": lambda folder: folder,
         "text": lambda folder: write_text(demo, folder),
@@ -200,18 +202,25 @@ def main(arguments: list[str] | None = None) -> int:
         "opencv": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV", BARREL)),
         "fisheye": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV_FISHEYE", FISHEYE)),
     }
+    if unknown := [name for name in names if name not in forms]:
+        print(f"names: expected some of {', '.join(forms)}, got {unknown[0]!r}", file=sys.stderr)
+        return 2
+    if not demo.exists():
+        write_demo(demo)
     config = with_settings(preset("default"), DEMO_SETTINGS)
     reference = load_scene(demo)
-    for name in given[1:] or forms:
+    for name in names or forms:
         folder = base / name
         if not folder.exists():
             forms[name](folder)
         scene = load_scene(folder)
         trainer = Trainer(scene, config, "cpu")
         trainer.run()
-        options = trainer.render_options()
-        own = evaluate(trainer.surfels, trainer.texture, scene.test, options=options)["psnr"]
-        same = evaluate(trainer.surfels, trainer.texture, reference.test, options=options)["psnr"]
+        model = trainer.finish()
+        own, same = (
+            evaluate(model.surfels, model.texture, views, options=model.render_options)["psnr"]
+            for views in (scene.test, reference.test)
+        )
         size = scene.train[0].camera
         print(
             f"{name:14}  {size.width}x{size.height}  own test photos {own:.2f} dB, "
@@ -222,4 +231,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tyro.cli(main))
