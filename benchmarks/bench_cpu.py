@@ -121,8 +121,9 @@ def torch_collect(
 
 
 def _rays(column: int, row: int, size: int, camera: ops.Pinhole) -> torch.Tensor:
-    x = (torch.arange(size) + (column * size + 0.5 - camera.cx)) / camera.fx
-    y = (torch.arange(size) + (row * size + 0.5 - camera.cy)) / camera.fy
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    x = (torch.arange(size) + (column * size + 0.5 - cx)) / fx
+    y = (torch.arange(size) + (row * size + 0.5 - cy)) / fy
     return torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones(size, size)], dim=-1).view(-1, 3)
 
 

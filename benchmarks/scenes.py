@@ -103,7 +103,7 @@ def geometry(scene: Scene) -> Geometry:
     s, c = scene.surfels, scene.camera
     shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
     colors = ops.plain_colors((s.sh0, s.shN), s.means, c.position, 3).requires_grad_()
-    pinhole = ops.Pinhole(c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.near)
+    pinhole = ops.Pinhole(c.K, c.width, c.height, c.near)
     return Geometry(shape, colors, c.viewmat, pinhole)
 
 

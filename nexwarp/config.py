@@ -126,6 +126,8 @@ class Config:
     """Of every random choice."""
     deterministic: bool = False
     """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
+    cuda_graphs: bool = True
+    """On CUDA, repeat steps as CUDA graphs: the same arithmetic, faster, with some more memory."""
     losses: LossWeights = field(default_factory=LossWeights)
     """Factors of the loss terms."""
     rates: LearningRates = field(default_factory=LearningRates)

@@ -14,7 +14,7 @@ from nexwarp.surfels import Surfels
 
 INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0
-NUMBERS_A_PIXEL = 0.4  # of the hash grid, for each pixel of the training photos
+NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 

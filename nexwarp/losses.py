@@ -171,8 +171,8 @@ def depth_loss(
     Args:
         depths: (H, W, K) z-depths of the textured hits, world units.
         weights: (H, W, K), W.
-        places: (M,) int64, row * W + column of the points' pixels, M >= 1; see `visible_points`.
-        expected: (M,) their z-depths, > 0.
+        places: (M,) int64, row * W + column of the points' pixels; see `visible_points`.
+        expected: (M,) their z-depths, > 0; what has 0 there is no point, and does not count. 0 without any.
     """
     check_tensors({"depths": (depths, ("H", "W", "K")), "weights": (weights, depths.shape)})
     check_tensors({"places": (places, ("M",))}, dtype=torch.int64, device=depths.device)
@@ -180,7 +180,9 @@ def depth_loss(
     # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
     shares, found = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
     means = (shares * found).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
-    return (means / expected - 1).abs().mean()
+    known = expected > 0
+    errors = (means / torch.where(known, expected, 1) - 1).abs() * known
+    return errors.sum() / known.sum().clamp_min(1)
 
 
 def visible_points(

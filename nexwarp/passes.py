@@ -163,7 +163,7 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
 
 def _unproject(depths: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """World points (H, W, K, 3) of z-depths (H, W, K), and unit directions (H, W, 3) of the rays."""
-    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    pinhole = ops.Pinhole(camera.K.to(depths), camera.width, camera.height, camera.near)
     return ops.unproject(depths, camera.viewmat, pinhole)
 
 

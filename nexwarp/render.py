@@ -50,6 +50,11 @@ class Rendering:
     weights: torch.Tensor
     alpha: torch.Tensor
 
+    @property
+    def tiles(self) -> ops.Tiles:
+        """The lists that the collection pass walked along."""
+        return self._passes.tiles
+
     def watch_error(self, errors: torch.Tensor) -> ops.ErrorWatch:
         """Ask the coming backward pass for `splat_error(errors)`, at hardly any cost.
 
@@ -79,7 +84,7 @@ def render(
     sh_degree: int = 3,
     low_pass: bool = False,
     clamp_texture: bool = False,
-    depth_jitter: float = 0.0,
+    depth_jitter: float | torch.Tensor = 0.0,
     generator: torch.Generator | None = None,
 ) -> Rendering:
     """Render surfels as a camera sees them.
@@ -97,7 +102,8 @@ def render(
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
         clamp_texture: limit textured colours to >= 0; not for residual textures.
         depth_jitter: for training: where the texture is looked up moves along the ray, at random, with this standard
-            deviation in units of depth / focal, a pixel's size there. The buffers' depths stay.
+            deviation in units of depth / focal, a pixel's size there. The buffers' depths stay. A tensor of
+            `jitter_factors` is what they are multiplied by for it.
         generator: of those random numbers, on the surfels' device; None is torch's own.
 
     Raises:
@@ -107,7 +113,7 @@ def render(
         surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter
     )
     shape = surfels.activated()
-    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
@@ -117,9 +123,10 @@ def render(
     else:
         weights = hits.weights
         looked_up = hits.depths
-        if depth_jitter > 0:
-            noise = torch.randn(looked_up.shape, generator=generator, dtype=looked_up.dtype, device=looked_up.device)
-            looked_up = looked_up * noise.mul_(depth_jitter / camera.focal).add_(1)
+        if not isinstance(depth_jitter, torch.Tensor) and depth_jitter > 0:
+            depth_jitter = jitter_factors(camera, max_hits, depth_jitter, looked_up.dtype, generator)
+        if isinstance(depth_jitter, torch.Tensor):
+            looked_up = looked_up * depth_jitter
         positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
         depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
@@ -134,6 +141,27 @@ def render(
     # No buffer, so no field: only `watch_error` and `splat_error` look at it.
     object.__setattr__(rendering, "_passes", passes)
     return rendering
+
+
+def jitter_factors(
+    camera: Camera,
+    max_hits: int,
+    jitter: float,
+    dtype: torch.dtype = torch.float32,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Draw what `render` multiplies depths by for a `depth_jitter`: (H, W, K) normal, 1 +- jitter / focal.
+
+    Args:
+        camera: to render with.
+        max_hits: K.
+        jitter: standard deviation in pixels.
+        dtype: of the surfels.
+        generator: on the camera's device; None is torch's own.
+    """
+    shape = (camera.height, camera.width, max_hits)
+    noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)
+    return noise.mul_(jitter / camera.focal).add_(1)
 
 
 def seen_depths(ids: torch.Tensor, depths: torch.Tensor, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
@@ -176,7 +204,7 @@ def _check(
     sh_degree: int,
     low_pass: bool,
     clamp_texture: bool,
-    depth_jitter: float,
+    depth_jitter: float | torch.Tensor,
 ) -> torch.Tensor:
     """Check types, shapes and devices only, so as never to wait for a GPU; return the background as a tensor."""
     for name, value, kind in (("surfels", surfels, Surfels), ("camera", camera, Camera)):
@@ -191,9 +219,10 @@ def _check(
     for name, value in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
         if not isinstance(value, bool):
             raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
-    if isinstance(depth_jitter, bool) or not isinstance(depth_jitter, numbers.Real):
-        raise TypeError(f"depth_jitter: expected a number, got {type(depth_jitter).__name__}")
-    check_range("depth_jitter", depth_jitter, 0.0, MAX_JITTER)
+    if not isinstance(depth_jitter, torch.Tensor):
+        if isinstance(depth_jitter, bool) or not isinstance(depth_jitter, numbers.Real):
+            raise TypeError(f"depth_jitter: expected a number or a tensor, got {type(depth_jitter).__name__}")
+        check_range("depth_jitter", depth_jitter, 0.0, MAX_JITTER)
     if clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
     means = surfels.means
@@ -201,6 +230,8 @@ def _check(
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
     background = _background(background, means)
     others = {"camera.viewmat": (camera.viewmat, (4, 4)), "background": (background, (3,))}
+    if isinstance(depth_jitter, torch.Tensor):
+        others["depth_jitter"] = (depth_jitter, (camera.height, camera.width, max_hits))
     if texture is not None:
         others["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
     check_tensors(others, dtype=means.dtype, device=means.device)

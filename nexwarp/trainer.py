@@ -6,7 +6,7 @@ import math
 import random
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +26,8 @@ from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.initial import initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
-from nexwarp.render import Rendering, render
+from nexwarp.render import Rendering, jitter_factors, render
+from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 from nexwarp.training_views import TrainingViews, mean_color
@@ -83,12 +84,13 @@ class Trainer:
         self.iteration = 0
         self.seconds = 0.0
         self.order: list[int] = []
-        self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor] | None] = {}
+        self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
+        self.graphs = StepGraphs(self.device) if config.cuda_graphs and self.device.type == "cuda" else None
         self.loss_log, self.checked = LossLog(), 0
         self.good: tuple[dict[str, torch.Tensor], dict[str, Any]] | None = None
 
@@ -221,28 +223,53 @@ class Trainer:
         self.surfels.exposures = None  # the photos are all brought to one
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
-        view = self._view(self._next_view(), 2 if coarse else 1)
+        index = self._next_view()
+        view = self._view(index, 2 if coarse else 1)
         self._schedule_rates()
         if config.border > 0 and self.iteration % config.border_every == 0:
             view = self._beyond_the_frame(view)
-        options = self.render_options() | {"background": view.background}
-        options |= {"depth_jitter": config.depth_jitter, "generator": self.noise}
-        out = render(self.surfels, self.texture if config.max_hits else None, view.camera, **options)
-        losses = self._losses(out, view)
-        watch = None
-        if self.densifier.active(self.iteration):
-            errors = (out.image.detach() - view.photo).abs().mean(dim=-1)
-            watch = out.watch_error(errors if view.counts is None else errors * view.counts)
-        sum(losses.values()).backward()
-        if watch is not None:
-            self.densifier.accumulate(watch.sums)
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        else:
+            view = self._with_points(view, index)
+        if config.depth_jitter > 0 and config.max_hits:
+            drawn = jitter_factors(view.camera, config.max_hits, config.depth_jitter, generator=self.noise)
+            view = dataclasses.replace(view, depth_jitter=drawn)
+        learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
+        return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
+
+    def _learn(self, view: "_Target") -> Learnt:
+        """Render, compare, go back and step: the GPU's part, whose launches follow from `_launched` and shapes."""
+        options = self.render_options() | {"background": view.background, "depth_jitter": view.depth_jitter}
+        try:
+            out = render(self.surfels, self.texture if self.config.max_hits else None, view.camera, **options)
+            losses = self._losses(out, view)
+            watch = None
+            if self.densifier.active(self.iteration):
+                errors = (out.image.detach() - view.photo).abs().mean(dim=-1)
+                watch = out.watch_error(errors if view.counts is None else errors * view.counts)
+            sum(losses.values()).backward()
+            if watch is not None:
+                self.densifier.accumulate(watch.sums)
+            self.optimizer.step()
+        finally:
+            self.optimizer.zero_grad(set_to_none=True)
         # Without their graph, which would keep this step's lists and buffers until the next one has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        return Progress(self.iteration, len(self.surfels), losses, out.image.detach(), view.photo)
+        return Learnt(losses, out.image.detach(), out.tiles)
+
+    def _launched(self) -> Hashable:
+        """What the launches of a step follow from, beside its target."""
+        tensors = [self.densifier.errors]
+        for _, parameter in self._named_parameters():
+            tensors += [parameter, *self.optimizer.state.get(parameter, {}).values()]
+        return (
+            len(self.surfels),
+            self.densifier.active(self.iteration),
+            self.render_options()["sh_degree"],
+            torch.are_deterministic_algorithms_enabled(),
+            *(x.data_ptr() for x in tensors),
+        )
 
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments of `nexwarp.render` at this point of the run."""
@@ -267,9 +294,9 @@ class Trainer:
                 photo = photo + (1 - alpha)[..., None] * (background - self.behind)
         mask = self.views.mask(index, factor)
         if mask is None or self.config.mask_mode == "ignore":
-            return _Target(index, camera, photo, background, counts=mask)
+            return _Target(camera, photo, background, counts=mask)
         behind = background if isinstance(background, torch.Tensor) else self.behind
-        return _Target(index, camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
+        return _Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
 
     def _beyond_the_frame(self, view: "_Target") -> "_Target":
         """Shift the window at random; where it leaves the photo, the photo's edge goes on.
@@ -294,22 +321,29 @@ class Trainer:
             beyond=~inside if known is None else ~inside & known,
         )
 
-    def _points(self, view: "_Target") -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Points that a view's depths are compared with, as `depth_loss` takes them.
+    def _with_points(self, view: "_Target", index: int) -> "_Target":
+        """Add the points that a view's depths are compared with, if there are any and somebody asks.
 
-        None when there are none, or nobody asks. Looks beyond the frame go without: theirs would be found anew for
-        each, and a step is short.
+        Looks beyond the frame go without: theirs would be found anew for each, and a step is short.
         """
-        points = self.scene.train[view.index].points
-        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None or view.beyond is not None:
-            return None
+        points = self.scene.train[index].points
+        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None:
+            return view
         camera = view.camera
-        key = (view.index, camera.width)
+        key = (index, camera.width)
         if key not in self.points:
             mask = view.counts if view.empty is None else ~view.empty
             seen = camera.project(points.to(self.device))
-            self.points[key] = visible_points(*seen, camera.width, camera.height, mask)
-        return self.points[key]
+            found = visible_points(*seen, camera.width, camera.height, mask)
+            # As many for every view, so that all their steps are launched alike.
+            most = max(len(v.points) for v in self.scene.train if v.points is not None)
+            places = torch.zeros(most, dtype=torch.int64, device=self.device)
+            expected = torch.zeros(most, device=self.device)
+            if found is not None:
+                places[: len(found[0])], expected[: len(found[0])] = found
+            self.points[key] = places, expected
+        places, expected = self.points[key]
+        return dataclasses.replace(view, places=places, expected=expected)
 
     def finish(self) -> Model:
         """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
@@ -492,9 +526,8 @@ class Trainer:
             losses["border"] = factors.border * border_loss(out.image, view.photo, view.beyond)
         if view.empty is not None and factors.empty > 0:
             losses["empty"] = factors.empty * (out.alpha * view.empty).mean()
-        points = self._points(view)
-        if points is not None:
-            losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, *points)
+        if view.places is not None and view.expected is not None:
+            losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, view.places, view.expected)
         return losses
 
     def _schedule_rates(self) -> None:
@@ -502,7 +535,11 @@ class Trainer:
         for group in self.optimizer.param_groups:
             first, last = group["ends"]
             rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-            group["lr"] = self.rate_factor * rate
+            rate *= self.rate_factor
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
 
 
 @dataclass(frozen=True)
@@ -510,22 +547,25 @@ class _Target:
     """What a step is to show.
 
     Attributes:
-        index: of the training view.
         camera: to render with.
         photo: (H, W, 3) float, what to compare with.
         background: as `render` takes it.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
         beyond: (H, W) bool, what lies beyond the photo's frame; None is nothing.
+        places, expected: (M,) points to compare depths with, as `depth_loss` takes them; None is no such loss.
+        depth_jitter: as `render` takes it.
     """
 
-    index: int
     camera: Camera
     photo: torch.Tensor
     background: Any
     counts: torch.Tensor | None = None
     empty: torch.Tensor | None = None
     beyond: torch.Tensor | None = None
+    places: torch.Tensor | None = None
+    expected: torch.Tensor | None = None
+    depth_jitter: float | torch.Tensor = 0.0
 
 
 def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] | tuple[None, None]:
@@ -561,7 +601,10 @@ def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, sc
     if config.max_hits:
         groups.append({"params": [texture.grid], "ends": rates.grid, "lr": rates.grid[0]})
         groups.append({"params": list(texture.mlp.parameters()), "ends": rates.mlp, "lr": rates.mlp[0]})
-    return torch.optim.Adam(groups, eps=1e-15, fused=True)
+    on_gpu = surfels.means.is_cuda
+    if on_gpu:  # where a CUDA graph finds them
+        groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.means.device)} for group in groups]
+    return torch.optim.Adam(groups, eps=1e-15, fused=True, capturable=on_gpu)
 
 
 def _densify_schedule(config: Config) -> DensifyConfig:

@@ -55,6 +55,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "orient_points": ("", ""),
     "seed": ("", "code"),
     "deterministic": ("", ""),
+    "cuda_graphs": ("", ""),
     "losses.dssim": ("λ_D-SSIM", "Losses"),
     "losses.alpha": ("λ_alpha", "Losses"),
     "losses.texture": ("λ_texture", "Losses"),

@@ -241,7 +241,7 @@ def warp_lists(surfels: nw.Surfels, camera: nw.Camera) -> Any:
 def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.device) -> None:
     """On CUDA a list is made before anybody knows how many there are."""
     surfels, camera = too_many(device, count)
-    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     shape = [x.detach() for x in surfels.activated()]
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=1000)

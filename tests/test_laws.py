@@ -9,6 +9,7 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.evaluate import NEVER, seen_footprints
+from nexwarp.render import jitter_factors
 from tests.reference import render as reference
 from tests.scenes import (
     Scene,
@@ -338,6 +339,8 @@ def test_jitter_moves_lookups_along_their_rays(
     own = [torch.Generator(device).manual_seed(3) for _ in range(2)]
     assert_same(*(draw(scene, texture, depth_jitter=jitter, generator=generator) for generator in own))
     assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
+    drawn = jitter_factors(camera, 2, jitter, scene["means"].dtype, own[0].manual_seed(3))
+    assert_same(draw(scene, texture, depth_jitter=drawn), moved)
 
 
 def test_without_jitter_no_random_number_is_drawn(device: torch.device) -> None:
@@ -376,7 +379,11 @@ def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -
     assert_close(*moved, kind="gradient", name="viewmat", precision=torch.float64)
 
 
-@pytest.mark.parametrize(("jitter", "error"), [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError)])
+@pytest.mark.parametrize(
+    ("jitter", "error"),
+    [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError), (torch.ones(2, 3), ValueError)],
+    ids=str,
+)
 def test_jitter_that_cannot_be_is_refused(jitter: Any, error: type[Exception], device: torch.device) -> None:
     with pytest.raises(error, match=r"^depth_jitter: expected "):
         draw(random_scene(device=device), make_texture(device=device), depth_jitter=jitter)
@@ -593,7 +600,7 @@ def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> Non
     assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
     filled = out.ids >= 0
     assert (out.depths[filled] < 3.4).any() and (out.depths[filled] > 3.6).any()
-    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     positions, directions = ops.unproject(out.depths, camera.viewmat, pinhole)
     depths = torch.where(filled, out.depths.clamp_min(3.5), 0.0)
     colors = texture.colors(positions, depths, directions, camera.focal)

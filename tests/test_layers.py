@@ -15,7 +15,7 @@ LAYERS = [
     {"json_files", "exposures"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "splats", "video"},
-    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},
+    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch", "step_graphs"},
     {"config"},
     {"initial"},
     {"trainer"},

@@ -311,6 +311,21 @@ def test_depth_loss_by_hand() -> None:
     assert losses.depth_loss(depths, weights, places, expected).item() == pytest.approx((0.25 + 0 + 1) / 3, abs=1e-5)
 
 
+def test_what_fills_up_points_does_not_count() -> None:
+    depths = (2 + torch.rand(3, 4, 2)).requires_grad_()
+    weights = (0.1 + 0.4 * torch.rand(3, 4, 2)).requires_grad_()
+    places, expected = torch.tensor([3, 11, 5]), torch.tensor([1.5, 4.0, 3.9])
+    found = []
+    for fill in (0, 5):
+        padded = torch.cat([places, places.new_zeros(fill)]), torch.cat([expected, expected.new_zeros(fill)])
+        loss = losses.depth_loss(depths, weights, *padded)
+        found.append([loss.detach(), *torch.autograd.grad(loss, [depths, weights])])
+    for bare, filled in zip(*found, strict=True):
+        assert torch.equal(bare, filled)
+    none = losses.depth_loss(depths, weights, places, torch.zeros(3))
+    assert none.item() == 0 and not any(x.any() for x in torch.autograd.grad(none, [depths, weights]))
+
+
 def test_depth_loss_against_finite_differences() -> None:
     depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()

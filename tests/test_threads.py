@@ -32,7 +32,7 @@ class Passes:
         shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
         viewmat = camera.viewmat.detach().clone().requires_grad_()
         shape = tuple(x.detach().clone().requires_grad_() for x in shape)
-        self.pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+        self.pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
         self.low_pass = low_pass
         sh = surfels.sh.detach().clone().requires_grad_()
         self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)

@@ -24,7 +24,7 @@ def one_thread() -> None:
 def passes(scene: Scene, low_pass: bool, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[torch.Tensor]]:
     surfels = nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS})
-    pinhole = ops.Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     shape = [getattr(surfels, key) for key in SURFEL_KEYS[:5]]
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, 3)
     projection = ops.project(*shape, colors, camera.viewmat)

@@ -34,7 +34,7 @@ import warp as wp
 from nexwarp.kernels.fixed import fixed_add, fixed_record_sum
 from nexwarp.kernels.lanes import any_lane, ballot, first_lane, from_lane, lane, lane_max, lane_sum, lanes, record_sum
 from nexwarp.kernels.loads import load_function
-from nexwarp.kernels.surfel import hit_functions
+from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 
 BLOCK_DIM = 128
@@ -125,7 +125,8 @@ def buffer_types(real: type, max_hits: int) -> tuple[type, type, type]:
 def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the forward kernel."""
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     vec, ivec, colors = buffer_types(real, max_hits)
@@ -150,7 +151,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
         # outputs
@@ -169,6 +170,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         done = int(0)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             done = 1
+        intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         d = view.ray_of(xy, intrinsics)
         middle = view.block_of(xy, intrinsics)
@@ -286,7 +288,8 @@ def collect_backward_kernel(
     With `fixed` the sums are pairs of integers, see `kernels.fixed`, and so do not depend on any order.
     """
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     hit_dot = h.hit_dot
@@ -318,7 +321,7 @@ def collect_backward_kernel(
         ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
         rows: wp.array(dtype=wp.int32),
@@ -348,6 +351,7 @@ def collect_backward_kernel(
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
+        intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         d = view.ray_of(xy, intrinsics)
         middle = view.block_of(xy, intrinsics)
@@ -470,7 +474,8 @@ def collect_backward_kernel(
 def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the kernel that gives each entry the sum over pixels of weight * error (densification, paper Sec. 3.3)."""
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     view = view_functions(real, tile_size)
@@ -495,7 +500,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         rows: wp.array(dtype=wp.int32),
         stops: wp.array(dtype=wp.int32),
@@ -510,6 +515,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         stop = stops[p]
         if xy[0] >= size[0] or xy[1] >= size[1]:
             stop = int(0)
+        intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         d = view.ray_of(xy, intrinsics)
         error = errors[p]

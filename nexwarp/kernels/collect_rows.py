@@ -11,7 +11,7 @@ import warp as wp
 
 from nexwarp.kernels.collect import overflowed, surfel_at, walk
 from nexwarp.kernels.simd import lane_functions
-from nexwarp.kernels.surfel import hit_functions
+from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 
 
@@ -66,7 +66,8 @@ def row_functions(real: type, tile_size: int) -> SimpleNamespace:
 def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the forward kernel."""
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
     lanes = row_lanes(tile_size)
     h = hit_functions(real, low_pass, lanes)
     f = lane_functions(real, lanes)
@@ -94,7 +95,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
         # outputs
@@ -110,6 +111,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         xy = view.row_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
+        intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         dx, y = view.rays_of(xy, intrinsics)
         alive = word()
@@ -208,7 +210,8 @@ def collect_rows_backward_kernel(
 ) -> wp.Kernel:
     """Make the backward kernel; with `watch` it also adds up weight * error a row of gradients."""
     t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
     lanes = row_lanes(tile_size)
     h = hit_functions(real, low_pass, lanes)
     hit_dot = h.hit_dot
@@ -237,7 +240,7 @@ def collect_rows_backward_kernel(
         ends: wp.array(dtype=wp.int32),
         size: wp.vec2i,
         tile_columns: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
         rows: wp.array(dtype=wp.int32),
@@ -262,6 +265,7 @@ def collect_rows_backward_kernel(
         xy = view.row_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
+        intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         dx, y = view.rays_of(xy, intrinsics)
         stop = word()

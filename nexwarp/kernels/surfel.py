@@ -76,7 +76,19 @@ def frame_functions(real: type) -> SimpleNamespace:
     def translation(viewmat: mat44):
         return vec3(viewmat[0, 3], viewmat[1, 3], viewmat[2, 3])
 
-    return SimpleNamespace(rotation=rotation, rotate=rotate, rotate_back=rotate_back, translation=translation)
+    @wp.func
+    def intrinsics_of(Ks: wp.array(dtype=mat33)):
+        """(fx, fy, cx, cy) of a camera's matrix: read from memory, so that a CUDA graph serves every camera."""
+        K = Ks[0]
+        return vec4(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+
+    return SimpleNamespace(
+        rotation=rotation,
+        rotate=rotate,
+        rotate_back=rotate_back,
+        translation=translation,
+        intrinsics_of=intrinsics_of,
+    )
 
 
 @functools.cache

@@ -40,6 +40,12 @@ class Image(NamedTuple):
     size: tuple[int, int]
     near: float
 
+    def matrices(self, like: wp.array) -> wp.array:
+        """The camera matrix (1) mat33, as the kernels read it."""
+        fx, fy, cx, cy = self.intrinsics
+        K = [[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]]
+        return wp.array(K, dtype=types(_real(like)).mat33, device=like.device)
+
 
 class Lists(NamedTuple):
     """Tile lists, see `nexwarp.ops.Tiles`."""
@@ -193,7 +199,7 @@ def intersect_tiles(
     shapes = integers(count, wp.vec3i)
     reaches, corners = reals(count, t.vec2), reals((count, MAX_CORNERS), t.vec2)
     margins, discs = reals(count, real), reals(count if low_pass else 1, t.vec3)
-    surfels = [means, quats, scales, opacities, gammas, viewmat, t.vec4(*image.intrinsics), image.near, rows]
+    surfels = [means, quats, scales, opacities, gammas, viewmat, image.matrices(means), image.near, rows]
     footprints = [corners, shapes, margins, discs]
     _silent(footprint_kernel(real, low_pass, tile_size), count, surfels, [reaches, *footprints])
     kernels = list_kernels(real, low_pass, tile_size)
@@ -242,7 +248,7 @@ def collect(
         stops=_new(records, pixels, wp.int32, requires_grad=False),
     )
     threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
-    view = [wp.vec2i(*image.size), lists.columns, t.vec4(*image.intrinsics), image.near]
+    view = [wp.vec2i(*image.size), lists.columns, image.matrices(records), image.near]
     walked = [lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
     inputs = [records, centers, limits, *walked, *view, lists.reaches]
     kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
@@ -264,7 +270,7 @@ def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) 
     real = _real(depths)
     t = types(real)
     positions, directions = _new(depths, depths.shape, t.vec3), _new(depths, depths.shape[0], t.vec3)
-    inputs = [depths, viewmat, 0, t.vec4(*image.intrinsics), image.size[0]]
+    inputs = [depths, viewmat, 0, image.matrices(depths), image.size[0]]
     _launch(tape, unproject_kernel(real), depths.shape[0], inputs, [positions, directions])
     return positions, directions
 

@@ -48,7 +48,7 @@ def check_entries(total: int, count: int, tiles: int) -> int:
 def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the kernel that projects supports to polygons, one thread a surfel."""
     t = types(real)
-    vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
+    vec2, vec3, vec4, mat33, mat44 = t.vec2, t.vec3, t.vec4, t.mat33, t.mat44
     mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
     f = frame_functions(real)
     ZERO, HALF, ONE, TWO = t.ZERO, t.HALF, t.ONE, t.TWO
@@ -70,7 +70,7 @@ def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         opacities: wp.array(dtype=real),
         gammas: wp.array(dtype=vec2),
         viewmats: wp.array(dtype=mat44),
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         near: real,
         tile_rows: wp.int32,
         # outputs
@@ -93,6 +93,7 @@ def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         reach = vec2(wp.pow(limit, HALF / gammas[i][0]), wp.pow(limit, HALF / gammas[i][1]))
         reaches[i] = reach
         viewmat = viewmats[0]
+        intrinsics = f.intrinsics_of(Ks)
         axes = f.rotation(quats[i])
         center = f.rotate(viewmat, means[i]) + f.translation(viewmat)
         v1 = f.rotate(viewmat, vec3(axes[0, 0], axes[1, 0], axes[2, 0])) * (scales[i][0] * reach[0])

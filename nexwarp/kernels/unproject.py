@@ -15,7 +15,7 @@ from nexwarp.kernels.types import types
 def unproject_kernel(real: type) -> wp.Kernel:
     """Make the kernel; `viewmat_step` is 0 for one shared viewmat, 1 for a gradient slot a pixel."""
     t = types(real)
-    vec3, vec4, mat44 = t.vec3, t.vec4, t.mat44
+    vec3, mat33, mat44 = t.vec3, t.mat33, t.mat44
     f = frame_functions(real)
 
     @wp.kernel(module="unique")
@@ -24,7 +24,7 @@ def unproject_kernel(real: type) -> wp.Kernel:
         depths: wp.array2d(dtype=real),
         viewmats: wp.array(dtype=mat44),
         viewmat_step: wp.int32,
-        intrinsics: vec4,
+        Ks: wp.array(dtype=mat33),
         width: wp.int32,
         # outputs
         positions: wp.array2d(dtype=vec3),
@@ -32,6 +32,7 @@ def unproject_kernel(real: type) -> wp.Kernel:
     ):
         p = first + wp.tid()
         viewmat = viewmats[p * viewmat_step]
+        intrinsics = f.intrinsics_of(Ks)
         x = (real(float(p % width)) + real(0.5) - intrinsics[2]) / intrinsics[0]
         y = (real(float(p // width)) + real(0.5) - intrinsics[3]) / intrinsics[1]
         ray = f.rotate_back(viewmat, vec3(x, y, real(1.0)))

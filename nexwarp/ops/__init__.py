@@ -3,11 +3,12 @@
 from nexwarp.ops.activate import activate
 from nexwarp.ops.collect import ErrorWatch, Hits, collect, splat_error
 from nexwarp.ops.compose import compose
+from nexwarp.ops.graphs import captured
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import Tiles, intersect_tiles
+from nexwarp.ops.tiles import Tiles, intersect_tiles, roomy
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -17,11 +18,13 @@ __all__ = [
     "Projection",
     "Tiles",
     "activate",
+    "captured",
     "collect",
     "compose",
     "intersect_tiles",
     "plain_colors",
     "project",
+    "roomy",
     "splat_error",
     "texture",
     "unproject",

@@ -67,7 +67,12 @@ def stream_of(tensor: torch.Tensor) -> wp.Stream | None:
     """Torch's current stream on the tensor's device, None on a CPU."""
     if tensor.device.type == "cpu":
         return None
-    return _stream(tensor.device.index, torch.cuda.current_stream(tensor.device).cuda_stream)
+    return stream_on(torch.cuda.current_stream(tensor.device))
+
+
+def stream_on(stream: torch.cuda.Stream) -> wp.Stream:
+    """Warp's view of a stream of torch."""
+    return _stream(stream.device_index, stream.cuda_stream)
 
 
 def launch(

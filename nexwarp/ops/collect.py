@@ -148,7 +148,7 @@ def _inputs(
         *(array(x, wp.int32) for x in (tiles.surfel_ids, tiles.tile_offsets, tiles.order, tiles.ends)),
         wp.vec2i(camera.width, camera.height),
         tiles.columns,
-        t.vec4(*camera.intrinsics),
+        array(camera.K.contiguous()[None], t.mat33),
         camera.near,
     ]
 

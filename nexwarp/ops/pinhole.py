@@ -2,26 +2,20 @@
 
 from dataclasses import dataclass
 
+import torch
+
 
 @dataclass(frozen=True)
 class Pinhole:
     """Intrinsics and size of an image.
 
     Attributes:
-        fx, fy, cx, cy: pixels; pixel centres lie at +0.5.
+        K: (3, 3) intrinsics in pixels, on the surfels' device and of their dtype; pixel centres lie at +0.5.
         width, height: pixels.
         near: hits with a z-depth of at most this (world units) are ignored.
     """
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    K: torch.Tensor
     width: int
     height: int
     near: float
-
-    @property
-    def intrinsics(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy)."""
-        return self.fx, self.fy, self.cx, self.cy

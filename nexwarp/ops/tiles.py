@@ -42,6 +42,7 @@ class Tiles:
         columns: tiles in a row.
         exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
             or, when `ends` says that there are more than M, the lists are incomplete and the walk goes over `order`.
+        kind: what renderings that need about as much room have in common.
     """
 
     order: torch.Tensor
@@ -53,6 +54,7 @@ class Tiles:
     tile_size: int
     columns: int
     exact: bool
+    kind: tuple[int, int, bool]
 
 
 def intersect_tiles(
@@ -95,7 +97,7 @@ def intersect_tiles(
     t = types(real)
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
     order = _depth_order(projection.centers.detach(), t)
-    kernels = list_kernels(real, low_pass, tile_size)
+    kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
     footprints, reaches = _footprints(tensors, viewmat, camera, low_pass, tile_size)
     lanes = 1 if means.device.type == "cpu" else LANES
     arguments = [array(order, wp.int32), *footprints, wp.vec2i(columns, rows), lanes]
@@ -109,7 +111,7 @@ def intersect_tiles(
         ends[-1:] = total
     exact = means.device.type == "cpu" and room is None
     if room is None:
-        room = _total(ends, columns * rows) if exact else _room(ends, (columns, rows, low_pass))
+        room = _total(ends, columns * rows) if exact else _room(ends, kind)
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
     fill = {"dtype": torch.int32, "device": means.device}
     entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
@@ -120,7 +122,7 @@ def intersect_tiles(
     launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     offsets = torch.empty(columns * rows + 1, **fill)
     launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact)
+    return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact, kind)
 
 
 def _footprints(
@@ -134,7 +136,7 @@ def _footprints(
     arguments = [
         *(array(x, dtype) for x, dtype in zip(shape, dtypes, strict=True)),
         array(viewmat.contiguous()[None], t.mat44),
-        t.vec4(*camera.intrinsics),
+        array(camera.K.contiguous()[None], t.mat33),
         camera.near,
         -(-camera.height // tile_size),
     ]
@@ -162,7 +164,7 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     if count == 0:
         return
     arrays = [wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)]
-    with wp.ScopedStream(stream_of(keys)):
+    with wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
 
 
@@ -171,7 +173,7 @@ def _scan(counts: torch.Tensor) -> None:
     if len(counts) == 0:
         return
     ends = wp.from_torch(counts, dtype=wp.int32)
-    with wp.ScopedStream(stream_of(counts)):
+    with wp.ScopedStream(stream_of(counts), sync_enter=False):
         wp.utils.array_scan(ends, ends, inclusive=True)
 
 
@@ -203,6 +205,10 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     bits = len(ends).bit_length()
     key = (ends.device.index, bits, *kind)
     need = _needs.get(key)
+    if torch.cuda.is_current_stream_capturing():
+        if need is None:
+            raise RuntimeError("expected a rendering of its kind before one is captured")
+        return need.room
     arrived = need is not None and need.copied.query()
     if arrived and int(need.total) > MAX_ENTRIES:
         # That one was right, but no list is as long: look again whether this one's may be made.
@@ -222,6 +228,11 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     need.total.copy_(ends[-1:], non_blocking=True)
     need.copied.record(torch.cuda.current_stream(ends.device))
     return need.room
+
+
+def roomy(tiles: Tiles) -> bool:
+    """Whether lists that a CUDA graph fills have the room that their kind is known to need; asked after each replay."""
+    return tiles.exact or _room(tiles.ends, tiles.kind) <= len(tiles.surfel_ids)
 
 
 def _with_margin(total: int) -> int:

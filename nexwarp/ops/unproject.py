@@ -74,8 +74,8 @@ def _launch(
     real = real_of(depths)
     t = types(real)
     pixels = depths.shape[0] * depths.shape[1]
-    intrinsics = t.vec4(*camera.intrinsics)
-    inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, intrinsics, camera.width]
+    K = array(camera.K.contiguous()[None], t.mat33)
+    inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, K, camera.width]
     shapes = ((pixels, depths.shape[2], 3), (pixels, 3))
     arrays = [array(None if x is None else x.view(s), t.vec3) for x, s in zip(outputs, shapes, strict=True)]
     if grads is None:
