@@ -63,8 +63,7 @@ def gsplat_call(g: Geometry, gsplat) -> tuple[Rasterize, list[torch.Tensor]]:
     scales = torch.cat([scales, torch.ones_like(scales[:, :1])], dim=1)
     leaves = [x.clone().requires_grad_() for x in (means, quats, scales, opacities, g.colors.detach()[None])]
     p = g.pinhole
-    K = torch.tensor([[p.fx, 0.0, p.cx], [0.0, p.fy, p.cy], [0.0, 0.0, 1.0]], device=means.device)
-    call = {"viewmats": g.viewmat[None], "Ks": K[None], "width": p.width, "height": p.height, "near_plane": p.near}
+    call = {"viewmats": g.viewmat[None], "Ks": p.K[None], "width": p.width, "height": p.height, "near_plane": p.near}
 
     def rasterize() -> tuple[torch.Tensor, ...]:
         return gsplat.rasterization_2dgs(*leaves, **call)[:2]

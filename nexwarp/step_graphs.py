@@ -48,7 +48,11 @@ class StepGraphs:
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
-        self.pool = torch.cuda.MemPool()
+        self.pool = torch.cuda.graph_pool_handle()
+        # A pool is gone with its last graph: this one outlives the others.
+        self.keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=device)
+        with ops.captured(self.keeper, self.stream, self.pool):
+            mark.add_(1)
         self.stages: dict[Hashable, _Stage] = {}
         self.able = True
 
@@ -122,7 +126,7 @@ class _Stage:
         staged.K.copy_(camera.K)
         staged.focals.fill_(camera.focal)
 
-    def capture(self, work: Callable[[Any], Learnt], stream: torch.cuda.Stream, pool: torch.cuda.MemPool) -> None:
+    def capture(self, work: Callable[[Any], Learnt], stream: torch.cuda.Stream, pool: Any) -> None:
         """Record the work."""
         graph = torch.cuda.CUDAGraph()
         with ops.captured(graph, stream, pool):

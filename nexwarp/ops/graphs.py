@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from typing import Any
 
 import torch
 import warp as wp
@@ -11,7 +12,7 @@ from nexwarp.ops._interop import stream_on
 
 
 @contextmanager
-def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: torch.cuda.MemPool) -> Iterator[None]:
+def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) -> Iterator[None]:
     """Record in `graph` what is launched inside, on `stream`, instead of doing it.
 
     Memory comes from `pool`, which several graphs may share that are replayed one after another. Unlike
@@ -20,7 +21,7 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: torch
     """
     stream.wait_stream(torch.cuda.current_stream(stream.device))
     with torch.cuda.stream(stream):
-        graph.capture_begin(pool=pool.id, capture_error_mode="thread_local")
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
         ours = stream_on(stream)
         # Lets Warp take the temporary memory of its sorts from the graph.
         wp.capture_begin(stream=ours, external=True, capture_mode=wp.CaptureMode.THREAD_LOCAL)
