@@ -23,15 +23,15 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
     with torch.cuda.stream(stream):
         graph.capture_begin(pool=pool, capture_error_mode="thread_local")
         ours = stream_on(stream)
-        # Lets Warp take the temporary memory of its sorts from the graph.
-        wp.capture_begin(stream=ours, external=True, capture_mode=wp.CaptureMode.THREAD_LOCAL)
         try:
+            # Lets Warp take the temporary memory of its sorts from the graph.
+            wp.capture_begin(stream=ours, external=True, capture_mode=wp.CaptureMode.THREAD_LOCAL)
             yield
+            wp.capture_end(stream=ours)
+            graph.capture_end()
         except BaseException:
             for end in (partial(wp.capture_end, stream=ours), graph.capture_end):
                 with suppress(RuntimeError):  # what went wrong was told
                     end()
             raise
-        wp.capture_end(stream=ours)
-        graph.capture_end()
     torch.cuda.current_stream(stream.device).wait_stream(stream)
