@@ -271,7 +271,9 @@ class Train:
             changed = _with_settings(config, settings)
             for name in settings:
                 old, new = setting(config, name), setting(changed, name)
-                if old != new:
+                if name == "cuda_graphs":  # shapes nothing
+                    config = dataclasses.replace(config, cuda_graphs=new)
+                elif old != new:
                     raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
             return config
         base = preset(self.preset)

@@ -1,7 +1,8 @@
 """Training steps as CUDA graphs: a step's launches are recorded once and repeated as one."""
 
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -9,9 +10,14 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import Camera
+from nexwarp.watch import needed_memory
 
-# Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own.
+# Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. One that
+# was not seen for so many steps makes room for others.
 MOST_KINDS = 4
+FORGOTTEN = 1000
+# How often to start again with nothing when memory does not suffice.
+CHANCES = 3
 
 
 class Learnt(NamedTuple):
@@ -20,12 +26,12 @@ class Learnt(NamedTuple):
     Attributes:
         losses: terms of the loss, scalars.
         image: (H, W, 3) the rendering.
-        tiles: its lists.
+        room: of its lists.
     """
 
     losses: dict[str, torch.Tensor]
     image: torch.Tensor
-    tiles: ops.Tiles
+    room: ops.Room
 
 
 @dataclass(frozen=True)
@@ -37,24 +43,31 @@ class _StagedCamera(Camera):
         return self.focals
 
 
+class CaptureError(Exception):
+    """A step could not be recorded; `memory` says whether for lack of that."""
+
+    def __init__(self, cause: RuntimeError) -> None:
+        super().__init__(" ".join(str(cause).split()))
+        self.memory = needed_memory(cause) is not None
+
+
 class StepGraphs:
     """Runs the GPU's part of training steps, as graphs where that pays.
 
     A step launches hundreds of small kernels, which keeps the host busy for longer than the GPU. All that differs from
     one step to the next, its target and the learning rates, is copied to where the graph reads it. Whatever else
     changes, such as the number of surfels, makes for a new graph: the first step after it is launched as ever, the next
-    one recorded. Both do the same arithmetic on the same numbers.
+    one recorded. Both do the same arithmetic on the same numbers. Where memory does not suffice for graphs, or a step
+    cannot be recorded, all steps are launched from then on.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
-        self.pool = torch.cuda.graph_pool_handle()
-        # A pool is gone with its last graph: this one outlives the others.
-        self.keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=device)
-        with ops.captured(self.keeper, self.stream, self.pool):
-            mark.add_(1)
+        self.pool: Any = None
+        self.keeper: torch.cuda.CUDAGraph | None = None
         self.stages: dict[Hashable, _Stage] = {}
-        self.able = True
+        self.steps = 0
+        self.chances = CHANCES
 
     def run(self, target: Any, work: Callable[[Any], Learnt], state: Hashable) -> Learnt:
         """Do a step.
@@ -65,38 +78,62 @@ class StepGraphs:
             state: whatever else `work` depends on.
 
         Returns:
-            What `work` returns; its image is there until the next step.
+            What `work` returns.
         """
+        if self.chances > 0:
+            try:
+                return self._run(target, work, state)
+            except CaptureError as error:
+                self.chances = self.chances - 1 if error.memory else 0
+                if not error.memory:
+                    told = f"training steps are launched kernel by kernel, which is slower: {error}"
+                    warnings.warn(told, stacklevel=2)
+            except RuntimeError as error:
+                # Graphs keep memory of their own, which may be what is missing.
+                if needed_memory(error) is None or self.keeper is None:
+                    raise
+                self.chances -= 1
+            self.clear()
+        return work(target)
+
+    def clear(self) -> None:
+        """Drop all graphs, and the memory that they have."""
+        self.stages.clear()
+        self.keeper = self.pool = None
+        torch.cuda.empty_cache()
+
+    def _run(self, target: Any, work: Callable[[Any], Learnt], state: Hashable) -> Learnt:
+        self.steps += 1
         kind = _kind(target)
         stage = self.stages.get(kind)
-        if stage is None and (not self.able or len(self.stages) == MOST_KINDS):
-            return work(target)
+        if stage is None and len(self.stages) == MOST_KINDS:
+            oldest = min(self.stages, key=lambda kind: self.stages[kind].seen)
+            if self.stages[oldest].seen >= self.steps - FORGOTTEN:
+                return work(target)
+            del self.stages[oldest]
         if stage is None:
             stage = self.stages[kind] = _Stage(target)
         else:
             stage.take(target)
+        stage.seen = self.steps
         if stage.state != state:
             stage.forget()
             stage.state = state
             return work(stage.target)
-        if stage.graph is None and not (self.able and self._capture(stage, work)):
-            return work(stage.target)
+        if stage.graph is None:
+            self._keep_pool()
+            stage.capture(work, self.stream, self.pool)
         return stage.replay()
 
-    def _capture(self, stage: "_Stage", work: Callable[[Any], Learnt]) -> bool:
-        try:
-            stage.capture(work, self.stream, self.pool)
-        except RuntimeError as error:
-            stage.forget()
-            self.able = False
-            self.stages.clear()
-            # A pool cannot grow at the cost of what torch keeps in reserve, as other memory can.
-            if not isinstance(error, torch.OutOfMemoryError):
-                told = " ".join(str(error).split())
-                warnings.warn(f"training steps are launched kernel by kernel, which is slower: {told}", stacklevel=2)
-            torch.cuda.empty_cache()
-            return False
-        return True
+    def _keep_pool(self) -> None:
+        """A pool of memory is gone with its last graph: one that does nothing outlives the others."""
+        if self.keeper is not None:
+            return
+        keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=self.stream.device)
+        self.pool = torch.cuda.graph_pool_handle()
+        with _told(), ops.captured(keeper, self.stream, self.pool):
+            mark.add_(1)
+        self.keeper = keeper
 
 
 class _Stage:
@@ -112,6 +149,7 @@ class _Stage:
         tensors = {name: x.clone() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
         self.target = replace(target, camera=staged, **tensors)
         self.tensors = tensors
+        self.seen = 0
         self.state: Hashable = None
         self.graph: torch.cuda.CUDAGraph | None = None
         self.learnt: Learnt | None = None
@@ -129,7 +167,7 @@ class _Stage:
     def capture(self, work: Callable[[Any], Learnt], stream: torch.cuda.Stream, pool: Any) -> None:
         """Record the work."""
         graph = torch.cuda.CUDAGraph()
-        with ops.captured(graph, stream, pool):
+        with _told(), ops.captured(graph, stream, pool):
             self.learnt = work(self.target)
             self.losses = torch.stack(list(self.learnt.losses.values()))
         self.graph = graph
@@ -139,15 +177,24 @@ class _Stage:
         assert self.graph is not None and self.learnt is not None and self.losses is not None
         self.graph.replay()
         learnt = self.learnt
-        if not ops.roomy(learnt.tiles):
+        if not ops.roomy(learnt.room):
             self.state = None
-        # Losses are looked at later, when the graph has put others there.
+        # They may be looked at later, when the graph has put others there.
         losses = dict(zip(learnt.losses, self.losses.clone().unbind(), strict=True))
-        return learnt._replace(losses=losses)
+        return learnt._replace(losses=losses, image=learnt.image.clone())
 
     def forget(self) -> None:
         """Drop the graph."""
         self.graph = self.learnt = self.losses = None
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Turn errors of a capture into CaptureError."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise CaptureError(error) from None  # whose traceback would keep what the step had made
 
 
 def _kind(target: Any) -> Hashable:

@@ -202,14 +202,15 @@ class Trainer:
 
     def _too_much(self, needed: str) -> str:
         camera = self.scene.train[0].camera
-        place, used = "memory", ""
+        place, used, graphs = "memory", "", ""
         if self.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(self.device)
             place, used = "GPU memory", f", with {(total - free) / 2**30:.1f} of {total / 2**30:.1f} GiB in use"
+            graphs = ", or do without CUDA graphs (--set cuda_graphs=false)" if self.graphs is not None else ""
         return (
             f"out of {place} at iteration {self.iteration}: it needed {needed}{used}, for {len(self.surfels):,} "
             f"surfels and photos of {camera.width}x{camera.height}; lower --max-surfels (now "
-            f"{self.config.max_surfels:,}) or --max-hits (now {self.config.max_hits}), or raise --downscale"
+            f"{self.config.max_surfels:,}) or --max-hits (now {self.config.max_hits}), or raise --downscale{graphs}"
         )
 
     def step(self) -> Progress:
@@ -249,14 +250,14 @@ class Trainer:
                 errors = (out.image.detach() - view.photo).abs().mean(dim=-1)
                 watch = out.watch_error(errors if view.counts is None else errors * view.counts)
             sum(losses.values()).backward()
+            self.optimizer.step()
             if watch is not None:
                 self.densifier.accumulate(watch.sums)
-            self.optimizer.step()
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without their graph, which would keep this step's lists and buffers until the next one has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        return Learnt(losses, out.image.detach(), out.tiles)
+        return Learnt(losses, out.image.detach(), out.tiles.room)
 
     def _launched(self) -> Hashable:
         """What the launches of a step follow from, beside its target."""
@@ -269,6 +270,7 @@ class Trainer:
             self.render_options()["sh_degree"],
             torch.are_deterministic_algorithms_enabled(),
             *(x.data_ptr() for x in tensors),
+            *(group["lr"].data_ptr() for group in self.optimizer.param_groups),
         )
 
     def render_options(self) -> dict[str, Any]:
@@ -335,15 +337,18 @@ class Trainer:
             mask = view.counts if view.empty is None else ~view.empty
             seen = camera.project(points.to(self.device))
             found = visible_points(*seen, camera.width, camera.height, mask)
-            # As many for every view, so that all their steps are launched alike.
-            most = max(len(v.points) for v in self.scene.train if v.points is not None)
-            places = torch.zeros(most, dtype=torch.int64, device=self.device)
-            expected = torch.zeros(most, device=self.device)
-            if found is not None:
-                places[: len(found[0])], expected[: len(found[0])] = found
-            self.points[key] = places, expected
+            none = torch.zeros(0, dtype=torch.int64, device=self.device), torch.zeros(0, device=self.device)
+            self.points[key] = none if found is None else found
         places, expected = self.points[key]
+        # As many for every view, so that all their steps are launched alike; also where they are not recorded, since
+        # sums of other lengths are other bits.
+        fill = self._most_points - len(places) if self.device.type == "cuda" else 0
+        places, expected = (torch.nn.functional.pad(x, (0, fill)) for x in (places, expected))
         return dataclasses.replace(view, places=places, expected=expected)
+
+    @cached_property
+    def _most_points(self) -> int:
+        return max(len(view.points) for view in self.scene.train if view.points is not None)
 
     def finish(self) -> Model:
         """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
@@ -425,7 +430,8 @@ class Trainer:
         """
         tensors, state = load_checkpoint(run, warn)
         try:
-            if Config.from_dict(state["config"]) != self.config:
+            saved = dataclasses.replace(Config.from_dict(state["config"]), cuda_graphs=self.config.cuda_graphs)
+            if saved != self.config:
                 raise ValueError("its settings are others")
             if state["views"] != self.views.fingerprint():
                 raise ValueError("it has seen other training views than the scene has")
@@ -483,6 +489,8 @@ class Trainer:
         np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
         version, internal, gauss = state["python"]
         random.setstate((version, tuple(internal), gauss))
+        if self.graphs is not None:
+            self.graphs.clear()
         self.iteration, self.seconds, self.order = state["iteration"], state["seconds"], list(state["order"])
         self.rate_factor = state["rate_factor"]
         self.loss_log, self.checked = LossLog(), self.iteration

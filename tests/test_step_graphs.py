@@ -1,14 +1,17 @@
 """Training steps as CUDA graphs: the bits of launched steps, whatever changes on the way; launches where one fails."""
 
 import dataclasses
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from nexwarp import ops, step_graphs
+from nexwarp import ops, step_graphs, training_views
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene, View
 from nexwarp.densify import DensifyConfig
@@ -106,29 +109,115 @@ def test_sizes_beyond_the_first_few_are_launched(tiny_scene: Scene, monkeypatch:
     assert_same_state(replayed, launched)
 
 
-@pytest.mark.parametrize("error", [RuntimeError("no"), torch.OutOfMemoryError("out of memory")], ids=str)
+def test_sizes_of_long_ago_make_room(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
+    monkeypatch.setattr(step_graphs, "MOST_KINDS", 2)
+    monkeypatch.setattr(step_graphs, "FORGOTTEN", 20)
+    replayed = trained(tiny_scene, coarse=0.5)
+    assert replayed.graphs is not None
+    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
+    assert widths == {tiny_scene.train[0].camera.width}
+    assert_same_state(replayed, launched)
+
+
+def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
+    """Nothing else has started Warp."""
+    code = (
+        "import nexwarp as nw; from nexwarp.config import Config; from nexwarp.trainer import Trainer\n"
+        f"trainer = Trainer(nw.load_scene({str(tiny_folder)!r}), Config(iterations=8, max_surfels=100), 'cuda')\n"
+        "trainer.run(); assert any(stage.graph for stage in trainer.graphs.stages.values())"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_photos_on_the_host_and_random_backgrounds(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training_views, "PHOTO_SHARE", 0.0)
+    scene = dataclasses.replace(tiny_scene, random_background=True)
+    launched = trained(scene, cuda_graphs=False)
+    replayed = trained(scene)
+    assert replayed.views.pool is not None and graphs_of(replayed) > 0
+    assert_same_state(replayed, launched)
+
+
+def test_going_back_changes_nothing(tiny_scene: Scene) -> None:
+    """From divergence: the steps after it are those of a launched training that goes back, too."""
+    runs = []
+    for graphs in (False, True):
+        trainer = Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
+        poisoned: list[int] = []
+
+        def poison(progress: Any, trainer: Trainer = trainer, poisoned: list[int] = poisoned) -> None:
+            if progress.iteration == 53 and not poisoned:
+                poisoned.append(1)
+                with torch.no_grad():
+                    trainer.surfels.sh0[0] = float("nan")
+
+        warnings: list[str] = []
+        trainer.run(poison, warnings.append)
+        assert poisoned and len(warnings) == 1
+        runs.append(trainer)
+    assert_same_state(runs[1], runs[0])
+
+
+def wait_in_vain() -> None:
+    """What invalidates a capture."""
+    torch.ones(1, device="cuda").item()
+
+
+def fail() -> None:
+    raise RuntimeError("no")
+
+
+def lack_memory() -> None:
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+
+@pytest.mark.parametrize("fault", [wait_in_vain, fail, lack_memory])
 def test_a_capture_that_fails_leaves_training_as_it_is(
-    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, error: RuntimeError
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None]
 ) -> None:
     """In the middle of a step, too: what it did to the gradients is gone."""
     launched = trained(tiny_scene, cuda_graphs=False)
-    replayed = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    replayed: Any = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     real = ops.captured
+
+    calls = []
 
     @contextmanager
     def failing(*arguments: Any) -> Iterator[None]:
+        calls.append(1)
         with real(*arguments):
             yield
-            raise error
+            if len(calls) > 1:  # the first one is not of a step
+                fault()
 
     monkeypatch.setattr(ops, "captured", failing)
-    if isinstance(error, torch.OutOfMemoryError):
+    if fault is lack_memory:
         replayed.run()
     else:
-        with pytest.warns(UserWarning, match="launched kernel by kernel, which is slower: no"):
+        with pytest.warns(UserWarning, match="launched kernel by kernel, which is slower: "):
             replayed.run()
-    assert replayed.graphs is not None and not replayed.graphs.able and not replayed.graphs.stages
+    assert replayed.graphs.chances == 0 and not replayed.graphs.stages and replayed.graphs.keeper is None
     assert_same_state(replayed, launched)
+
+
+def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: Scene) -> None:
+    launched = trained(tiny_scene, cuda_graphs=False)
+    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    learn, failed = trainer._learn, []
+
+    def failing(view: Any) -> Any:
+        if trainer.iteration == 31 and not failed:  # the first step after a round
+            assert graphs_of(trainer) > 0
+            failed.append(1)
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return learn(view)
+
+    trainer._learn = failing  # type: ignore[method-assign]
+    trainer.run()
+    assert failed and trainer.graphs is not None and trainer.graphs.chances == step_graphs.CHANCES - 1
+    assert_same_state(trainer, launched)
 
 
 def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +225,7 @@ def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeyp
     launched = trained(tiny_scene, cuda_graphs=False)
     trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     answers = iter(bool(i % 7) for i in range(10_000))
-    monkeypatch.setattr(ops, "roomy", lambda tiles: next(answers))
+    monkeypatch.setattr(ops, "roomy", lambda room: next(answers))
     trainer.run()
     assert next(answers) is not None
     assert_same_state(trainer, launched)

@@ -8,7 +8,7 @@ from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import Tiles, intersect_tiles, roomy
+from nexwarp.ops.tiles import Room, Tiles, intersect_tiles, roomy
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Hits",
     "Pinhole",
     "Projection",
+    "Room",
     "Tiles",
     "activate",
     "captured",

@@ -1,6 +1,7 @@
 """The torch <-> Warp boundary: arrays, types, devices and streams."""
 
 import functools
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -72,7 +73,12 @@ def stream_of(tensor: torch.Tensor) -> wp.Stream | None:
 
 def stream_on(stream: torch.cuda.Stream) -> wp.Stream:
     """Warp's view of a stream of torch."""
+    wp.init()
     return _stream(stream.device_index, stream.cuda_stream)
+
+
+# Warp's own sorts and scans go to its current stream, which is one for all threads: who sets it holds this.
+warp_streams = threading.RLock()
 
 
 def launch(

@@ -1,14 +1,13 @@
-"""Recording of launches, torch's and Warp's alike, as a CUDA graph."""
+"""Recording of launches, torch's and Warp's alike, as CUDA graphs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from typing import Any
 
 import torch
 import warp as wp
 
-from nexwarp.ops._interop import stream_on
+from nexwarp.ops._interop import stream_on, warp_streams
 
 
 @contextmanager
@@ -17,12 +16,12 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
 
     Memory comes from `pool`, which several graphs may share that are replayed one after another. Unlike
     `torch.cuda.graph` this neither waits for the GPU nor gives cached memory back, so that it is worth doing often.
-    Other threads may go on using the GPU.
+    Other threads may go on using the GPU, but not wait for the whole of it; where they render, they wait for the end.
     """
+    ours = stream_on(stream)  # before: Warp may have to start first
     stream.wait_stream(torch.cuda.current_stream(stream.device))
-    with torch.cuda.stream(stream):
+    with warp_streams, torch.cuda.stream(stream):
         graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-        ours = stream_on(stream)
         try:
             # Lets Warp take the temporary memory of its sorts from the graph.
             wp.capture_begin(stream=ours, external=True, capture_mode=wp.CaptureMode.THREAD_LOCAL)
@@ -30,8 +29,13 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
             wp.capture_end(stream=ours)
             graph.capture_end()
         except BaseException:
-            for end in (partial(wp.capture_end, stream=ours), graph.capture_end):
-                with suppress(RuntimeError):  # what went wrong was told
-                    end()
+            # What went wrong was told.
+            with suppress(RuntimeError):
+                wp.capture_end(stream=ours)
+            try:
+                graph.capture_end()
+            except RuntimeError:
+                with suppress(RuntimeError):  # some versions of torch leave their allocator capturing
+                    torch._C._cuda_endAllocateToPool(stream.device_index, pool)
             raise
     torch.cuda.current_stream(stream.device).wait_stream(stream)

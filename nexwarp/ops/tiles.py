@@ -18,13 +18,28 @@ from nexwarp.kernels.tiles import (
     tile_offsets_kernel,
 )
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of, stream_of
+from nexwarp.ops._interop import array, launch, real_of, stream_of, warp_streams
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
 LANES = 8
+
+
+@dataclass(frozen=True)
+class Room:
+    """How much room lists have, and what to ask for how much they need.
+
+    Attributes:
+        entries: M, that there is room for.
+        ends: (N,) int32, as in `Tiles`.
+        kind: what renderings that need about as much have in common.
+    """
+
+    entries: int
+    ends: torch.Tensor
+    kind: tuple[int, int, bool]
 
 
 @dataclass(frozen=True)
@@ -42,7 +57,7 @@ class Tiles:
         columns: tiles in a row.
         exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
             or, when `ends` says that there are more than M, the lists are incomplete and the walk goes over `order`.
-        kind: what renderings that need about as much room have in common.
+        kind: as in `Room`.
     """
 
     order: torch.Tensor
@@ -55,6 +70,11 @@ class Tiles:
     columns: int
     exact: bool
     kind: tuple[int, int, bool]
+
+    @property
+    def room(self) -> Room:
+        """All of the lists that is worth keeping of a rendering."""
+        return Room(len(self.surfel_ids), self.ends, self.kind)
 
 
 def intersect_tiles(
@@ -164,7 +184,7 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     if count == 0:
         return
     arrays = [wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)]
-    with wp.ScopedStream(stream_of(keys), sync_enter=False):
+    with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
 
 
@@ -173,7 +193,7 @@ def _scan(counts: torch.Tensor) -> None:
     if len(counts) == 0:
         return
     ends = wp.from_torch(counts, dtype=wp.int32)
-    with wp.ScopedStream(stream_of(counts), sync_enter=False):
+    with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
         wp.utils.array_scan(ends, ends, inclusive=True)
 
 
@@ -230,9 +250,9 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     return need.room
 
 
-def roomy(tiles: Tiles) -> bool:
+def roomy(room: Room) -> bool:
     """Whether lists that a CUDA graph fills have the room that their kind is known to need; asked after each replay."""
-    return tiles.exact or _room(tiles.ends, tiles.kind) <= len(tiles.surfel_ids)
+    return _room(room.ends, room.kind) <= room.entries
 
 
 def _with_margin(total: int) -> int:
