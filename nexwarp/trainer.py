@@ -24,7 +24,7 @@ from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
-from nexwarp.initial import initial_surfels, texture_shape
+from nexwarp.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
 from nexwarp.step_graphs import Learnt, StepGraphs
@@ -79,6 +79,7 @@ class Trainer:
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
         self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
+        self.cells_unit = cells_unit(scene, config)
         self.optimizer = _make_optimizer(self.surfels, self.texture, config, scene.scale)
         self.densifier = Densifier(_densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration = 0
@@ -525,7 +526,7 @@ class Trainer:
             target=view.photo,
             opacities=self.surfels.opacities,
             grid=self.texture.grid if textured else None,
-            resolutions=self.texture.resolutions if textured else None,
+            resolutions=self.texture.resolutions * self.cells_unit if textured else None,
             loss_weights=factors,
             mask=view.counts,
             empty=view.empty,

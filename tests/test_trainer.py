@@ -21,6 +21,7 @@ from nexwarp.initial import initial_surfels, quats_towards, texture_shape
 from nexwarp.losses import LossWeights
 from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
+from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -385,6 +386,19 @@ def test_texture_follows_the_scale_of_the_scene(scene, factor):
     for end in ("min_resolution", "max_resolution"):
         assert other.pop(end) == pytest.approx(one.pop(end) / factor, rel=1e-4)
     assert one == other
+
+
+@pytest.mark.parametrize("factor", [64.0, 1 / 64])
+def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
+    """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
+    config = small(iterations=40, texture=dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None))
+    runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
+    for step in range(config.iterations):
+        one, other = (torch.stack(list(trainer.step().losses.values())) for trainer in runs)
+        assert_close(other, one, kind="gradient", name=f"losses of step {step}")
+    assert len(runs[0].surfels) == len(runs[1].surfels)
+    images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
+    assert_close(images[1], images[0], kind="gradient", name="image")
 
 
 def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
