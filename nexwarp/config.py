@@ -322,7 +322,7 @@ PRESETS: dict[str, Config] = {
         orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
         texture=TextureConfig(table_size=2**20, min_resolution=16.0, max_resolution=256.0, residual=False),
-        losses=LossWeights(depth=0.0),
+        losses=LossWeights(depth=0.0, alpha_hits=MAX_HITS),
         densify=DensifyConfig(prune_at_cap=False),
     ),
 }

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
+from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
@@ -23,6 +24,8 @@ class LossWeights:
     """Share of D-SSIM in the image loss; L1 has the rest."""
     alpha: float = 0.005
     """Penalty on blending weight that is not textured."""
+    alpha_hits: int = 2
+    """Of the textured hits, how many of the heaviest count for that."""
     texture: float = 0.5
     """L1 between the un-premultiplied texture and the photograph."""
     opacity: float = 0.01
@@ -39,6 +42,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
+        check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
         for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
@@ -82,6 +86,8 @@ def training_losses(
     if empty is not None:
         check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
         _, textured, weights = _masked(image, textured, weights, target, ~empty)
+    # More of them would let surfaces be more transparent, which new views tell from the training photos.
+    some = weights.shape[-1] > factors.alpha_hits
     l1_term, texture_term, alpha_term = photometric_terms(
         image,
         textured,
@@ -89,8 +95,10 @@ def training_losses(
         target,
         l1=1.0 - factors.dssim,
         texture=factors.texture * has_slots,
-        alpha=factors.alpha * has_slots,
+        alpha=factors.alpha * (has_slots and not some),
     )
+    if some and factors.alpha > 0.0:
+        alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
     terms = {
         "l1": l1_term,
         "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,

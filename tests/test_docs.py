@@ -58,6 +58,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "cuda_graphs": ("", ""),
     "losses.dssim": ("λ_D-SSIM", "Losses"),
     "losses.alpha": ("λ_alpha", "Losses"),
+    "losses.alpha_hits": ("", ""),
     "losses.texture": ("λ_texture", "Losses"),
     "losses.opacity": ("λ_opacity", "Losses"),
     "losses.grid": ("λ_grid", "Losses"),

@@ -208,6 +208,20 @@ def test_training_losses_are_the_papers_total() -> None:
         assert_close(terms[name], value, kind="value", name=name)
 
 
+@pytest.mark.parametrize(("slots", "counted"), [(1, 2), (2, 2), (4, 2), (4, 1), (3, 8)])
+def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
+    """For the term of the weights alone: the texture's has all of them."""
+    given = arguments(slots)
+    given["weights"].requires_grad_()
+    terms = losses.training_losses(**given, loss_weights=LossWeights(alpha_hits=counted))
+    missing = 1 - given["weights"].detach()[..., :counted].sum(-1)
+    assert_close(terms["alpha"], 0.005 * missing.mean(), kind="value", name="alpha")
+    (grad,) = torch.autograd.grad(terms["alpha"], given["weights"], retain_graph=True)
+    assert bool((grad[..., :counted] < 0).all()) and not grad[..., counted:].any()
+    texture = 0.5 * losses.texture_loss(given["textured"], given["weights"], given["target"])
+    assert_close(terms["texture"], texture, kind="value", name="texture")
+
+
 def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     def names(given: dict[str, torch.Tensor | None], **weights: float) -> set[str]:
         return set(losses.training_losses(**given, loss_weights=LossWeights(**weights)))

@@ -273,7 +273,9 @@ def test_paper_is_the_paper():
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
     assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
     assert p.coarse == 0.0
-    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
+    assert p.losses == LossWeights(
+        dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0, alpha_hits=8
+    )
     assert (p.border, p.mask_mode, p.footprints, p.exposures) == (0.0, "ignore", False, False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
