@@ -127,7 +127,7 @@ class Config:
     deterministic: bool = False
     """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
     cuda_graphs: bool = True
-    """On CUDA, repeat steps as CUDA graphs: the same arithmetic, faster, with some more memory."""
+    """On CUDA, repeat steps as CUDA graphs instead of launching each kernel: the same arithmetic, more memory."""
     losses: LossWeights = field(default_factory=LossWeights)
     """Factors of the loss terms."""
     rates: LearningRates = field(default_factory=LearningRates)

@@ -15,7 +15,7 @@ from nexwarp.surfels import Surfels
 INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
-USUAL_SCALE = 5.0
+USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 
@@ -92,7 +92,7 @@ def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
 def cells_unit(scene: Scene, config: Config) -> float:
     """World units in which the grid's loss counts its cells: a scene's own where the grid follows the scene.
 
-    Real scenes have a scale near `USUAL_SCALE` as COLMAP leaves them.
+    Scenes of `USUAL_SCALE` keep the loss as the paper has it.
     """
     return scene.scale / USUAL_SCALE if config.texture.max_resolution is None else 1.0
 

@@ -86,7 +86,7 @@ def training_losses(
     if empty is not None:
         check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
         _, textured, weights = _masked(image, textured, weights, target, ~empty)
-    # More of them would let surfaces be more transparent, which new views tell from the training photos.
+    # With all of K = 4 test views came out worse than with K = 2: benchmarks/NOTES.md.
     some = weights.shape[-1] > factors.alpha_hits
     l1_term, texture_term, alpha_term = photometric_terms(
         image,

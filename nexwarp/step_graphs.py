@@ -86,7 +86,7 @@ class StepGraphs:
             except CaptureError as error:
                 self.chances = self.chances - 1 if error.memory else 0
                 if not error.memory:
-                    told = f"training steps are launched kernel by kernel, which is slower: {error}"
+                    told = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
                     warnings.warn(told, stacklevel=2)
             except RuntimeError as error:
                 # Graphs keep memory of their own, which may be what is missing.
