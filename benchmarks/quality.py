@@ -87,14 +87,15 @@ class Job:
 PAPER = Row("paper", "paper")
 DEFAULT = Row("default")
 PEER = Row(GSPLAT, None)
+NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
 # The paper's ablation (its Sec. "Ablations").
 REMOVALS = (
-    Row("no texture", settings={"max_hits": 0}),
+    NO_TEXTURE,
     Row("no gamma", settings={"rates.gammas": 0.0}),
     Row("no higher SH of surfels", settings={"sh_degree": 0, "texture.sh_degree": 3}),
     Row("no down-weighting", settings={"texture.down_weighting": False}),
 )
-HITS = tuple(Row(f"K = {k}", settings={"max_hits": k}) for k in (0, 1, 3, 4))
+HITS = tuple(Row(f"K = {k}", settings={"max_hits": k}) for k in (1, 3, 4))
 # Each undoes one change of the default preset against the paper.
 CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
@@ -139,7 +140,7 @@ def jobs_of(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations:
     elif table == "ablation":
         yield from each((DEFAULT, *REMOVALS), (size,))
     elif table == "hits":
-        yield from each((DEFAULT, *HITS), (size,))
+        yield from each((DEFAULT, NO_TEXTURE, *HITS), (size,))
     elif table == "changes":
         yield from each((DEFAULT, *CHANGES), (size,))
     elif table == "arc":
