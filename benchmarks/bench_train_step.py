@@ -52,7 +52,9 @@ def make_trainer(scene: Scene, options: Options) -> Trainer:
     large = count >= 20_000
     # The garden of the paper has photos enough for the largest table, whatever is drawn here.
     table = 2**20 if count >= GARDEN else None
-    shape = TextureConfig(table_size=table) if large else TextureConfig(levels=8, table_size=2**15, width=32)
+    shape = (
+        TextureConfig(table_size=table) if large else TextureConfig(levels=8, table_size=2**15, features=2, width=32)
+    )
     config = Config(max_surfels=count, texture=shape)
     surfels = scene.surfels.to(options.device)
     trainer = Trainer(photos(scene, options), config, options.device)

@@ -112,6 +112,7 @@ CHANGES = (
     Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
     Row("no jitter of depths", settings={"depth_jitter": 0.0}),
     Row("paper's table", settings={"texture.table_size": 2**20}),
+    Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),
     Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
 )
 ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES)}

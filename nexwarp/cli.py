@@ -70,6 +70,7 @@ DEMO_SETTINGS: dict[str, Any] = {
     "depth_jitter": 0.5,
     "texture.levels": 12,
     "texture.table_size": 2**15,
+    "texture.features": 2,
     "texture.width": 32,
     "rates.means": (5e-4, 5e-6),
     "rates.quats": 5e-3,

@@ -56,11 +56,11 @@ class LearningRates:
 class TextureConfig:
     """Shape of the neural texture (paper Sec. 4)."""
 
-    levels: int = 16
+    levels: int = 8
     """L, resolution levels."""
     table_size: int | None = None
     """T, entries a level, a power of two; None follows the number of the training photos' pixels."""
-    features: int = 2
+    features: int = 4
     """F, features an entry."""
     min_resolution: float | None = None
     """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
@@ -321,7 +321,9 @@ PRESETS: dict[str, Config] = {
         filter_points=False,
         orient_points=False,
         rates=LearningRates(mlp=(1e-3, 1e-3)),
-        texture=TextureConfig(table_size=2**20, min_resolution=16.0, max_resolution=256.0, residual=False),
+        texture=TextureConfig(
+            levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
+        ),
         losses=LossWeights(depth=0.0, alpha_hits=MAX_HITS),
         densify=DensifyConfig(prune_at_cap=False),
     ),

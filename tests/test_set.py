@@ -128,7 +128,7 @@ def test_a_run_keeps_what_was_set(run):
     changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "border": 0}
     changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
     assert config == with_settings(preset("default"), changes)
-    assert nw.load(run).texture.grid.shape == (4, 256, 2)
+    assert nw.load(run).texture.grid.shape == (4, 256, 4)
 
 
 def test_resume_agrees_or_is_refused(run, scene, capsys):

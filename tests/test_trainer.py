@@ -423,7 +423,7 @@ def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
     ("pixels", "power"), [(21_600_000, 16), (9_000_000, 15), (330_000_000, 20), (1000, 12), (10**12, 20)]
 )
 def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, power):
-    """A tenth of a number for each pixel, 16 levels of 2 numbers an entry, and at most the paper's size."""
+    """A tenth of a number for each pixel, 8 levels of 4 numbers an entry, and at most the paper's size."""
     each = pixels // len(scene.train)
     camera = Camera(torch.eye(4), torch.eye(3), 1000, each // 1000) if each >= 1000 else scene.train[0].camera
     views = [dataclasses.replace(view, camera=camera) for view in scene.train]

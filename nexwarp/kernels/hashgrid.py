@@ -24,21 +24,14 @@ from nexwarp.kernels.types import types
 PRIME_Y = wp.constant(wp.uint32(2654435761))
 PRIME_Z = wp.constant(wp.uint32(805459861))
 
-# Two-float atomics exist from sm_90 on; they halve the number of atomics of the backward pass.
-_ADD_PAIR = """
+# Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
+_ADD = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<float2*>(&wp::index(table, level, slot)), make_float2(value[0], value[1]));
+    atomicAdd(reinterpret_cast<floatN*>(&wp::index(table, level, slot)), make_floatN(VALUES));
 #else
     wp::atomic_add(table, level, slot, value);
 #endif
 """
-
-
-@wp.func_native(_ADD_PAIR)
-def add_pair(table: wp.array2d(dtype=wp.vec2), level: wp.int32, slot: wp.int32, value: wp.vec2):
-    """Add a float pair to table[level, slot] atomically."""
-    ...
-
 
 # Neighbouring pixels fall into the same cell of a coarse level: the lanes of a cell add up theirs in a tree, and only
 # the first of them goes on to the atomics. Absent lanes (a part-filled warp, empty hits) are left out by the mask.
@@ -54,7 +47,7 @@ _MERGE = """
     while (__any_sync(active, rest != 0u)) {
         const int next = __ffs(rest) - 1;
         for (int j = 0; j < 8; ++j) {
-            for (int k = 0; k < 2; ++k) {
+            for (int k = 0; k < N; ++k) {
                 const float other = __shfl_sync(active, value.data[j][k], next < 0 ? lane : next);
                 if (next >= 0) value.data[j][k] += other;
             }
@@ -63,18 +56,33 @@ _MERGE = """
         rank >>= 1;
     }
     if (!first) {
-        for (int j = 0; j < 8; ++j) for (int k = 0; k < 2; ++k) value.data[j][k] = 0.0f;
+        for (int j = 0; j < 8; ++j) for (int k = 0; k < N; ++k) value.data[j][k] = 0.0f;
     }
 #endif
     return value;
 """
-Corners = wp.types.matrix(shape=(8, 2), dtype=wp.float32)
 
 
-@wp.func_native(_MERGE)
-def merge_cells(x: wp.int32, y: wp.int32, z: wp.int32, value: Corners) -> Corners:
-    """Return the sum of the values of all lanes with the cell (x, y, z) in the first of them, zeros in the others."""
-    ...
+@functools.cache
+def scatter_functions(features: int) -> SimpleNamespace:
+    """Make `merge_cells` and `add_row` for tables of rows of 2 or 4 floats."""
+    row = wp.types.vector(length=features, dtype=wp.float32)
+    corners = wp.types.matrix(shape=(8, features), dtype=wp.float32)
+    values = ", ".join(f"value[{k}]" for k in range(features))
+    merge = _MERGE.replace("N;", f"{features};")
+    add = _ADD.replace("floatN", f"float{features}").replace("VALUES", values)
+
+    @wp.func_native(merge)
+    def merge_cells(x: wp.int32, y: wp.int32, z: wp.int32, value: corners) -> corners:
+        """Return the sum over all lanes with the cell (x, y, z) in the first of them, zeros in the others."""
+        ...
+
+    @wp.func_native(add)
+    def add_row(table: wp.array2d(dtype=row), level: wp.int32, slot: wp.int32, value: row):
+        """Add to table[level, slot] atomically."""
+        ...
+
+    return SimpleNamespace(merge_cells=merge_cells, add_row=add_row)
 
 
 @wp.func
@@ -191,7 +199,9 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
     load = load_function(features, storage)
     options = {"fast_math": real is wp.float32}
     # In fixed point the lanes of a cell do not add up theirs first: which ones come together may change.
-    pairs = features == 2 and real is wp.float32 and not fixed
+    merged = features in (2, 4) and real is wp.float32 and not fixed
+    scatter = scatter_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
+    merge_cells, add_row = scatter.merge_cells, scatter.add_row
     table_of_sums = wp.array2d(dtype=wp.int64) if fixed else wp.array2d(dtype=vec)
     add_units = fixed_units(real)
 
@@ -270,7 +280,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
             gx, gy, gz, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
                 x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0], grad
             )
-            if wp.static(pairs):
+            if wp.static(merged):
                 gc = merge_cells(corner[0], corner[1], corner[2], gc)
             for j in range(8):
                 if wp.static(fixed):
@@ -279,11 +289,14 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
                         add_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
                 else:
                     part = vec()
+                    some = int(0)
                     for k in range(wp.static(features)):
                         part[k] = gc[j, k]
-                    if wp.static(pairs):
-                        if part[0] != real(0.0) or part[1] != real(0.0):
-                            add_pair(grad_table, level, hash_slot(corner, j, mask), part)
+                        if part[k] != ZERO:
+                            some = 1
+                    if wp.static(merged):
+                        if some != 0:
+                            add_row(grad_table, level, hash_slot(corner, j, mask), part)
                     else:
                         wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
             total += vec4(gx * scale, gy * scale, gz * scale, gd)

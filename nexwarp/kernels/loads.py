@@ -37,7 +37,26 @@ _LOAD_HALF2 = """
 #endif
 """
 
-_SNIPPETS = {(4, wp.float32): _LOAD_FLOAT4, (2, wp.float32): _LOAD_FLOAT2, (2, wp.float16): _LOAD_HALF2}
+_LOAD_HALF4 = """
+#if defined(__CUDA_ARCH__)
+    const uint2 bits = __ldg(reinterpret_cast<const uint2*>(&wp::index(rows, i, j)));
+    wp::vec_t<4, wp::half> v;
+    v.c[0].u = (unsigned short)(bits.x & 0xffffu);
+    v.c[1].u = (unsigned short)(bits.x >> 16);
+    v.c[2].u = (unsigned short)(bits.y & 0xffffu);
+    v.c[3].u = (unsigned short)(bits.y >> 16);
+    return v;
+#else
+    return wp::index(rows, i, j);
+#endif
+"""
+
+_SNIPPETS = {
+    (4, wp.float32): _LOAD_FLOAT4,
+    (2, wp.float32): _LOAD_FLOAT2,
+    (4, wp.float16): _LOAD_HALF4,
+    (2, wp.float16): _LOAD_HALF2,
+}
 
 
 @functools.cache
