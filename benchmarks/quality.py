@@ -1,7 +1,7 @@
 """Quality on real scenes: nexwarp beside gsplat's 3DGS-MCMC, the paper's ablations, the worth of each change of ours.
 
     python -m benchmarks.quality train --tables peers,hits --data DIR --out results.jsonl
-    python -m benchmarks.quality table results.jsonl --out quality.md
+    python -m benchmarks.quality table results.jsonl --out quality.md --json quality.json
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
@@ -14,6 +14,7 @@ weights of VGG and is left out where they cannot be had. Speed and memory of a t
 import argparse
 import dataclasses
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -396,8 +397,11 @@ def _worker(job: Job, row: Row, data: Path, pictures: Path | None, models: Path 
 
 
 def table(given: argparse.Namespace) -> int:
-    """Write Markdown."""
-    text = markdown(read_results(given.results))
+    """Write Markdown, and JSON where that is asked for."""
+    results = read_results(given.results)
+    text = markdown(results)
+    if given.json:
+        given.json.write_text(json.dumps({"convention": CONVENTION, "rows": summary(results)}, indent=1) + "\n")
     if given.out:
         given.out.write_text(text)
     else:
@@ -405,26 +409,55 @@ def table(given: argparse.Namespace) -> int:
     return 0
 
 
-def markdown(results: dict[Job, dict[str, Any]]) -> str:
-    """All results, one table for each scene, variant, size and length, seeds together; best PSNR first."""
-    lines = ["# Quality", "", CONVENTION, ""]
-    groups: dict[tuple, dict[str, list[dict]]] = {}
+def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Results with seeds together, by scene, variant, size and length, best PSNR first.
+
+    Each has the settings that differ from its preset, the seeds, and, by figure, [mean, standard deviation] over those
+    that have it, None without any: the metrics, `megabytes`, and `seconds`, `rate` (it/s) and `peak_mib` of trainings
+    that ran alone. The standard deviation of one is None.
+    """
+    groups: dict[tuple, list[tuple[Job, dict[str, Any]]]] = {}
     for job, result in results.items():
-        key = (job.scene, job.variant, job.size, job.iterations)
-        groups.setdefault(key, {}).setdefault(job.row, []).append(result)
-    for (scene, variant, size, iterations), rows in sorted(groups.items()):
-        title = f"{scene}{', ' + variant if variant else ''}, {size:,} primitives, {iterations:,} iterations"
-        lines += [f"## {title}", "", "| | " + " | ".join(UNITS[m] for m in METRICS) + " | MB | s | MiB | seeds |"]
-        lines += ["|---" * (len(METRICS) + 5) + "|"]
-        for name, found in sorted(rows.items(), key=lambda item: -_mean(r["psnr"] for r in item[1])):
-            cells = [_cell([r[m] for r in found], DIGITS[m]) for m in METRICS]
-            alone = [r for r in found if r.get("jobs") == 1]
-            cells.append(_cell([r["megabytes"] for r in found], 1))
-            cells.append(_cell([r["seconds"] for r in alone], 0))
-            cells.append(_cell([r.get("peak_mib") for r in alone], 0))
-            lines.append(f"| {name} | " + " | ".join(cells) + f" | {len(found)} |")
-        lines.append("")
-    return "\n".join(lines)
+        groups.setdefault((job.scene, job.variant, job.size, job.iterations, job.row), []).append((job, result))
+    rows: list[dict[str, Any]] = []
+    for (scene, variant, size, iterations, name), found in groups.items():
+        each = [result for _, result in found]
+        alone = [result for result in each if result.get("jobs") == 1]
+        figures = {metric: [r[metric] for r in each] for metric in METRICS}
+        figures["megabytes"] = [r["megabytes"] for r in each]
+        figures["seconds"] = [r["seconds"] for r in alone]
+        figures["rate"] = [iterations / r["seconds"] for r in alone]
+        figures["peak_mib"] = [r.get("peak_mib") for r in alone]
+        key = {"scene": scene, "variant": variant, "size": size, "iterations": iterations, "row": name}
+        known = {"settings": each[0]["settings"], "seeds": sorted(job.seed for job, _ in found)}
+        known["commits"] = sorted({r["commit"] for r in each})
+        rows.append(key | known | {figure: _spread(values) for figure, values in figures.items()})
+
+    def order(row: dict[str, Any]) -> tuple:
+        return row["scene"], row["variant"], row["size"], row["iterations"], -(row["psnr"] or [-math.inf])[0]
+
+    return sorted(rows, key=order)
+
+
+def markdown(results: dict[Job, dict[str, Any]]) -> str:
+    """All of `summary`."""
+    rows = summary(results)
+    lines = ["# Quality", "", CONVENTION, ""]
+    if any(row["lpips"] is None for row in rows):
+        lines += ["LPIPS is left out where the weights of VGG could not be had.", ""]
+    columns = [*(UNITS[m] for m in METRICS), "MB", "s", "it/s", "MiB", "seeds"]
+    digits = DIGITS | {"megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
+    title = ""
+    for row in rows:
+        variant = f", {row['variant']}" if row["variant"] else ""
+        here = f"{row['scene']}{variant}, {row['size']:,} primitives, {row['iterations']:,} iterations"
+        if here != title:
+            lines += [""] * bool(title) + [f"## {here}", "", f"| | {' | '.join(columns)} |"]
+            lines += ["|---" * (len(columns) + 1) + "|"]
+            title = here
+        cells = [_cell(row[figure], digits[figure]) for figure in digits]
+        lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
+    return "\n".join([*lines, ""])
 
 
 def curve(given: argparse.Namespace) -> int:
@@ -474,12 +507,16 @@ def curves_of(
     }
 
 
-def _cell(values: list[float | None], digits: int) -> str:
+def _spread(values: Iterable[float | None]) -> list[float | None] | None:
+    """[mean, standard deviation]; None of nothing."""
     values = [x for x in values if x is not None]
     if not values:
-        return ""
-    spread = f" +- {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):.{digits}f}{spread}"
+        return None
+    return [statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None]
+
+
+def _cell(values: list[float | None] | None, digits: int) -> str:
+    return " +- ".join(f"{value:.{digits}f}" for value in values or () if value is not None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -504,6 +541,7 @@ def main(arguments: list[str] | None = None) -> int:
     tables.set_defaults(run=table)
     tables.add_argument("results", type=Path, nargs="+")
     tables.add_argument("--out", type=Path, help="file to write; default: the screen")
+    tables.add_argument("--json", type=Path, help="file to write the same to, as JSON")
     curves = commands.add_parser("curve", help="draw a metric over the number of primitives")
     curves.set_defaults(run=curve)
     curves.add_argument("results", type=Path, nargs="+")

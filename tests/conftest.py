@@ -1,6 +1,8 @@
 """Fixtures that every test may use."""
 
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,23 @@ import nexwarp as nw
 from nexwarp import config
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
+
+# So many tests that they wait for most kernels.
+MANY = 500
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compilers(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Run of all tests: kernels that are not in Warp's cache yet are compiled beside the first tests."""
+    if len(request.session.items) < MANY or request.config.option.markexpr == "cuda":
+        yield
+        return
+    root = Path(__file__).parents[1]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    ahead = subprocess.Popen([sys.executable, "-m", "tests.compile_ahead"], cwd=root, **quiet)
+    yield
+    ahead.kill()
+    ahead.wait()
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -36,13 +37,27 @@ def test_there_are_four() -> None:
     assert NAMES == ["01_one_surfel", "02_passes", "03_train", "04_gpu_vs_cpu"]
 
 
+@pytest.fixture(scope="module")
+def short_forms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[subprocess.CompletedProcess, Path]]:
+    """What running each notebook's short form gave, two at a time, and where it is."""
+
+    def run(name: str) -> tuple[subprocess.CompletedProcess, Path]:
+        folder = tmp_path_factory.mktemp(name)
+        command = [sys.executable, "-m", "notebooks", "--short", "--out", str(folder), name]
+        return subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540), folder
+
+    with ThreadPoolExecutor(2) as pool:
+        return dict(zip(NAMES, pool.map(run, NAMES), strict=True))
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_short_form_runs_from_clean(name: str, tmp_path: Path) -> None:
+def test_short_form_runs_from_clean(
+    name: str, short_forms: dict[str, tuple[subprocess.CompletedProcess, Path]]
+) -> None:
     """Its own assertions hold, nothing is warned of, and every figure of the kept form is drawn."""
-    command = [sys.executable, "-m", "notebooks", "--short", "--out", str(tmp_path), name]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540)
+    done, folder = short_forms[name]
     assert done.returncode == 0, done.stderr
-    kept, run = (nbformat.read(folder / f"{name}.ipynb", as_version=4) for folder in (FOLDER, tmp_path))
+    kept, run = (nbformat.read(where / f"{name}.ipynb", as_version=4) for where in (FOLDER, folder))
     assert [cell.source for cell in kept.cells] == [cell.source for cell in run.cells]
     assert pictures(kept) == pictures(run)
     assert sum(pictures(run)) >= 3

@@ -67,10 +67,10 @@ def test_moved_scenes_look_the_same(scene: Scene) -> None:
         assert (seen - one.camera.project(one.points)[0]).abs().max() < 0.01
 
 
-def result(row: str, seed: int, **figures: float) -> dict:
+def result(row: str, seed: int, **figures: float | str) -> dict:
     job = dataclasses.asdict(Job("fox", "", row, 40, seed, 100))
     figures = {"psnr": 30.0, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0, "seconds": 5.0} | figures
-    return job | figures | {"jobs": 1, "peak_mib": 100}
+    return job | {"settings": {}, "commit": "abc", "jobs": 1, "peak_mib": 100} | figures
 
 
 def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
@@ -89,9 +89,25 @@ def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
     assert rows[0].startswith(f"| {GSPLAT} | 33.00 |")
     assert (
         rows[1]
-        == "| default | 30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  | 2.0 +- 0.0 | 5 +- 0 | 100 +- 0 | 2 |"
+        == "| default | 30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  | 2.0 +- 0.0 | 5 +- 0 | 20.0 +- 0.0 | "
+        "100 +- 0 | 2 |"
     )
     assert "## fox, 40 primitives, 100 iterations" in text
+    assert "LPIPS is left out where the weights of VGG could not be had." in text
+
+
+def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, table = tmp_path / "results.jsonl", tmp_path / "table.json"
+    lines = [result("default", 1), result("default", 0, psnr=32.0), result(GSPLAT, 0, jobs=4, commit="abd")]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert quality.main(["table", str(file), "--json", str(table)]) == 0
+    assert "| default | 31.00 +- 1.41 |" in capsys.readouterr().out
+    found = json.loads(table.read_text())
+    assert "11x11 Gaussian window" in found["convention"]
+    ours, theirs = found["rows"]
+    assert (ours["row"], ours["seeds"], ours["commits"]) == ("default", [0, 1], ["abc"])
+    assert ours["psnr"] == [31.0, pytest.approx(2**0.5)] and ours["rate"] == [20.0, 0.0] and ours["lpips"] is None
+    assert (theirs["row"], theirs["psnr"], theirs["seconds"]) == (GSPLAT, [30.0, None], None)
 
 
 def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
