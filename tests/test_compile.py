@@ -1,27 +1,35 @@
 """Kernels compile for CUDA without a GPU, for NVRTC comes with Warp (CI has no GPU).
 
-Those of the usual K for sm_90, all of them with `-m slow`; for sm_80, where only atomics differ, those of K = 2.
+For sm_90 those of the usual K, and all of them with `-m slow`; for sm_80, where only atomics differ, a default run's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import warp as wp
 
-from nexwarp.kernels.catalogue import all_kernels
+from nexwarp.kernels.catalogue import all_kernels, thread_kernels, walk_kernels
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.tiles import TILE_SIZE
 
-USUAL_HITS = (0, 1, 2, 4, MAX_HITS)
+
+def usual() -> Iterator[wp.Kernel]:
+    return all_kernels(max_hits=(0, 1, 2, 4, MAX_HITS))
+
+
+def one_run() -> Iterator[wp.Kernel]:
+    few = {"degrees": (3,), "features": (2, 4), "clamps": (False,), "low_passes": (False,), "ssim_lanes": (1,)}
+    yield from thread_kernels(wp.float32, wp.float16, TILE_SIZE, **few)
+    yield from walk_kernels(wp.float32, TILE_SIZE, (2,), low_passes=(False,))
 
 
 @pytest.mark.parametrize(
-    ("arch", "max_hits"),
-    [(80, (2,)), (90, USUAL_HITS), pytest.param(90, range(MAX_HITS + 1), marks=pytest.mark.slow)],
+    ("arch", "chosen"), [(80, one_run), (90, usual), pytest.param(90, all_kernels, marks=pytest.mark.slow)]
 )
-def test_every_kernel_compiles_for_cuda(arch: int, max_hits: Sequence[int], tmp_path: Path) -> None:
-    kernels = list(all_kernels(max_hits=max_hits))
+def test_kernels_compile_for_cuda(arch: int, chosen: Callable[[], Iterator[wp.Kernel]], tmp_path: Path) -> None:
+    kernels = list(chosen())
     assert len({kernel.module.name for kernel in kernels}) == len(kernels), "kernels share a module"
 
     def compile_one(kernel: wp.Kernel) -> int:

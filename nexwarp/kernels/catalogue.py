@@ -38,7 +38,7 @@ def all_kernels(
     cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
-    yield from thread_kernels(real, storage, tile_size, cpu=cpu)
+    yield from thread_kernels(real, storage, tile_size, ssim_lanes=(1, LANES) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
 
 
