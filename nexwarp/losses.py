@@ -87,7 +87,7 @@ def training_losses(
         check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
         _, textured, weights = _masked(image, textured, weights, target, ~empty)
     # With all of K = 4 test views came out worse than with K = 2: benchmarks/NOTES.md.
-    some = weights.shape[-1] > factors.alpha_hits
+    all_count = weights.shape[-1] <= factors.alpha_hits
     l1_term, texture_term, alpha_term = photometric_terms(
         image,
         textured,
@@ -95,9 +95,9 @@ def training_losses(
         target,
         l1=1.0 - factors.dssim,
         texture=factors.texture * has_slots,
-        alpha=factors.alpha * (has_slots and not some),
+        alpha=factors.alpha * (has_slots and all_count),
     )
-    if some and factors.alpha > 0.0:
+    if not all_count and factors.alpha > 0.0:
         alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
     terms = {
         "l1": l1_term,

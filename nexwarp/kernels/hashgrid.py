@@ -27,7 +27,7 @@ PRIME_Z = wp.constant(wp.uint32(805459861))
 # Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
 _ADD = """
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<floatN*>(&wp::index(table, level, slot)), make_floatN(VALUES));
+    atomicAdd(reinterpret_cast<floatFEATURES*>(&wp::index(table, level, slot)), make_floatFEATURES(VALUES));
 #else
     wp::atomic_add(table, level, slot, value);
 #endif
@@ -47,7 +47,7 @@ _MERGE = """
     while (__any_sync(active, rest != 0u)) {
         const int next = __ffs(rest) - 1;
         for (int j = 0; j < 8; ++j) {
-            for (int k = 0; k < N; ++k) {
+            for (int k = 0; k < FEATURES; ++k) {
                 const float other = __shfl_sync(active, value.data[j][k], next < 0 ? lane : next);
                 if (next >= 0) value.data[j][k] += other;
             }
@@ -56,7 +56,7 @@ _MERGE = """
         rank >>= 1;
     }
     if (!first) {
-        for (int j = 0; j < 8; ++j) for (int k = 0; k < N; ++k) value.data[j][k] = 0.0f;
+        for (int j = 0; j < 8; ++j) for (int k = 0; k < FEATURES; ++k) value.data[j][k] = 0.0f;
     }
 #endif
     return value;
@@ -69,15 +69,16 @@ def scatter_functions(features: int) -> SimpleNamespace:
     row = wp.types.vector(length=features, dtype=wp.float32)
     corners = wp.types.matrix(shape=(8, features), dtype=wp.float32)
     values = ", ".join(f"value[{k}]" for k in range(features))
-    merge = _MERGE.replace("N;", f"{features};")
-    add = _ADD.replace("floatN", f"float{features}").replace("VALUES", values)
 
-    @wp.func_native(merge)
+    def filled(text: str) -> str:
+        return text.replace("FEATURES", str(features)).replace("VALUES", values)
+
+    @wp.func_native(filled(_MERGE))
     def merge_cells(x: wp.int32, y: wp.int32, z: wp.int32, value: corners) -> corners:
         """Return the sum over all lanes with the cell (x, y, z) in the first of them, zeros in the others."""
         ...
 
-    @wp.func_native(add)
+    @wp.func_native(filled(_ADD))
     def add_row(table: wp.array2d(dtype=row), level: wp.int32, slot: wp.int32, value: row):
         """Add to table[level, slot] atomically."""
         ...
@@ -289,13 +290,14 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
                         add_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
                 else:
                     part = vec()
-                    some = int(0)
                     for k in range(wp.static(features)):
                         part[k] = gc[j, k]
-                        if part[k] != ZERO:
-                            some = 1
                     if wp.static(merged):
-                        if some != 0:
+                        nonzero = int(0)
+                        for k in range(wp.static(features)):
+                            if part[k] != ZERO:
+                                nonzero = 1
+                        if nonzero != 0:
                             add_row(grad_table, level, hash_slot(corner, j, mask), part)
                     else:
                         wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
