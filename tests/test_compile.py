@@ -1,6 +1,6 @@
 """Kernels compile for CUDA without a GPU, for NVRTC comes with Warp (CI has no GPU).
 
-For sm_90 those of the usual K, and all of them with `-m slow`; for sm_80, where only atomics differ, a default run's.
+For sm_90 those of the usual K, for sm_80, where only atomics differ, a default run's; all of them with `-m slow`.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ from nexwarp.ops.tiles import TILE_SIZE
 
 
 def usual() -> Iterator[wp.Kernel]:
-    return all_kernels(max_hits=(0, 1, 2, 4, MAX_HITS))
+    return all_kernels(max_hits=(*range(5), MAX_HITS))
 
 
 def one_run() -> Iterator[wp.Kernel]:
@@ -26,7 +26,8 @@ def one_run() -> Iterator[wp.Kernel]:
 
 
 @pytest.mark.parametrize(
-    ("arch", "chosen"), [(80, one_run), (90, usual), pytest.param(90, all_kernels, marks=pytest.mark.slow)]
+    ("arch", "chosen"),
+    [(80, one_run), (90, usual), *(pytest.param(arch, all_kernels, marks=pytest.mark.slow) for arch in (80, 90))],
 )
 def test_kernels_compile_for_cuda(arch: int, chosen: Callable[[], Iterator[wp.Kernel]], tmp_path: Path) -> None:
     kernels = list(chosen())

@@ -74,15 +74,13 @@ def one_line(capsys: pytest.CaptureFixture, *words: str) -> None:
 def every_fault(run: Path, command: list[str]) -> Iterator[Disk]:
     """Disks that fail one request of a command after the other; each is yielded in place of the command's own.
 
-    A full disk fails all that follow, too; a broken one, of many requests every other, that one alone.
+    A full disk fails all that follow, too; a broken one that one alone.
     """
     with failing(Disk(run)) as counted:
         assert cli.main(command) == 0
-    count = len(counted.requests)
-    for fatal in range(count):
-        yield Disk(run, fatal, FULL, True)
-        if count < 50 or fatal % 2:
-            yield Disk(run, fatal, BROKEN, False)
+    yield from (
+        Disk(run, fatal, number, number == FULL) for fatal in range(len(counted.requests)) for number in (FULL, BROKEN)
+    )
 
 
 # Training
