@@ -474,7 +474,8 @@ def curve(given: argparse.Namespace) -> int:
     figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
     for name, points in curves.items():
         sizes, means, spreads = zip(*points, strict=True)
-        axes.errorbar(sizes, means, yerr=spreads, marker="o", capsize=3, label=name)
+        label = "nexwarp" if name == DEFAULT.name else name
+        axes.errorbar(sizes, means, yerr=spreads, marker="o", capsize=3, label=label)
     sizes = sorted({size for points in curves.values() for size, _, _ in points})
     axes.set(xscale="log", xlabel="primitives", ylabel=UNITS[given.metric], title=given.scene)
     axes.set_xticks(sizes, [f"{size // 1000}K" for size in sizes])
