@@ -75,6 +75,7 @@ class Job:
         size: budget of primitives.
         seed: of all random choices.
         iterations: training steps.
+        downscale: photos are reduced by this factor, for a machine without a GPU.
     """
 
     scene: str
@@ -83,6 +84,7 @@ class Job:
     size: int
     seed: int
     iterations: int
+    downscale: int = 1
 
 
 PAPER = Row("paper", "paper")
@@ -193,8 +195,8 @@ VARIANTS = {
 
 
 @lru_cache(maxsize=1)
-def _scene(path: Path, variant: str) -> Scene:
-    scene = load_scene(path)
+def _scene(path: Path, variant: str, downscale: int) -> Scene:
+    scene = load_scene(path, downscale=downscale)
     return VARIANTS[variant](scene) if variant else scene
 
 
@@ -210,7 +212,7 @@ def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path 
         `train_psnr` and `zoom_psnr` of nexwarp; the metrics by view; device, date and commit.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    scene = _scene(data / job.scene, job.variant)
+    scene = _scene(data / job.scene, job.variant, job.downscale)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     if row.preset is None:
@@ -229,7 +231,7 @@ def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path 
             "lpips": lpips_vgg(image.to(device), photo.to(device)),
         }
         if pictures is not None:
-            name = f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}-{Path(view.name).stem}".replace(" ", "_")
+            name = f"{_name(job)}-{Path(view.name).stem}"
             strip = [photo, image, error_map(image, photo)]
             captions = ["photo", f"{job.row}, {views[view.name]['psnr']:.2f} dB", "error (0 to 0.25)"]
             save_png(pictures / f"{name}.png", side_by_side(strip, captions=captions))
@@ -245,6 +247,12 @@ def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path 
     }
 
 
+def _name(job: Job) -> str:
+    """Of a training's files."""
+    reduced = f"-downscale{job.downscale}" if job.downscale > 1 else ""
+    return f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}{reduced}".replace(" ", "_")
+
+
 def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None) -> tuple[Any, dict]:
     config = with_settings(preset(row.preset), row.settings)
     config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
@@ -254,7 +262,7 @@ def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, model
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         if models is not None:
-            folder = models / f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}".replace(" ", "_")
+            folder = models / _name(job)
             folder.mkdir(parents=True, exist_ok=True)
         megabytes = save_model(folder, model).stat().st_size / 1e6
     facts = {
@@ -338,13 +346,13 @@ def _commit() -> str:
 
 def read_results(paths: Iterable[Path]) -> dict[Job, dict[str, Any]]:
     """Results by job; of two for one job the later counts."""
-    names = [f.name for f in dataclasses.fields(Job)]
+    defaults = {f.name: f.default for f in dataclasses.fields(Job)}  # older lines lack what came later
     found = {}
     for path in paths:
         if path.exists():
             for line in path.read_text().splitlines():
                 result = json.loads(line)
-                found[Job(**{name: result[name] for name in names})] = result
+                found[Job(**{name: result.get(name, default) for name, default in defaults.items()})] = result
     return found
 
 
@@ -356,14 +364,14 @@ def train(given: argparse.Namespace) -> int:
     scenes = given.scenes.split(",")
     for table in filter(None, (given.tables or "").split(",")):
         for job in jobs_of(table, scenes, seeds, given.iterations, given.size):
-            wanted[job] = None
+            wanted[dataclasses.replace(job, downscale=given.downscale)] = None
     for text in given.row or ():
         # NAME:PRESET:SETTINGS, for trying things out.
         name, base, settings = text.split(":", 2)
         rows[name] = Row(name, base or "default", json.loads(settings or "{}")) if base != "gsplat" else Row(name, None)
         for scene in scenes:
             for seed in seeds:
-                wanted[Job(scene, given.variant, name, given.size, seed, given.iterations)] = None
+                wanted[Job(scene, given.variant, name, given.size, seed, given.iterations, given.downscale)] = None
     have = read_results([given.out])
     jobs = [job for job in wanted if job not in have]
     print(f"{len(jobs)} of {len(wanted)} trainings to do")
@@ -410,7 +418,7 @@ def table(given: argparse.Namespace) -> int:
 
 
 def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Results with seeds together, by scene, variant, size and length, best PSNR first.
+    """Results with seeds together, by scene, variant, downscale, size and length, best PSNR first.
 
     Each has the settings that differ from its preset, the seeds, and, by figure, [mean, standard deviation] over those
     that have it, None without any: the metrics, `megabytes`, and `seconds`, `rate` (it/s) and `peak_mib` of trainings
@@ -418,9 +426,10 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
     """
     groups: dict[tuple, list[tuple[Job, dict[str, Any]]]] = {}
     for job, result in results.items():
-        groups.setdefault((job.scene, job.variant, job.size, job.iterations, job.row), []).append((job, result))
+        key = (job.scene, job.variant, job.downscale, job.size, job.iterations, job.row)
+        groups.setdefault(key, []).append((job, result))
     rows: list[dict[str, Any]] = []
-    for (scene, variant, size, iterations, name), found in groups.items():
+    for (scene, variant, downscale, size, iterations, name), found in groups.items():
         each = [result for _, result in found]
         alone = [result for result in each if result.get("jobs") == 1]
         figures = {metric: [r[metric] for r in each] for metric in METRICS}
@@ -428,13 +437,15 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
         figures["seconds"] = [r["seconds"] for r in alone]
         figures["rate"] = [iterations / r["seconds"] for r in alone]
         figures["peak_mib"] = [r.get("peak_mib") for r in alone]
-        key = {"scene": scene, "variant": variant, "size": size, "iterations": iterations, "row": name}
+        what = {"scene": scene, "variant": variant, "downscale": downscale}
+        what |= {"size": size, "iterations": iterations, "row": name}
         known = {"settings": each[0]["settings"], "seeds": sorted(job.seed for job, _ in found)}
         known["commits"] = sorted({r["commit"] for r in each})
-        rows.append(key | known | {figure: _spread(values) for figure, values in figures.items()})
+        rows.append(what | known | {figure: _spread(values) for figure, values in figures.items()})
 
     def order(row: dict[str, Any]) -> tuple:
-        return row["scene"], row["variant"], row["size"], row["iterations"], -(row["psnr"] or [-math.inf])[0]
+        psnr = (row["psnr"] or [-math.inf])[0]
+        return row["scene"], row["variant"], row["downscale"], row["size"], row["iterations"], -psnr
 
     return sorted(rows, key=order)
 
@@ -450,7 +461,8 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
     title = ""
     for row in rows:
         variant = f", {row['variant']}" if row["variant"] else ""
-        here = f"{row['scene']}{variant}, {row['size']:,} primitives, {row['iterations']:,} iterations"
+        reduced = f", photos reduced by {row['downscale']}" if row["downscale"] > 1 else ""
+        here = f"{row['scene']}{variant}{reduced}, {row['size']:,} primitives, {row['iterations']:,} iterations"
         if here != title:
             lines += [""] * bool(title) + [f"## {here}", "", f"| | {' | '.join(columns)} |"]
             lines += ["|---" * (len(columns) + 1) + "|"]
@@ -492,14 +504,15 @@ def curve(given: argparse.Namespace) -> int:
 def curves_of(
     results: dict[Job, dict[str, Any]], scene: str, metric: str, iterations: int
 ) -> dict[str, list[tuple[int, float, float]]]:
-    """Curves of our default and of gsplat: (primitives, mean over seeds, their standard deviation), by size."""
+    """Curves of our default and of gsplat, photos at full size.
+
+    Returns:
+        (primitives, mean over seeds, their standard deviation) by size, for each of the two that has results.
+    """
     found: dict[str, dict[int, list[float]]] = {}
     for job, result in results.items():
-        named = job.row in (DEFAULT.name, GSPLAT) and (job.scene, job.variant, job.iterations) == (
-            scene,
-            "",
-            iterations,
-        )
+        which = (job.scene, job.variant, job.iterations, job.downscale)
+        named = job.row in (DEFAULT.name, GSPLAT) and which == (scene, "", iterations, 1)
         if named and result[metric] is not None:
             found.setdefault(job.row, {}).setdefault(job.size, []).append(result[metric])
     return {
@@ -533,6 +546,7 @@ def main(arguments: list[str] | None = None) -> int:
     training.add_argument("--seeds", default="0,1", help="default: %(default)s")
     training.add_argument("--size", type=int, default=40_000, help="budget of primitives (default: %(default)s)")
     training.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
+    training.add_argument("--downscale", type=int, default=1, help="reduce photos by (default: %(default)s)")
     training.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     training.add_argument("--out", type=Path, default=Path("quality.jsonl"), help="default: %(default)s")
     training.add_argument("--jobs", type=int, default=1, help="trainings at once (default: %(default)s)")

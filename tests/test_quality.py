@@ -81,6 +81,7 @@ def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
         result(GSPLAT, 0, psnr=33.0, jobs=4),
     ]
     file = tmp_path / "results.jsonl"
+    del lines[-1]["downscale"]  # as before there was such a thing
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     results = read_results([file, tmp_path / "absent.jsonl"])
     assert len(results) == 3
@@ -115,11 +116,11 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     settings = {"texture.levels": 4, "texture.table_size": 1024}
     command = ["train", "--row", f"mine:default:{json.dumps(settings)}", "--scenes", "tiny", "--seeds", "0"]
     command += ["--size", "60", "--iterations", "4", "--data", str(folder), "--out", str(tmp_path / "out.jsonl")]
-    command += ["--pictures", str(tmp_path / "pictures"), "--models", str(tmp_path / "models")]
+    command += ["--pictures", str(tmp_path / "pictures"), "--models", str(tmp_path / "models"), "--downscale", "2"]
     assert quality.main(command) == 0
     (line,) = (tmp_path / "out.jsonl").read_text().splitlines()
     found = json.loads(line)
-    assert (found["scene"], found["row"], found["settings"]) == ("tiny", "mine", settings)
+    assert (found["scene"], found["row"], found["settings"], found["downscale"]) == ("tiny", "mine", settings, 2)
     assert set(found["views"]) == {view.name for view in nw.load_scene(folder / "tiny").test}
     mean = sum(view["psnr"] for view in found["views"].values()) / len(found["views"])
     assert found["psnr"] == pytest.approx(mean) and found["primitives"] <= 60 and found["flip"] > 0
@@ -131,7 +132,8 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert "0 of 1 trainings to do" in capsys.readouterr().out
     assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 1
     assert quality.main(["table", str(tmp_path / "out.jsonl"), "--out", str(tmp_path / "table.md")]) == 0
-    assert "| mine |" in (tmp_path / "table.md").read_text()
+    text = (tmp_path / "table.md").read_text()
+    assert "| mine |" in text and "## tiny, photos reduced by 2, 60 primitives, 4 iterations" in text
     torch.set_num_threads(threads)
 
 
@@ -146,7 +148,9 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
     ):
         job = Job("fox", "", row, size, seed, 30)
         lines.append(json.dumps(dataclasses.asdict(job) | {"flip": figure, "psnr": None}))
-    lines.append(json.dumps(dataclasses.asdict(Job("fox", "arc", "default", 5000, 0, 30)) | {"flip": 9.0, "psnr": 1.0}))
+    # Neither counts: another variant, and photos of another size.
+    for other in (Job("fox", "arc", "default", 5000, 0, 30), Job("fox", "", "default", 5000, 0, 30, downscale=2)):
+        lines.append(json.dumps(dataclasses.asdict(other) | {"flip": 9.0, "psnr": 1.0}))
     file = tmp_path / "results.jsonl"
     file.write_text("\n".join(lines))
     curves = quality.curves_of(read_results([file]), "fox", "flip", 30)
