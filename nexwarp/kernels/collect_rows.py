@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.collect import overflowed, surfel_at, walk
-from nexwarp.kernels.simd import lane_functions
+from nexwarp.kernels.simd import lane_functions, slot_functions
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 
@@ -72,12 +72,49 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
     h = hit_functions(real, low_pass, lanes)
     f = lane_functions(real, lanes)
     lane, word, integer = f.lane, f.word, f.integer
-    slots = max(max_hits, 1)
-    lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
-    words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
+    s = slot_functions(real, lanes, max(max_hits, 1))
+    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
     view = row_functions(real, tile_size)
     rows = view.rows
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
+
+    # The loop over pixels is not unrolled, that would be most of the kernel's code. Its arguments are copies, so that
+    # what the walk works on is never indexed by a variable and stays in registers.
+    @wp.func
+    def write(
+        xy: wp.vec2i,
+        size: wp.vec2i,
+        red: lane,
+        green: lane,
+        blue: lane,
+        transmittance: lane,
+        stop: word,
+        buffer_red: lanes_by_slot,
+        buffer_green: lanes_by_slot,
+        buffer_blue: lanes_by_slot,
+        buffer_weights: lanes_by_slot,
+        buffer_ids: words_by_slot,
+        buffer_depths: lanes_by_slot,
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+    ):
+        for l in range(wp.min(lanes, size[0] - xy[0])):
+            p = xy[1] * size[0] + xy[0] + l
+            plain[p] = vec3(red[l], green[l], blue[l])
+            kept = vec3()
+            for j in range(wp.static(max_hits)):
+                kept += vec3(buffer_red[j, l], buffer_green[j, l], buffer_blue[j, l]) * buffer_weights[j, l]
+                ids[p, j] = wp.int32(buffer_ids[j, l])
+                depths[p, j] = buffer_depths[j, l]
+                weights[p, j] = buffer_weights[j, l]
+            base[p] = kept
+            alphas[p] = ONE - transmittance[l]
+            stops[p] = wp.int32(stop[l])
 
     @wp.kernel(
         enable_backward=False,
@@ -162,19 +199,19 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             out_green = lane(rc[1])
             out_blue = lane(rc[2])
             for j in range(wp.static(max_hits)):
-                w_ = buffer_weights[j]
+                w_ = s.lane_at(buffer_weights, j)
                 displaced = f.either(displaced, f.below(w_, out_weight))
-                i_ = buffer_ids[j]
-                d_ = buffer_depths[j]
-                r_ = buffer_red[j]
-                g_ = buffer_green[j]
-                b_ = buffer_blue[j]
-                buffer_weights[j] = f.pick(displaced, out_weight, w_)
-                buffer_ids[j] = f.pick_words(displaced, out_id, i_)
-                buffer_depths[j] = f.pick(displaced, out_depth, d_)
-                buffer_red[j] = f.pick(displaced, out_red, r_)
-                buffer_green[j] = f.pick(displaced, out_green, g_)
-                buffer_blue[j] = f.pick(displaced, out_blue, b_)
+                i_ = s.word_at(buffer_ids, j)
+                d_ = s.lane_at(buffer_depths, j)
+                r_ = s.lane_at(buffer_red, j)
+                g_ = s.lane_at(buffer_green, j)
+                b_ = s.lane_at(buffer_blue, j)
+                buffer_weights = s.with_lane(buffer_weights, j, f.pick(displaced, out_weight, w_))
+                buffer_ids = s.with_word(buffer_ids, j, f.pick_words(displaced, out_id, i_))
+                buffer_depths = s.with_lane(buffer_depths, j, f.pick(displaced, out_depth, d_))
+                buffer_red = s.with_lane(buffer_red, j, f.pick(displaced, out_red, r_))
+                buffer_green = s.with_lane(buffer_green, j, f.pick(displaced, out_green, g_))
+                buffer_blue = s.with_lane(buffer_blue, j, f.pick(displaced, out_blue, b_))
                 out_weight = f.pick(displaced, w_, out_weight)
                 out_id = f.pick_words(displaced, i_, out_id)
                 out_depth = f.pick(displaced, d_, out_depth)
@@ -187,19 +224,28 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             alive = f.both(alive, f.above(transmittance, lane(TRANSMITTANCE_MIN), True))
             if not f.any_of(alive):
                 break
-        for l in range(wp.static(lanes)):
-            if xy[0] + l < size[0]:
-                p = xy[1] * size[0] + xy[0] + l
-                plain[p] = vec3(red[l], green[l], blue[l])
-                kept = vec3()
-                for j in range(wp.static(max_hits)):
-                    kept += vec3(buffer_red[j, l], buffer_green[j, l], buffer_blue[j, l]) * buffer_weights[j, l]
-                    ids[p, j] = wp.int32(buffer_ids[j, l])
-                    depths[p, j] = buffer_depths[j, l]
-                    weights[p, j] = buffer_weights[j, l]
-                base[p] = kept
-                alphas[p] = ONE - transmittance[l]
-                stops[p] = wp.int32(stop[l])
+        write(
+            xy,
+            size,
+            red,
+            green,
+            blue,
+            transmittance,
+            stop,
+            buffer_red,
+            buffer_green,
+            buffer_blue,
+            buffer_weights,
+            buffer_ids,
+            buffer_depths,
+            plain,
+            base,
+            ids,
+            depths,
+            weights,
+            alphas,
+            stops,
+        )
 
     return collect_rows
 
@@ -217,12 +263,82 @@ def collect_rows_backward_kernel(
     hit_dot = h.hit_dot
     f = lane_functions(real, lanes)
     lane, word, integer, inner = f.lane, f.word, f.integer, f.inner
-    slots_ = max(max_hits, 1)
-    lanes_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=real)
-    words_by_slot = wp.types.matrix(shape=(slots_, lanes), dtype=integer)
+    s = slot_functions(real, lanes, max(max_hits, 1))
+    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
     view = row_functions(real, tile_size)
     rows_a_tile = view.rows
     ALPHA_MIN, ONE = t.ALPHA_MIN, t.ONE
+
+    # Apart from the walk for the reasons that `write` is.
+    @wp.func
+    def read(
+        xy: wp.vec2i,
+        size: wp.vec2i,
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+        grad_plain: wp.array(dtype=vec3),
+        grad_base: wp.array(dtype=vec3),
+        grad_depths: wp.array2d(dtype=real),
+        grad_weights: wp.array2d(dtype=real),
+        grad_alphas: wp.array(dtype=real),
+        errors: wp.array(dtype=real),
+    ):
+        stop = word()
+        last = int(0)
+        grad_red = lane()
+        grad_green = lane()
+        grad_blue = lane()
+        base_red = lane()
+        base_green = lane()
+        base_blue = lane()
+        grad_alpha_sum = lane()
+        rest = lane()
+        error = lane()
+        slots = words_by_slot(integer(-1))
+        gw = lanes_by_slot()
+        gd = lanes_by_slot()
+        for l in range(wp.min(lanes, size[0] - xy[0])):
+            p = xy[1] * size[0] + xy[0] + l
+            stop[l] = integer(stops[p])
+            last = wp.max(last, stops[p])
+            gn = grad_plain[p]
+            grad_red[l] = gn[0]
+            grad_green[l] = gn[1]
+            grad_blue[l] = gn[2]
+            gb = grad_base[p]
+            base_red[l] = gb[0]
+            base_green[l] = gb[1]
+            base_blue[l] = gb[2]
+            grad_alpha_sum[l] = grad_alphas[p]
+            total = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + grad_alphas[p] * alphas[p]
+            for j in range(wp.static(max_hits)):
+                slots[j, l] = integer(ids[p, j])
+                gw[j, l] = grad_weights[p, j]
+                gd[j, l] = grad_depths[p, j]
+                total += grad_weights[p, j] * weights[p, j]
+            rest[l] = total
+            if wp.static(watch):
+                error[l] = errors[p]
+        return (
+            stop,
+            last,
+            grad_red,
+            grad_green,
+            grad_blue,
+            base_red,
+            base_green,
+            base_blue,
+            grad_alpha_sum,
+            rest,
+            error,
+            slots,
+            gw,
+            gd,
+        )
 
     @wp.kernel(
         enable_backward=False,
@@ -268,43 +384,37 @@ def collect_rows_backward_kernel(
         intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         dx, y = view.rays_of(xy, intrinsics)
-        stop = word()
-        last = int(0)
-        grad_red = lane()
-        grad_green = lane()
-        grad_blue = lane()
-        base_red = lane()
-        base_green = lane()
-        base_blue = lane()
-        grad_alpha_sum = lane()
-        rest = lane()
-        error = lane()
-        slots = words_by_slot(integer(-1))
-        gw = lanes_by_slot()
-        gd = lanes_by_slot()
-        for l in range(wp.static(lanes)):
-            if xy[0] + l < size[0]:
-                p = xy[1] * size[0] + xy[0] + l
-                stop[l] = integer(stops[p])
-                last = wp.max(last, stops[p])
-                gn = grad_plain[p]
-                grad_red[l] = gn[0]
-                grad_green[l] = gn[1]
-                grad_blue[l] = gn[2]
-                gb = grad_base[p]
-                base_red[l] = gb[0]
-                base_green[l] = gb[1]
-                base_blue[l] = gb[2]
-                grad_alpha_sum[l] = grad_alphas[p]
-                total = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + grad_alphas[p] * alphas[p]
-                for j in range(wp.static(max_hits)):
-                    slots[j, l] = integer(ids[p, j])
-                    gw[j, l] = grad_weights[p, j]
-                    gd[j, l] = grad_depths[p, j]
-                    total += grad_weights[p, j] * weights[p, j]
-                rest[l] = total
-                if wp.static(watch):
-                    error[l] = errors[p]
+        (
+            stop,
+            last,
+            grad_red,
+            grad_green,
+            grad_blue,
+            base_red,
+            base_green,
+            base_blue,
+            grad_alpha_sum,
+            rest,
+            error,
+            slots,
+            gw,
+            gd,
+        ) = read(
+            xy,
+            size,
+            plain,
+            base,
+            ids,
+            weights,
+            alphas,
+            stops,
+            grad_plain,
+            grad_base,
+            grad_depths,
+            grad_weights,
+            grad_alphas,
+            errors,
+        )
         middle = view.middle_of(xy, y, intrinsics)
         half = view.half_row(intrinsics)
         one = lane(ONE)
@@ -334,9 +444,9 @@ def collect_rows_backward_kernel(
             gt = lane()
             buffered = word()
             for j in range(wp.static(max_hits)):
-                same = f.equal_words(slots[j], word(integer(i)))
-                q += f.pick(same, gw[j], lane())
-                gt = f.pick(same, gd[j], gt)
+                same = f.equal_words(s.word_at(slots, j), word(integer(i)))
+                q += f.pick(same, s.lane_at(gw, j), lane())
+                gt = f.pick(same, s.lane_at(gd, j), gt)
                 buffered = f.either(buffered, same)
             red_ = f.pick(buffered, base_red, grad_red)
             green_ = f.pick(buffered, base_green, grad_green)

@@ -198,6 +198,19 @@ _WORDS = """
     return a;
 """
 
+# Whole rows at once: element by element, Clang takes the table apart into numbers and puts vectors together again, at
+# the cost of seconds of its time and of some of the kernel's.
+_ROW_AT = """
+    wp::vec_t<LANES, NUMBER> v;
+    __builtin_memcpy(&v, rows.data[j], sizeof(v));
+    return v;
+"""
+
+_WITH_ROW = """
+    __builtin_memcpy(rows.data[j], &v, sizeof(v));
+    return rows;
+"""
+
 _ANY = """
     word_t m;
     __builtin_memcpy(&m, &mask, sizeof(m));
@@ -382,4 +395,42 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
         either=either,
         pick_words=pick_words,
         any_of=any_of,
+    )
+
+
+@functools.cache
+def slot_functions(real: type, lanes: int, slots: int) -> SimpleNamespace:
+    """Tables with a value of `lanes` > 1 pixels in each of `slots` rows; not differentiable.
+
+    Returns:
+        `lanes_by_slot` and `words_by_slot`, types of tables of reals and of words, and functions: lane_at(rows, j) and
+        word_at(rows, j), a row; with_lane(rows, j, v) and with_word(rows, j, v), the table with another row j.
+    """
+    f = lane_functions(real, lanes)
+    lane, word, integer = f.lane, f.word, f.integer
+    lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
+    words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
+
+    def row_at(number: type) -> str:
+        return _ROW_AT.replace("LANES", str(lanes)).replace("NUMBER", f"wp::{number.__name__}")
+
+    @wp.func_native(row_at(real))
+    def lane_at(rows: lanes_by_slot, j: wp.int32) -> lane: ...
+
+    @wp.func_native(row_at(integer))
+    def word_at(rows: words_by_slot, j: wp.int32) -> word: ...
+
+    @wp.func_native(_WITH_ROW)
+    def with_lane(rows: lanes_by_slot, j: wp.int32, v: lane) -> lanes_by_slot: ...
+
+    @wp.func_native(_WITH_ROW)
+    def with_word(rows: words_by_slot, j: wp.int32, v: word) -> words_by_slot: ...
+
+    return SimpleNamespace(
+        lanes_by_slot=lanes_by_slot,
+        words_by_slot=words_by_slot,
+        lane_at=lane_at,
+        word_at=word_at,
+        with_lane=with_lane,
+        with_word=with_word,
     )
