@@ -188,8 +188,8 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             if not f.any_of(seen):
                 continue
             alpha = f.pick(seen, alpha, lane())
-            out_weight = wp.cw_mul(alpha, transmittance)
-            transmittance = wp.cw_mul(transmittance, one - alpha)
+            out_weight = f.times(alpha, transmittance)
+            transmittance = f.times(transmittance, one - alpha)
             stop = f.pick_words(seen, word(integer(k + 1)), stop)
             # Pixels without a hit insert the weight 0, which displaces nothing and adds nothing.
             displaced = word()
@@ -218,9 +218,9 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
                 out_red = f.pick(displaced, r_, out_red)
                 out_green = f.pick(displaced, g_, out_green)
                 out_blue = f.pick(displaced, b_, out_blue)
-            red += wp.cw_mul(out_red, out_weight)
-            green += wp.cw_mul(out_green, out_weight)
-            blue += wp.cw_mul(out_blue, out_weight)
+            red += f.times(out_red, out_weight)
+            green += f.times(out_green, out_weight)
+            blue += f.times(out_blue, out_weight)
             alive = f.both(alive, f.above(transmittance, lane(TRANSMITTANCE_MIN), True))
             if not f.any_of(alive):
                 break
@@ -439,7 +439,7 @@ def collect_rows_backward_kernel(
             if not f.any_of(seen):
                 continue
             alpha = f.pick(seen, alpha, lane())
-            weight = wp.cw_mul(alpha, transmittance)
+            weight = f.times(alpha, transmittance)
             q = grad_alpha_sum
             gt = lane()
             buffered = word()
@@ -452,9 +452,9 @@ def collect_rows_backward_kernel(
             green_ = f.pick(buffered, base_green, grad_green)
             blue_ = f.pick(buffered, base_blue, grad_blue)
             q += red_ * rc[0] + green_ * rc[1] + blue_ * rc[2]
-            rest -= wp.cw_mul(q, weight)
-            grad_alpha = wp.cw_mul(transmittance, q) - wp.cw_div(rest, one - alpha)
-            transmittance = wp.cw_mul(transmittance, one - alpha)
+            rest -= f.times(q, weight)
+            grad_alpha = f.times(transmittance, q) - f.over(rest, one - alpha)
+            transmittance = f.times(transmittance, one - alpha)
             # Lanes without a hit are differentiated along, by 0.
             g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
                 ra,

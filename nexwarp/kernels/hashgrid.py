@@ -18,7 +18,7 @@ import warp as wp
 
 from nexwarp.kernels.fixed import fixed_units
 from nexwarp.kernels.loads import load_function
-from nexwarp.kernels.simd import lane_functions
+from nexwarp.kernels.simd import lane_functions, slot_functions
 from nexwarp.kernels.types import types
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
@@ -109,13 +109,14 @@ def interpolation_functions(real: type, features: int, lanes: int = 1) -> Simple
         Types `corners` (8 corners x features; for more points, rows of lanes, corner-major) and `values` (features; for
         more points, rows of lanes), and functions interpolate and interpolate_dot.
     """
-    values = _interpolation(real, features, lanes, lane_functions(real, lanes))
-    copies = _interpolation(real, features, lanes, lane_functions(real, lanes, for_gradients=True))
+    values = _interpolation(real, features, lanes, for_gradients=False)
+    copies = _interpolation(real, features, lanes, for_gradients=True)
     values.interpolate_dot = copies.interpolate_dot  # see `surfel.hit_functions`
     return values
 
 
-def _interpolation(real: type, features: int, lanes: int, f: SimpleNamespace) -> SimpleNamespace:
+def _interpolation(real: type, features: int, lanes: int, for_gradients: bool) -> SimpleNamespace:
+    f = lane_functions(real, lanes, for_gradients)
     lane, splat, scaled, times, over, inner = f.lane, f.splat, f.scaled, f.times, f.over, f.inner
     power_of_e = f.power_of_e
     ONE = types(real).ONE
@@ -128,12 +129,13 @@ def _interpolation(real: type, features: int, lanes: int, f: SimpleNamespace) ->
         def corner_of(corners: corners_type, j: int, k: int):
             return corners[j, k]
     else:
-        corners_type = wp.types.matrix(shape=(8 * features, lanes), dtype=real)
+        table = slot_functions(real, lanes, 8 * features, for_gradients)
+        corners_type, row_at = table.lanes_by_slot, table.lane_at
         values_type = wp.types.matrix(shape=(features, lanes), dtype=real)
 
         @wp.func
         def corner_of(corners: corners_type, j: int, k: int):
-            return corners[j * features + k]
+            return row_at(corners, j * features + k)
 
     @wp.func
     def interpolate(fx: lane, fy: lane, fz: lane, corners: corners_type, scale: real, depth: lane, focal: real):

@@ -134,6 +134,45 @@ _ADJOINT_SCALED = """
     adj_s += sum;
 """
 
+# Warp's own products and quotients of vectors are loops over their elements, and so are their derivatives.
+_TIMES = """
+    lane_t x, y;
+    __builtin_memcpy(&x, &a, sizeof(x));
+    __builtin_memcpy(&y, &b, sizeof(y));
+    x = x * y;
+    __builtin_memcpy(&a, &x, sizeof(x));
+    return a;
+"""
+
+_ADJOINT_TIMES = """
+    lane_t g, x, y, total;
+    __builtin_memcpy(&g, &adj_ret, sizeof(g));
+    __builtin_memcpy(&x, &a, sizeof(x));
+    __builtin_memcpy(&y, &b, sizeof(y));
+    __builtin_memcpy(&total, &adj_a, sizeof(total));
+    total = total + g * y;
+    __builtin_memcpy(&adj_a, &total, sizeof(total));
+    __builtin_memcpy(&total, &adj_b, sizeof(total));
+    total = total + g * x;
+    __builtin_memcpy(&adj_b, &total, sizeof(total));
+"""
+
+_OVER = _TIMES.replace("x * y", "x / y")
+
+_ADJOINT_OVER = """
+    lane_t g, x, y, total;
+    __builtin_memcpy(&g, &adj_ret, sizeof(g));
+    __builtin_memcpy(&x, &a, sizeof(x));
+    __builtin_memcpy(&y, &b, sizeof(y));
+    g = g / y;
+    __builtin_memcpy(&total, &adj_a, sizeof(total));
+    total = total + g;
+    __builtin_memcpy(&adj_a, &total, sizeof(total));
+    __builtin_memcpy(&total, &adj_b, sizeof(total));
+    total = total - g * (x / y);
+    __builtin_memcpy(&adj_b, &total, sizeof(total));
+"""
+
 _INNER = """
     lane_t g, x;
     __builtin_memcpy(&g, &a, sizeof(g));
@@ -204,6 +243,14 @@ _ROW_AT = """
     wp::vec_t<LANES, NUMBER> v;
     __builtin_memcpy(&v, rows.data[j], sizeof(v));
     return v;
+"""
+
+_ADJOINT_ROW_AT = """
+    lane_t g, total;
+    __builtin_memcpy(&g, &adj_ret, sizeof(g));
+    __builtin_memcpy(&total, adj_rows.data[j], sizeof(total));
+    total = total + g;
+    __builtin_memcpy(adj_rows.data[j], &total, sizeof(total));
 """
 
 _WITH_ROW = """
@@ -320,13 +367,11 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
     @wp.func_native(snippet(_SCALED), adj_snippet=snippet(_ADJOINT_SCALED))
     def scaled(s: real, a: lane) -> lane: ...
 
-    @wp.func
-    def times(a: lane, b: lane):
-        return wp.cw_mul(a, b)
+    @wp.func_native(snippet(_TIMES), adj_snippet=snippet(_ADJOINT_TIMES))
+    def times(a: lane, b: lane) -> lane: ...
 
-    @wp.func
-    def over(a: lane, b: lane):
-        return wp.cw_div(a, b)
+    @wp.func_native(snippet(_OVER), adj_snippet=snippet(_ADJOINT_OVER))
+    def over(a: lane, b: lane) -> lane: ...
 
     @wp.func_native(snippet(_INNER), adj_snippet=snippet(_ADJOINT_INNER))
     def inner(a: lane, b: lane) -> real: ...
@@ -399,25 +444,30 @@ def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
 
 
 @functools.cache
-def slot_functions(real: type, lanes: int, slots: int) -> SimpleNamespace:
-    """Tables with a value of `lanes` > 1 pixels in each of `slots` rows; not differentiable.
+def slot_functions(real: type, lanes: int, slots: int, for_gradients: bool = False) -> SimpleNamespace:
+    """Tables with a value of `lanes` > 1 pixels in each of `slots` rows; `for_gradients` as in `lane_functions`.
 
     Returns:
-        `lanes_by_slot` and `words_by_slot`, types of tables of reals and of words, and functions: lane_at(rows, j) and
-        word_at(rows, j), a row; with_lane(rows, j, v) and with_word(rows, j, v), the table with another row j.
+        `lanes_by_slot` and `words_by_slot`, types of tables of reals and of words, and functions: lane_at(rows, j),
+        which is differentiable, and word_at(rows, j), a row; with_lane(rows, j, v) and with_word(rows, j, v), the table
+        with another row j.
     """
-    f = lane_functions(real, lanes)
+    f = lane_functions(real, lanes, for_gradients)
     lane, word, integer = f.lane, f.word, f.integer
     lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
     words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
 
-    def row_at(number: type) -> str:
-        return _ROW_AT.replace("LANES", str(lanes)).replace("NUMBER", f"wp::{number.__name__}")
+    def snippet(text: str, number: type) -> str:
+        names = {"REAL": real, "INT": integer, "NUMBER": number}
+        text = text.replace("LANES", str(lanes))
+        for name, which in names.items():
+            text = text.replace(name, f"wp::{which.__name__}")
+        return text
 
-    @wp.func_native(row_at(real))
+    @wp.func_native(snippet(_ROW_AT, real), adj_snippet=snippet(_TYPES + _ADJOINT_ROW_AT, real))
     def lane_at(rows: lanes_by_slot, j: wp.int32) -> lane: ...
 
-    @wp.func_native(row_at(integer))
+    @wp.func_native(snippet(_ROW_AT, integer))
     def word_at(rows: words_by_slot, j: wp.int32) -> word: ...
 
     @wp.func_native(_WITH_ROW)
