@@ -338,26 +338,30 @@ def _scalar_functions(real: type) -> SimpleNamespace:
     )
 
 
+def _filled(text: str, real: type, lanes: int, **replaced: str) -> str:
+    """Put what a snippet leaves open: `replaced`, then the types and their lanes."""
+    wide = real is wp.float64
+    # The sum over the lanes by halves: in order it would be one addition after another.
+    halves = [f"const auto g{n // 2} = g{n}.lo + g{n}.hi;" for n in (16, 8, 4) if n <= lanes]
+    names = {
+        "SUM_OF_G": f"const auto g{lanes} = g; {' '.join(halves)} const REAL sum = g2[0] + g2[1];",
+        "REAL": "double" if wide else "float",
+        "INT": "wp::int64" if wide else "wp::int32",
+        "LANES": str(lanes),
+    }
+    for key, value in (replaced | names).items():
+        text = text.replace(key, value)
+    return text
+
+
 def _vector_functions(real: type, lanes: int) -> SimpleNamespace:
     wide = real is wp.float64
     lane = wp.types.vector(length=lanes, dtype=real)
     integer = wp.int64 if wide else wp.int32
     word = wp.types.vector(length=lanes, dtype=integer)
-    # The sum over the lanes by halves: in order it would be one addition after another.
-    halves = [f"const auto g{n // 2} = g{n}.lo + g{n}.hi;" for n in (16, 8, 4) if n <= lanes]
-    total = f"const auto g{lanes} = g; {' '.join(halves)} const REAL sum = g2[0] + g2[1];"
-    names = {
-        "SUM_OF_G": total,
-        "REAL": "double" if wide else "float",
-        "INT": "wp::int64" if wide else "wp::int32",
-        "LANES": str(lanes),
-    }
 
     def snippet(*parts: str, **replaced: str) -> str:
-        text = "".join((_TYPES, *parts))
-        for key, value in (names | replaced).items():
-            text = text.replace(key, value)
-        return text
+        return _filled("".join((_TYPES, *parts)), real, lanes, **replaced)
 
     exp_body, log_body = (_EXACT.replace("FUNCTION", f"::{f}") for f in ("exp", "log")) if wide else (_EXP, _LOG)
 
@@ -457,17 +461,13 @@ def slot_functions(real: type, lanes: int, slots: int, for_gradients: bool = Fal
     lanes_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=real)
     words_by_slot = wp.types.matrix(shape=(slots, lanes), dtype=integer)
 
-    def snippet(text: str, number: type) -> str:
-        names = {"REAL": real, "INT": integer, "NUMBER": number}
-        text = text.replace("LANES", str(lanes))
-        for name, which in names.items():
-            text = text.replace(name, f"wp::{which.__name__}")
-        return text
+    def snippet(text: str, **replaced: str) -> str:
+        return _filled(text, real, lanes, **replaced)
 
-    @wp.func_native(snippet(_ROW_AT, real), adj_snippet=snippet(_TYPES + _ADJOINT_ROW_AT, real))
+    @wp.func_native(snippet(_ROW_AT, NUMBER="REAL"), adj_snippet=snippet(_TYPES + _ADJOINT_ROW_AT))
     def lane_at(rows: lanes_by_slot, j: wp.int32) -> lane: ...
 
-    @wp.func_native(snippet(_ROW_AT, integer))
+    @wp.func_native(snippet(_ROW_AT, NUMBER="INT"))
     def word_at(rows: words_by_slot, j: wp.int32) -> word: ...
 
     @wp.func_native(_WITH_ROW)
