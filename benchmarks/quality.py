@@ -5,10 +5,10 @@
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
-several machines too. `table` makes Markdown of them, means and spreads over seeds; nothing is trained twice for two
-tables. `curve` draws a metric over the number of primitives. Metrics are those of `nexwarp.metrics`; LPIPS needs the
-weights of VGG and is left out where they cannot be had. Speed and memory of a training count when it ran alone (`--jobs
-1`).
+several machines too. `table` makes Markdown of them, means and spreads over seeds, and what each row has more than the
+default on the mean of the scenes; nothing is trained twice for two tables. `curve` draws a metric over the number of
+primitives. Metrics are those of `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be
+had. Speed and memory of a training count when it ran alone (`--jobs 1`).
 """
 
 import argparse
@@ -409,7 +409,8 @@ def table(given: argparse.Namespace) -> int:
     results = read_results(given.results)
     text = markdown(results)
     if given.json:
-        given.json.write_text(json.dumps({"convention": CONVENTION, "rows": summary(results)}, indent=1) + "\n")
+        tables = {"convention": CONVENTION, "rows": summary(results), "differences": differences(results)}
+        given.json.write_text(json.dumps(tables, indent=1) + "\n")
     if given.out:
         given.out.write_text(text)
     else:
@@ -451,7 +452,7 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def markdown(results: dict[Job, dict[str, Any]]) -> str:
-    """All of `summary`."""
+    """All of `summary` and `differences`."""
     rows = summary(results)
     lines = ["# Quality", "", CONVENTION, ""]
     if any(row["lpips"] is None for row in rows):
@@ -469,7 +470,63 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
             title = here
         cells = [_cell(row[figure], digits[figure]) for figure in digits]
         lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
+    for group in differences(results):
+        reduced = f", photos reduced by {group['downscale']}" if group["downscale"] > 1 else ""
+        lines += ["", f"## Mean of the scenes less the default's, {group['size']:,} primitives{reduced}, "]
+        lines[-1] += f"{group['iterations']:,} iterations"
+        lines += ["", f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
+        for row in group["rows"]:
+            cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]
+            lines.append(f"| {row['row']} | {' | '.join(cells)} | {', '.join(row['scenes'])} |")
     return "\n".join([*lines, ""])
+
+
+def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
+    """What each row has more than the default, on the mean of the scenes that both were trained on.
+
+    Returns:
+        By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
+        best PSNR first, each with its `scenes` and, by metric, [difference, its standard error], None where a scene
+        lacks the metric. Each scene counts alike, with the means over its seeds; the error is that of the seeds'
+        spread, None where a scene has one seed alone.
+    """
+    groups: dict[tuple, dict[str, dict[str, list[dict[str, Any]]]]] = {}
+    for job, result in results.items():
+        if not job.variant:
+            rows = groups.setdefault((job.size, job.downscale, job.iterations), {})
+            rows.setdefault(job.row, {}).setdefault(job.scene, []).append(result)
+    found = []
+    for (size, downscale, iterations), rows in sorted(groups.items()):
+        base = rows.pop(DEFAULT.name, {})
+        shown = []
+        for name, scenes in rows.items():
+            both = [scene for scene in scenes if scene in base]
+            if len(both) < 2:
+                continue
+            figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in METRICS}
+            shown.append({"row": name, "scenes": sorted(both)} | {m: _mean_difference(x) for m, x in figures.items()})
+        if shown:
+            shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
+            found.append({"size": size, "downscale": downscale, "iterations": iterations, "rows": shown})
+    return found
+
+
+def _difference(one: list[dict], two: list[dict], metric: str) -> tuple[float, float | None] | None:
+    """Of two means over seeds, and its variance."""
+    spreads = [_spread(result[metric] for result in each) for each in (one, two)]
+    if None in spreads:
+        return None
+    (a, s), (b, t) = spreads
+    return a - b, None if s is None or t is None else s**2 / len(one) + t**2 / len(two)
+
+
+def _mean_difference(each: list[tuple[float, float | None] | None]) -> list[float | None] | None:
+    """[mean, standard error] of differences with their variances."""
+    if any(x is None for x in each):
+        return None
+    values, variances = zip(*each, strict=True)
+    error = None if None in variances else math.sqrt(sum(variances)) / len(values)
+    return [statistics.fmean(values), error]
 
 
 def curve(given: argparse.Namespace) -> int:
@@ -529,8 +586,10 @@ def _spread(values: Iterable[float | None]) -> list[float | None] | None:
     return [statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None]
 
 
-def _cell(values: list[float | None] | None, digits: int) -> str:
-    return " +- ".join(f"{value:.{digits}f}" for value in values or () if value is not None)
+def _cell(values: list[float | None] | None, digits: int, signed: bool = False) -> str:
+    formats = f"{'+' * signed}.{digits}f", f".{digits}f"
+    pairs = zip(values or (), formats, strict=False)
+    return " +- ".join(f"{value:{form}}" for value, form in pairs if value is not None)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -97,6 +97,40 @@ def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
     assert "LPIPS is left out where the weights of VGG could not be had." in text
 
 
+def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None:
+    results = {}
+    for row, scene, seed, figure, flip in (
+        ("default", "fox", 0, 30.0, 0.1),
+        ("default", "fox", 1, 32.0, 0.1),
+        ("default", "kitchen", 0, 18.0, 0.3),
+        ("default", "kitchen", 1, 18.0, 0.3),
+        ("no gamma", "fox", 0, 30.0, 0.2),
+        ("no gamma", "fox", 1, 30.0, 0.2),
+        ("no gamma", "kitchen", 0, 19.0, 0.3),
+        ("no gamma", "kitchen", 1, 16.0, 0.5),
+        ("K = 3", "fox", 0, 33.0, 0.1),
+        ("K = 3", "kitchen", 0, 19.0, 0.3),
+        ("K = 4", "fox", 0, 33.0, 0.1),  # on one scene alone: nothing to compare the mean of
+        ("K = 1", "fox", 0, 33.0, 0.1),
+        ("K = 1", "statue", 0, 19.0, 0.3),  # which the default was not trained on
+    ):
+        job = Job(scene, "", row, 40, seed, 100)
+        results[job] = result(row, seed, psnr=figure, flip=flip) | dataclasses.asdict(job)
+    results |= {dataclasses.replace(job, variant="moved"): found for job, found in results.items()}
+    (group,) = quality.differences(results)
+    assert (group["size"], group["downscale"], group["iterations"]) == (40, 1, 100)
+    first, second = group["rows"]
+    assert (first["row"], first["scenes"], first["psnr"]) == ("K = 3", ["fox", "kitchen"], [1.5, None])
+    # fox: -1 with variance 2 / 2; kitchen: -0.5 with 4.5 / 2.
+    assert second["row"] == "no gamma" and second["lpips"] is None
+    assert second["psnr"] == [pytest.approx(-0.75), pytest.approx((1 + 2.25) ** 0.5 / 2)]
+    assert second["flip"] == [pytest.approx(0.1), pytest.approx(0.01**0.5 / 2)]
+    text = markdown(results)
+    assert "## Mean of the scenes less the default's, 40 primitives, 100 iterations" in text
+    assert "| K = 3 | +1.50 | +0.0000 | +0.0000 |  | fox, kitchen |" in text
+    assert "| no gamma | -0.75 +- 0.90 | +0.0000 +- 0.0000 | +0.1000 +- 0.0500 |  | fox, kitchen |" in text
+
+
 def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, table = tmp_path / "results.jsonl", tmp_path / "table.json"
     lines = [result("default", 1), result("default", 0, psnr=32.0), result(GSPLAT, 0, jobs=4, commit="abd")]
