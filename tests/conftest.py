@@ -1,10 +1,10 @@
 """Fixtures that every test may use."""
 
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,23 +13,27 @@ import nexwarp as nw
 from nexwarp import config
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
+from tests import beside as beside_others
 
-# So many tests that they wait for most kernels.
-MANY = 500
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """In a run of many tests, those that wait for work beside them come last."""
+    if len(items) >= beside_others.MANY:
+        items.sort(key=lambda item: beside_others.key(item) is not None)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compilers(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Run of all tests: kernels that are not in Warp's cache yet are compiled beside the first tests."""
-    if len(request.session.items) < MANY or request.config.option.markexpr == "cuda":
-        yield
-        return
-    root = Path(__file__).parents[1]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    ahead = subprocess.Popen([sys.executable, "-m", "tests.compile_ahead"], cwd=root, **quiet)
-    yield
-    ahead.kill()
-    ahead.wait()
+def begun(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[beside_others.Beside]:
+    """Kernels that are not in Warp's cache yet are compiled beside the first tests; then the marked tests' work."""
+    items, compilers = request.session.items, [sys.executable, "-m", "tests.compile_ahead"]
+    with beside_others.begun(items, tmp_path_factory.mktemp, compilers) as work:
+        yield work
+
+
+@pytest.fixture
+def beside(request: pytest.FixtureRequest, begun: beside_others.Beside) -> Any:
+    """What the work of the test's mark `beside` gave."""
+    return begun.result(beside_others.key(request.node))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])

@@ -3,41 +3,34 @@
 For sm_90 those of the usual K, for sm_80, where only atomics differ, a default run's; all of them with `-m slow`.
 """
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-import warp as wp
 
-from nexwarp.kernels.catalogue import all_kernels, thread_kernels, walk_kernels
-from nexwarp.kernels.types import MAX_HITS
-from nexwarp.ops.tiles import TILE_SIZE
+ROOT = Path(__file__).parents[1]
 
 
-def usual() -> Iterator[wp.Kernel]:
-    return all_kernels(max_hits=(*range(5), MAX_HITS))
-
-
-def one_run() -> Iterator[wp.Kernel]:
-    few = {"degrees": (3,), "features": (2, 4), "clamps": (False,), "low_passes": (False,), "ssim_lanes": (1,)}
-    yield from thread_kernels(wp.float32, wp.float16, TILE_SIZE, **few)
-    yield from walk_kernels(wp.float32, TILE_SIZE, (2,), low_passes=(False,))
+def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(folder)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(
-    ("arch", "chosen"),
-    [(80, one_run), (90, usual), *(pytest.param(arch, all_kernels, marks=pytest.mark.slow) for arch in (80, 90))],
+    ("arch", "least"),
+    [
+        pytest.param(80, 30, marks=pytest.mark.beside(compiled, 80, "one run")),
+        pytest.param(90, 100, marks=pytest.mark.beside(compiled, 90, "usual")),
+        *(
+            pytest.param(arch, 300, marks=[pytest.mark.beside(compiled, arch, "all"), pytest.mark.slow])
+            for arch in (80, 90)
+        ),
+    ],
 )
-def test_kernels_compile_for_cuda(arch: int, chosen: Callable[[], Iterator[wp.Kernel]], tmp_path: Path) -> None:
-    kernels = list(chosen())
-    assert len({kernel.module.name for kernel in kernels}) == len(kernels), "kernels share a module"
-
-    def compile_one(kernel: wp.Kernel) -> int:
-        folder = tmp_path / kernel.module.name
-        wp.compile_aot_module(kernel.module, arch=arch, module_dir=str(folder), strip_hash=True, use_ptx=False)
-        return sum(path.stat().st_size for path in folder.glob("*.cubin"))
-
-    with ThreadPoolExecutor(2) as pool:
-        sizes = list(pool.map(compile_one, kernels))
-    assert all(size > 1000 for size in sizes), "a kernel left no machine code"
+def test_kernels_compile_for_cuda(arch: int, least: int, beside: subprocess.CompletedProcess) -> None:
+    assert beside.returncode == 0, beside.stderr
+    sizes = json.loads(beside.stdout.splitlines()[-1])
+    assert len(sizes) >= least
+    assert all(size > 1000 for size in sizes.values()), "a kernel left no machine code"

@@ -34,15 +34,18 @@ print(json.dumps(results))
 """
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    pytest.importorskip("hypothesis")
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path_factory.mktemp("failed")), json.dumps(DRIVERS)]
-    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+def fuzzed(folder: Path) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", PROGRAM, str(folder), json.dumps(DRIVERS)]
+    return subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
 
 
+@pytest.fixture
+def results(beside: subprocess.CompletedProcess) -> dict:
+    assert beside.returncode == 0, beside.stderr
+    return json.loads(beside.stdout.splitlines()[-1])
+
+
+@pytest.mark.beside(fuzzed)
 @pytest.mark.parametrize("name", TARGETS)
 def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
@@ -51,6 +54,7 @@ def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     assert 0 < result["loaded"] < inputs, "inputs are neither all as good as new nor all beyond recognition"
 
 
+@pytest.mark.beside(fuzzed)
 @pytest.mark.parametrize("name", DRAWN)
 def test_readers_stand_what_hypothesis_draws(results: dict, name: str) -> None:
     result = results[f"hypothesis {name}"]

@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -37,25 +36,16 @@ def test_there_are_four() -> None:
     assert NAMES == ["01_one_surfel", "02_passes", "03_train", "04_gpu_vs_cpu"]
 
 
-@pytest.fixture(scope="module")
-def short_forms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[subprocess.CompletedProcess, Path]]:
-    """What running each notebook's short form gave, two at a time, and where it is."""
-
-    def run(name: str) -> tuple[subprocess.CompletedProcess, Path]:
-        folder = tmp_path_factory.mktemp(name)
-        command = [sys.executable, "-m", "notebooks", "--short", "--out", str(folder), name]
-        return subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540), folder
-
-    with ThreadPoolExecutor(2) as pool:
-        return dict(zip(NAMES, pool.map(run, NAMES), strict=True))
+def short_form(folder: Path, name: str) -> tuple[subprocess.CompletedProcess, Path]:
+    """What running a notebook's short form gave, and where it is."""
+    command = [sys.executable, "-m", "notebooks", "--short", "--out", str(folder), name]
+    return subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540), folder
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_short_form_runs_from_clean(
-    name: str, short_forms: dict[str, tuple[subprocess.CompletedProcess, Path]]
-) -> None:
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.beside(short_form, name)) for name in NAMES])
+def test_short_form_runs_from_clean(name: str, beside: tuple[subprocess.CompletedProcess, Path]) -> None:
     """Its own assertions hold, nothing is warned of, and every figure of the kept form is drawn."""
-    done, folder = short_forms[name]
+    done, folder = beside
     assert done.returncode == 0, done.stderr
     kept, run = (nbformat.read(where / f"{name}.ipynb", as_version=4) for where in (FOLDER, folder))
     assert [cell.source for cell in kept.cells] == [cell.source for cell in run.cells]

@@ -67,13 +67,27 @@ def fresh_process(program: str, *arguments: str, cache: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_nothing_is_left_to_compile(tmp_path: Path, device: torch.device) -> None:
+def warmed(folder: Path, device: str) -> tuple[list[str], list[str]]:
+    """What both print."""
+    scene = write_demo(folder / "tiny", width=48, height=36, views=10, points=200)
+    warm = fresh_process(WARM, device, cache=folder)
+    return warm, fresh_process(USE, str(scene), str(folder / "run"), device, cache=folder)
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        pytest.param("cpu", marks=pytest.mark.beside(warmed, "cpu")),
+        pytest.param("cuda", marks=[pytest.mark.beside(warmed, "cuda"), pytest.mark.cuda]),
+    ],
+)
+def test_nothing_is_left_to_compile(device: str, beside: tuple[list[str], list[str]]) -> None:
     """The list alone is enough for the rehearsal; and after both, no command compiles, not even a second warm-up."""
-    scene = write_demo(tmp_path / "tiny", width=48, height=36, views=10, points=200)
-    at_first, listed, rehearsed = json.loads(fresh_process(WARM, device.type, cache=tmp_path)[-1])
+    warm, use = beside
+    at_first, listed, rehearsed = json.loads(warm[-1])
     assert at_first == 0 and listed > 20
     assert rehearsed == listed, "the rehearsal compiled kernels that the catalogue does not list"
-    *output, last = fresh_process(USE, str(scene), str(tmp_path / "run"), device.type, cache=tmp_path)
+    *output, last = use
     codes, compiled = json.loads(last)
     assert codes == [0] * 4
     assert not compiled, "compiled after the warm-up"

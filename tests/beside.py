@@ -1,0 +1,78 @@
+"""Long work that tests wait for, done on a second core beside the tests that do not need it.
+
+A test marked `beside(work, *arguments)` gets what `work(folder, *arguments)` gave, or raises what it raised, as the
+fixture `beside`. Such tests come last in a run of many. The work should be done in a process of its own: beside others
+it is called in a thread. `folder` is empty and its own. Tests with the same mark share one call.
+"""
+
+import subprocess
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# So many tests that the other ones take longer than the work, and wait for most kernels.
+MANY = 500
+
+
+def key(item: pytest.Item) -> tuple[Callable[..., Any], ...] | None:
+    """What a test's mark asks for."""
+    mark = item.get_closest_marker("beside")
+    return mark.args if mark else None
+
+
+class Beside:
+    """Work that has been begun.
+
+    Attributes:
+        pool: does it, in order.
+        folder: makes a folder by its name.
+    """
+
+    def __init__(self, pool: ThreadPoolExecutor, folder: Callable[[str], Path]) -> None:
+        self.pool, self.folder = pool, folder
+        self._begun: dict[tuple, Future] = {}
+
+    def begin(self, works: Iterable[tuple]) -> None:
+        """Put work in line."""
+        for work in works:
+            if work not in self._begun:
+                self._begun[work] = self.pool.submit(self._do, work)
+
+    def result(self, work: tuple) -> Any:
+        """Wait for work; what is still in line, or never was, is done here and now."""
+        future = self._begun.get(work)
+        if future is None or future.cancel():
+            future = self._begun[work] = Future()
+            try:
+                future.set_result(self._do(work))
+            except BaseException as error:
+                future.set_exception(error)
+        return future.result()
+
+    def _do(self, work: tuple) -> Any:
+        function, *arguments = work
+        return function(self.folder(function.__name__), *arguments)
+
+
+@contextmanager
+def begun(items: list[pytest.Item], folder: Callable[[str], Path], first: list[str]) -> Iterator[Beside]:
+    """Begin the work of some tests: of many at one time one, after a command that may be killed; of few two."""
+    many = len(items) >= MANY
+    ahead = None
+    with ThreadPoolExecutor(1 if many else 2) as pool:
+        if many:
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            ahead = subprocess.Popen(first, cwd=Path(__file__).parents[1], **quiet)
+            pool.submit(ahead.wait)
+        beside = Beside(pool, folder)
+        beside.begin(work for item in items if (work := key(item)))
+        try:
+            yield beside
+        finally:
+            if ahead is not None:
+                ahead.kill()
+            pool.shutdown(cancel_futures=True)
