@@ -2,7 +2,8 @@
 
 A test marked `beside(work, *arguments)` gets what `work(folder, *arguments)` gave, or raises what it raised, as the
 fixture `beside`. Such tests come last in a run of many. The work should be done in a process of its own: beside others
-it is called in a thread. `folder` is empty and its own. Tests with the same mark share one call.
+it is called in a thread. `folder` is empty and its own. Tests with the same mark share one call. Work without arguments
+is marked `beside.with_args(work)`, for pytest takes a mark called with one function for that function's own mark.
 """
 
 import subprocess

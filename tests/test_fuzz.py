@@ -45,7 +45,7 @@ def results(beside: subprocess.CompletedProcess) -> dict:
     return json.loads(beside.stdout.splitlines()[-1])
 
 
-@pytest.mark.beside(fuzzed)
+@pytest.mark.beside.with_args(fuzzed)
 @pytest.mark.parametrize("name", TARGETS)
 def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
@@ -54,7 +54,7 @@ def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     assert 0 < result["loaded"] < inputs, "inputs are neither all as good as new nor all beyond recognition"
 
 
-@pytest.mark.beside(fuzzed)
+@pytest.mark.beside.with_args(fuzzed)
 @pytest.mark.parametrize("name", DRAWN)
 def test_readers_stand_what_hypothesis_draws(results: dict, name: str) -> None:
     result = results[f"hypothesis {name}"]
