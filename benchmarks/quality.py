@@ -362,9 +362,13 @@ def train(given: argparse.Namespace) -> int:
     wanted: dict[Job, None] = {}
     seeds = [int(x) for x in given.seeds.split(",")]
     scenes = given.scenes.split(",")
+    only = given.only.split(",") if given.only else [*ROWS]
+    if unknown := [name for name in only if name not in ROWS]:
+        raise ValueError(f"--only: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
     for table in filter(None, (given.tables or "").split(",")):
         for job in jobs_of(table, scenes, seeds, given.iterations, given.size):
-            wanted[dataclasses.replace(job, downscale=given.downscale)] = None
+            if job.row in only:
+                wanted[dataclasses.replace(job, downscale=given.downscale)] = None
     for text in given.row or ():
         # NAME:PRESET:SETTINGS, for trying things out.
         name, base, settings = text.split(":", 2)
@@ -599,6 +603,7 @@ def main(arguments: list[str] | None = None) -> int:
     training = commands.add_parser("train", help="do the trainings of some tables that are not there yet")
     training.set_defaults(run=train)
     training.add_argument("--tables", help=f"comma-separated: {', '.join(TABLES)}")
+    training.add_argument("--only", help="comma-separated rows of the tables; default: all of them")
     training.add_argument("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
     training.add_argument("--variant", default="", choices=("", *VARIANTS), help="of the scene, for --row")
     training.add_argument("--scenes", default=",".join(SCENES), help="default: %(default)s")

@@ -171,6 +171,17 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     torch.set_num_threads(threads)
 
 
+def test_only_some_rows_of_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "results.jsonl"
+    file.write_text(json.dumps(result("no gamma", 0)) + "\n" + json.dumps(result("K = 3", 0)) + "\n")
+    command = ["train", "--tables", "ablation,hits", "--scenes", "fox", "--seeds", "0", "--size", "40"]
+    command += ["--iterations", "100", "--out", str(file), "--only"]
+    assert quality.main([*command, "no gamma,K = 3"]) == 0
+    assert "0 of 2 trainings to do" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"--only: expected some of default, paper, .*, got K = 9"):
+        quality.main([*command, "no gamma,K = 9"])
+
+
 def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = []
     for row, size, seed, figure in (
