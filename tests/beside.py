@@ -61,7 +61,11 @@ class Beside:
 
 @contextmanager
 def begun(items: list[pytest.Item], folder: Callable[[str], Path], first: list[str]) -> Iterator[Beside]:
-    """Begin the work of some tests: of many at one time one, after a command that may be killed; of few two."""
+    """Begin the work of some tests: of many at one time one, after a command that may be killed; of few two.
+
+    That of tests on CUDA waits until it is asked for: nothing may run beside those that look at the GPU's memory.
+    """
+    items = [item for item in items if item.get_closest_marker("cuda") is None]
     many = len(items) >= MANY
     ahead = None
     with ThreadPoolExecutor(1 if many else 2) as pool:
