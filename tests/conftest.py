@@ -33,6 +33,8 @@ def begun(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture
 def beside(request: pytest.FixtureRequest, begun: beside_others.Beside) -> Any:
     """What the work of the test's mark `beside` gave."""
+    if request.node.get_closest_marker("cuda") and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
     return begun.result(beside_others.key(request.node))
 
 
