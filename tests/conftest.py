@@ -17,7 +17,11 @@ from tests import beside as beside_others
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """In a run of many tests, those that wait for work beside them come last."""
+    """Tests on CUDA are skipped where there is none; of many tests, those that wait for work beside them come last."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("cuda"):
+                item.add_marker(pytest.mark.skip(reason="no CUDA device"))
     if len(items) >= beside_others.MANY:
         items.sort(key=lambda item: beside_others.key(item) is not None)
 
@@ -33,16 +37,12 @@ def begun(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture
 def beside(request: pytest.FixtureRequest, begun: beside_others.Beside) -> Any:
     """What the work of the test's mark `beside` gave."""
-    if request.node.get_closest_marker("cuda") and not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     return begun.result(beside_others.key(request.node))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Device to run on: the CPU always, CUDA with `-m cuda`."""
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     return torch.device(request.param)
 
 
