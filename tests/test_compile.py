@@ -24,7 +24,7 @@ def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProces
         pytest.param(80, 30, marks=pytest.mark.beside(compiled, 80, "one run")),
         pytest.param(90, 100, marks=pytest.mark.beside(compiled, 90, "usual")),
         *(
-            pytest.param(arch, 300, marks=[pytest.mark.beside(compiled, arch, "all"), pytest.mark.slow])
+            pytest.param(arch, 150, marks=[pytest.mark.beside(compiled, arch, "all"), pytest.mark.slow])
             for arch in (80, 90)
         ),
     ],

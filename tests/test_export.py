@@ -215,8 +215,6 @@ def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> 
     """Against our render without texture at gamma = 1."""
     pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
     pytest.importorskip("plyfile", reason="an independent reader of PLY (extra `dev`)")
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     device = torch.device("cuda")
     surfels = small_surfels(20_000, device)
     save_splats_ply(tmp_path / "splats.ply", surfels)
@@ -237,8 +235,6 @@ def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> 
 def test_gsplat_renders_a_trained_scene_as_we_do(tmp_path: Path, record_property) -> None:
     """The demo as `nexwarp train demo` trains it, at 4 times its photos' size, where the blur is small."""
     pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     scene = nw.load_scene(write_demo(tmp_path / "demo"))
     trainer = Trainer(scene, with_settings(preset("default"), DEMO_SETTINGS), "cuda")
     trainer.run()

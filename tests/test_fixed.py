@@ -108,8 +108,6 @@ def test_lookup_in_fixed_point(features: int, switched: Any) -> None:
 @pytest.mark.cuda
 def test_gradients_repeat_bit_for_bit() -> None:
     """Thousands of overlapping surfels, half precision: with torch's deterministic algorithms all bits repeat."""
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     device = torch.device("cuda")
     scene = random_scene(4000, width=400, height=300, device=device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)

@@ -18,7 +18,7 @@ from nexwarp.densify import DensifyConfig
 from nexwarp.trainer import Trainer
 from tests.test_trainer import assert_same_state
 
-pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+pytestmark = pytest.mark.cuda
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 SETTINGS: dict[str, Any] = {

@@ -114,8 +114,6 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
 
 @pytest.mark.cuda
 def test_deterministic_runs_are_the_same_on_cuda(scene):
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     runs = []
     for _ in range(3):
         trainer = Trainer(scene, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
