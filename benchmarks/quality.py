@@ -466,8 +466,7 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
     title = ""
     for row in rows:
         variant = f", {row['variant']}" if row["variant"] else ""
-        reduced = f", photos reduced by {row['downscale']}" if row["downscale"] > 1 else ""
-        here = f"{row['scene']}{variant}{reduced}, {row['size']:,} primitives, {row['iterations']:,} iterations"
+        here = f"{row['scene']}{variant}{_extent(row)}"
         if here != title:
             lines += [""] * bool(title) + [f"## {here}", "", f"| | {' | '.join(columns)} |"]
             lines += ["|---" * (len(columns) + 1) + "|"]
@@ -475,14 +474,18 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
         cells = [_cell(row[figure], digits[figure]) for figure in digits]
         lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
     for group in differences(results):
-        reduced = f", photos reduced by {group['downscale']}" if group["downscale"] > 1 else ""
-        lines += ["", f"## Mean of the scenes less the default's, {group['size']:,} primitives{reduced}, "]
-        lines[-1] += f"{group['iterations']:,} iterations"
-        lines += ["", f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
+        lines += ["", f"## Mean of the scenes less the default's{_extent(group)}", ""]
+        lines += [f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
         for row in group["rows"]:
             cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]
             lines.append(f"| {row['row']} | {' | '.join(cells)} | {', '.join(row['scenes'])} |")
     return "\n".join([*lines, ""])
+
+
+def _extent(what: dict[str, Any]) -> str:
+    """Of trainings, for a heading."""
+    reduced = f", photos reduced by {what['downscale']}" if what["downscale"] > 1 else ""
+    return f"{reduced}, {what['size']:,} primitives, {what['iterations']:,} iterations"
 
 
 def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
