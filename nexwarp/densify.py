@@ -10,6 +10,9 @@ from nexwarp.surfels import Surfels
 
 PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
 
+# Between surfels and cameras, at a time: 64 MB.
+DISTANCES = 2**24
+
 
 @dataclass(frozen=True)
 class DensifyConfig:
@@ -27,11 +30,14 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    max_scale: float = 0.0
+    """Largest scale of a surfel, in shares of its distance to the nearest training camera; 0 is no limit."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)
         check_range("fraction", self.fraction, 0.0, 1.0)
         check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
+        check_range("max_scale", self.max_scale, 0.0)
 
 
 class Densifier:
@@ -103,6 +109,26 @@ class Densifier:
         keys = torch.empty_like(errors).exponential_(generator=generator) / errors
         chosen = keys.topk(min(count, candidates), largest=False).indices.sort().values
         return chosen.to(self.errors.device)
+
+
+@torch.no_grad()
+def limit_scales(surfels: Surfels, positions: torch.Tensor, share: float, least: float) -> None:
+    """Shrink, in place, scales of more than a share of the distance from the surfel's mean to the nearest camera.
+
+    What is wider reaches from the background that it explains in some views past the cameras of others.
+
+    Args:
+        surfels: to change; Adam's moments stay.
+        positions: (V, 3) of the cameras, world units.
+        share: > 0.
+        least: distance, world units, that nearer surfels count as, > 0.
+    """
+    chunk = max(1, DISTANCES // len(positions))
+    for first in range(0, len(surfels), chunk):
+        rows = slice(first, first + chunk)
+        distances = torch.cdist(surfels.means[rows], positions).amin(dim=1).clamp_min(least)
+        scales = surfels.log_scales[rows]
+        scales.copy_(torch.minimum(scales, (share * distances).log()[:, None]))
 
 
 @torch.no_grad()

@@ -20,12 +20,12 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
 from nexwarp.config import Config
 from nexwarp.data import Scene
-from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
+from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig, limit_scales
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
+from nexwarp.losses import border_loss, depth_loss, near_loss, nearest_depth, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
 from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
@@ -86,8 +86,10 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
+        self.nearest = _nearest_depths(scene, config, self.device)
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
+        self.positions = torch.stack([camera.position for camera in self.views.cameras])
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
@@ -238,6 +240,9 @@ class Trainer:
         learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
+        share = config.densify.max_scale
+        if share > 0 and self.iteration % self.densifier.config.every == 0:  # also after the last round
+            limit_scales(self.surfels, self.positions, share, self.views.cameras[index].near)
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
     def _learn(self, view: "_Target") -> Learnt:
@@ -296,10 +301,11 @@ class Trainer:
             if alpha is not None:
                 photo = photo + (1 - alpha)[..., None] * (background - self.behind)
         mask = self.views.mask(index, factor)
+        nearest = None if self.nearest is None else self.nearest[index]
         if mask is None or self.config.mask_mode == "ignore":
-            return _Target(camera, photo, background, counts=mask)
+            return _Target(camera, photo, background, counts=mask, nearest=nearest)
         behind = background if isinstance(background, torch.Tensor) else self.behind
-        return _Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
+        return _Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask, nearest=nearest)
 
     def _beyond_the_frame(self, view: "_Target") -> "_Target":
         """Shift the window at random; where it leaves the photo, the photo's edge goes on.
@@ -537,6 +543,8 @@ class Trainer:
             losses["empty"] = factors.empty * (out.alpha * view.empty).mean()
         if view.places is not None and view.expected is not None:
             losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, view.places, view.expected)
+        if view.nearest is not None:
+            losses["near"] = factors.near * near_loss(out.depths, out.weights, view.nearest)
         return losses
 
     def _schedule_rates(self) -> None:
@@ -564,6 +572,7 @@ class _Target:
         beyond: (H, W) bool, what lies beyond the photo's frame; None is nothing.
         places, expected: (M,) points to compare depths with, as `depth_loss` takes them; None is no such loss.
         depth_jitter: as `render` takes it.
+        nearest: () as `near_loss` takes it; None is no such loss.
     """
 
     camera: Camera
@@ -575,6 +584,7 @@ class _Target:
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
+    nearest: torch.Tensor | None = None
 
 
 def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] | tuple[None, None]:
@@ -593,6 +603,19 @@ def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] |
     log_gains, falloff = photo_gains(cameras, photos, seen, masks)
     found = torch.from_numpy(log_gains)
     return Exposures.of(found, cameras, falloff if config.vignetting else None), found.float().exp()
+
+
+def _nearest_depths(scene: Scene, config: Config, device: torch.device) -> torch.Tensor | None:
+    """(V,) what `near_loss` takes for the training views; None where nobody asks, or no points tell."""
+    if config.losses.near == 0 or config.max_hits == 0:
+        return None
+    nearest = []
+    for view in scene.train:
+        camera, points, found = view.camera, view.points, None
+        if points is not None:
+            found = visible_points(*camera.project(points), camera.width, camera.height, view.mask)
+        nearest.append(0.0 if found is None else nearest_depth(found[1]))
+    return torch.tensor(nearest, device=device) if any(nearest) else None
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

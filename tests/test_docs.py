@@ -65,6 +65,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
     "losses.border": ("", ""),
+    "losses.near": ("", ""),
     "rates.means": ("", "code"),
     "rates.quats": ("", "code"),
     "rates.scales": ("", "code"),
@@ -90,6 +91,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "densify.fraction": ("", "Adaptive Density Control"),
     "densify.prune_opacity": ("", "Adaptive Density Control"),
     "densify.prune_at_cap": ("", "code"),
+    "densify.max_scale": ("", ""),
 }
 
 INTRODUCTION = """\

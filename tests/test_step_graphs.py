@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nexwarp import ops, step_graphs, training_views
-from nexwarp.config import Config, TextureConfig
+from nexwarp.config import Config, TextureConfig, with_settings
 from nexwarp.data import Scene, View
 from nexwarp.densify import DensifyConfig
 from nexwarp.trainer import Trainer
@@ -57,15 +57,17 @@ def masked(scene: Scene) -> Scene:
         {"max_hits": 0},
         {"max_hits": 4, "depth_jitter": 0.0, "border": 0.0},
         {"low_pass": True, "losses.depth": 0.0},
+        {"losses.near": 1.0, "densify.max_scale": 0.1},
         {"coarse": 0.5},
         {"background": (0.1, 0.2, 0.3), "sh_every": 5_000},
     ],
     ids=str,
 )
 def test_graphs_give_the_bits_of_launches(tiny_scene: Scene, changes: dict[str, Any]) -> None:
-    if "losses.depth" in changes:
-        changes = {k: v for k, v in changes.items() if k != "losses.depth"}
-        changes["losses"] = dataclasses.replace(Config().losses, depth=0.0)
+    parts = {name: x for name, x in changes.items() if "." in name}
+    config = with_settings(Config(**SETTINGS), parts)
+    changes = {name: x for name, x in changes.items() if name not in parts}
+    changes |= {part: getattr(config, part) for part in {name.split(".")[0] for name in parts}}
     launched = trained(tiny_scene, cuda_graphs=False, **changes)
     replayed = trained(tiny_scene, **changes)
     assert launched.graphs is None and graphs_of(replayed) > 0

@@ -18,7 +18,7 @@ from nexwarp.data import Scene, View, initial_points
 from nexwarp.densify import DensifyConfig
 from nexwarp.evaluate import evaluate
 from nexwarp.initial import initial_surfels, quats_towards, texture_shape
-from nexwarp.losses import LossWeights
+from nexwarp.losses import LossWeights, nearest_depth
 from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
 from tests.tolerances import assert_close
@@ -388,10 +388,12 @@ def test_texture_follows_the_scale_of_the_scene(scene, factor):
     assert one == other
 
 
-@pytest.mark.parametrize("factor", [64.0, 1 / 64])
-def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
+@pytest.mark.parametrize(("factor", "near", "max_scale"), [(64.0, 0.0, 0.0), (1 / 64, 0.0, 0.0), (64.0, 1.0, 0.05)])
+def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, near, max_scale):
     """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
-    config = small(iterations=40, texture=dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None))
+    texture = dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None)
+    often = dataclasses.replace(OFTEN, max_scale=max_scale)
+    config = small(iterations=40, texture=texture, densify=often, losses=LossWeights(near=near))
     runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
     for step in range(config.iterations):
         one, other = (torch.stack(list(trainer.step().losses.values())) for trainer in runs)
@@ -399,6 +401,38 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
     assert len(runs[0].surfels) == len(runs[1].surfels)
     images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
+
+
+def test_what_hangs_in_front_of_a_camera_is_to_vanish(scene):
+    """A surfel at a quarter of the depth from which on they may be: the near term wants its opacity alone to fall."""
+    trainer = Trainer(scene, small(losses=LossWeights(near=2.0)), "cpu")
+    camera, surfels = trainer.views.cameras[0], trainer.surfels
+    bound = nearest_depth(camera.project(scene.train[0].points)[1])
+    forward = camera.viewmat[2, :3]
+    with torch.no_grad():
+        surfels.means[0] = camera.position + bound / 4 * forward
+        surfels.raw_quats[0] = quats_towards(forward[None], torch.tensor([[1.0, 0, 0, 0]]))[0]
+        surfels.log_scales[0] = math.log(bound / 4 * camera.width / camera.fx / 8)
+    target = trainer._view(0, 1)
+    out = nw.render(surfels, trainer.texture, target.camera, **trainer.render_options())
+    hidden = (out.weights * (out.ids == 0)).sum() / out.alpha.numel()
+    term = trainer._losses(out, target)["near"]
+    assert_close(term, 2.0 * 0.75 * hidden, kind="gradient", name="term")
+    to_opacities = torch.autograd.grad(term, surfels.logit_opacities)[0]
+    assert to_opacities[0] > 0 and not to_opacities[1:].any()
+
+
+def test_nothing_is_too_near_where_no_points_tell(scene):
+    blind = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
+    trainer = Trainer(blind, small(losses=LossWeights(near=1.0)), "cpu")
+    assert "near" not in trainer.step().losses
+
+
+def test_scales_stay_limited_to_the_end(scene):
+    trainer = trained(scene, small(densify=dataclasses.replace(OFTEN, max_scale=0.02)))
+    distances = torch.cdist(trainer.surfels.means, trainer.positions).amin(dim=1)
+    widest = trainer.surfels.log_scales.exp().amax(dim=1) / distances
+    assert widest.max().item() == pytest.approx(0.02, rel=1e-4)
 
 
 def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
