@@ -15,7 +15,7 @@ from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
 
-# Of a view, for the nearest of them to say how near a surfel may be.
+# Fewer points of a view than this do not tell how near a surfel may be.
 FEWEST_POINTS = 20
 
 

@@ -242,7 +242,8 @@ class Trainer:
             self.densifier.step(self.surfels, self.optimizer, self.generator)
         share = config.densify.max_scale
         if share > 0 and self.iteration % self.densifier.config.every == 0:  # also after the last round
-            limit_scales(self.surfels, self.positions, share, self.views.cameras[index].near)
+            least = min(camera.near for camera in self.views.cameras)
+            limit_scales(self.surfels, self.positions, share, least)
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
     def _learn(self, view: "_Target") -> Learnt:
