@@ -10,9 +10,6 @@ from nexwarp.surfels import Surfels
 
 PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
 
-# Between surfels and cameras, at a time: 64 MB.
-DISTANCES = 2**24
-
 
 @dataclass(frozen=True)
 class DensifyConfig:
@@ -30,14 +27,13 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
-    max_scale: float = 0.0
-    """Largest scale of a surfel, in shares of its distance to the nearest training camera; 0 is no limit."""
+    floaters: bool = True
+    """Remove surfels that views between those of training show large, from less than half as far as any of those."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)
         check_range("fraction", self.fraction, 0.0, 1.0)
         check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
-        check_range("max_scale", self.max_scale, 0.0)
 
 
 class Densifier:
@@ -90,14 +86,22 @@ class Densifier:
         pruned = 0
         if split or self.config.prune_at_cap:
             opacities = surfels.opacities.detach()
-            # The most opaque one always stays: a scene without surfels has no gradient to recover by.
-            keep = (opacities >= self.config.prune_opacity) | (opacities == opacities.max())
-            pruned = int((~keep).sum())
-            if pruned:
-                kept = keep.nonzero()[:, 0]
-                replace_rows(surfels, optimizer, kept)
-                self.errors = self.errors[kept]
+            pruned = self.remove(surfels, optimizer, opacities < self.config.prune_opacity)
         return split, pruned
+
+    def remove(self, surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> int:
+        """Remove, in place, the chosen (N,) bool surfels but for the most opaque ones of all; return how many.
+
+        A scene without surfels has no gradient to recover by.
+        """
+        opacities = surfels.opacities.detach()
+        keep = ~chosen | (opacities == opacities.max())
+        removed = int((~keep).sum())
+        if removed:
+            kept = keep.nonzero()[:, 0]
+            replace_rows(surfels, optimizer, kept)
+            self.errors = self.errors[kept]
+        return removed
 
     def _choose(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Draw surfels without replacement, with probability proportional to their blended error."""
@@ -109,26 +113,6 @@ class Densifier:
         keys = torch.empty_like(errors).exponential_(generator=generator) / errors
         chosen = keys.topk(min(count, candidates), largest=False).indices.sort().values
         return chosen.to(self.errors.device)
-
-
-@torch.no_grad()
-def limit_scales(surfels: Surfels, positions: torch.Tensor, share: float, least: float) -> None:
-    """Shrink, in place, scales of more than a share of the distance from the surfel's mean to the nearest camera.
-
-    What is wider reaches from the background that it explains in some views past the cameras of others.
-
-    Args:
-        surfels: to change; Adam's moments stay.
-        positions: (V, 3) of the cameras, world units.
-        share: > 0.
-        least: distance, world units, that nearer surfels count as, > 0.
-    """
-    chunk = max(1, DISTANCES // len(positions))
-    for first in range(0, len(surfels), chunk):
-        rows = slice(first, first + chunk)
-        distances = torch.cdist(surfels.means[rows], positions).amin(dim=1).clamp_min(least)
-        scales = surfels.log_scales[rows]
-        scales.copy_(torch.minimum(scales, (share * distances).log()[:, None]))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Camera paths for videos: an ellipse around what the cameras see, a spiral before it, a flight from view to view."""
+"""Camera paths for videos (an ellipse around what the cameras see, a spiral before it, a flight), and cameras between."""
 
 import math
 from collections.abc import Sequence
@@ -14,6 +14,9 @@ DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as
 ONE_WAY = 0.5  # least length of the mean viewing direction for a spiral
 SPREAD = 0.9  # share of the cameras, along each axis, that a spiral spans
 FRAMES_PER_KEY = 10
+NEIGHBORS = 4  # cameras, the nearest that look alike, towards one of which `between` goes
+ALIKE = math.cos(math.radians(60.0))
+BEYOND = 0.5  # share of the way that `between` goes at most beyond either end
 
 
 def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
@@ -123,6 +126,46 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
         path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
     return path
+
+
+def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torch.Generator) -> list[Camera]:
+    """Return for each camera one on the way from it to a neighbour, or at most half as far beyond either end.
+
+    The neighbour is drawn from the 4 nearest whose optical axes are within 60 degrees of the camera's; a camera without
+    any, or without reach, is left out. Position and rotation go along evenly; all else is the camera's. A rigid motion
+    and scaling of all cameras does the same to the result.
+
+    Args:
+        cameras: at least one.
+        reaches: for each, how far from it the new one may be, world units, >= 0.
+        generator: for neighbours and places, on the CPU.
+    """
+    from scipy.spatial.transform import Rotation
+
+    viewmats, centres = _poses(cameras)
+    drawn, places = torch.rand(2, len(cameras), generator=generator, dtype=torch.float64)
+    places = places * (1 + 2 * BEYOND) - BEYOND
+    distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
+    axes = viewmats[:, 2, :3]
+    distances = distances.where(axes @ axes.mT >= ALIKE, torch.inf).fill_diagonal_(torch.inf)
+    nearest = distances.topk(min(NEIGHBORS, len(cameras)), largest=False)
+    choices = nearest.values.isfinite().sum(dim=1)
+    some = ((choices > 0) & (torch.tensor(reaches) > 0)).nonzero()[:, 0]
+    if not len(some):
+        return []
+    others = nearest.indices[some, (drawn[some] * choices[some]).long()]
+    limits = torch.tensor(reaches, dtype=torch.float64)[some] / distances[some, others]
+    places = places[some].clamp(-limits, limits)
+    turned = Rotation.from_matrix(viewmats[:, :3, :3].numpy())
+    turns = (turned[others.numpy()] * turned[some.numpy()].inv()).as_rotvec() * places[:, None].numpy()
+    rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned[some.numpy()]).as_matrix())
+    positions = torch.lerp(centres[some], centres[others], places[:, None])
+    made = []
+    for index, rotation, position in zip(some.tolist(), rotations, positions, strict=True):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+        made.append(replace(cameras[index], viewmat=viewmat.to(cameras[index].viewmat)))
+    return made
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

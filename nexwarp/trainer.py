@@ -20,10 +20,11 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
 from nexwarp.config import Config
 from nexwarp.data import Scene
-from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig, limit_scales
+from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
+from nexwarp.floaters import floaters
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, near_loss, nearest_depth, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
@@ -38,6 +39,8 @@ from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 CHECK_EVERY = 100
 SNAPSHOTS = 10
 LOWERED_RATES = 0.5
+# Rounds of densification between looks for floaters.
+FLOATERS_EVERY = 10
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,10 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
-        self.nearest = _nearest_depths(scene, config, self.device)
+        self.reaches = _nearest_depths(scene)
+        self.nearest = torch.tensor(self.reaches, device=self.device)
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
-        self.positions = torch.stack([camera.position for camera in self.views.cameras])
         self.background = config.background or scene.background or mean_color(scene.train)
         self.behind = torch.tensor(self.background, device=self.device)
         self.rate_factor = 1.0
@@ -240,11 +243,23 @@ class Trainer:
         learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
-        share = config.densify.max_scale
-        if share > 0 and self.iteration % self.densifier.config.every == 0:  # also after the last round
-            least = min(camera.near for camera in self.views.cameras)
-            limit_scales(self.surfels, self.positions, share, least)
+        if config.densify.floaters and self._floaters_due():
+            self._remove_floaters()
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
+
+    def _floaters_due(self) -> bool:
+        """Also after the last round of densification, but not at the end: what was behind them has to be learnt."""
+        densify = self.densifier.config
+        every = FLOATERS_EVERY * densify.every
+        due = self.iteration > densify.start and self.iteration % every == 0
+        return due and self.iteration < self.config.iterations and any(self.reaches)
+
+    def _remove_floaters(self) -> None:
+        # A generator of its own: where there are no floaters, nothing else changes.
+        generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
+        cameras, options = self.views.cameras, self.render_options()
+        chosen = floaters(self.surfels, cameras, self.reaches, generator, options=options)
+        self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def _learn(self, view: "_Target") -> Learnt:
         """Render, compare, go back and step: the GPU's part, whose launches follow from `_launched` and shapes."""
@@ -302,7 +317,8 @@ class Trainer:
             if alpha is not None:
                 photo = photo + (1 - alpha)[..., None] * (background - self.behind)
         mask = self.views.mask(index, factor)
-        nearest = None if self.nearest is None else self.nearest[index]
+        near = self.config.losses.near > 0 and self.config.max_hits > 0 and any(self.reaches)
+        nearest = self.nearest[index] if near else None
         if mask is None or self.config.mask_mode == "ignore":
             return _Target(camera, photo, background, counts=mask, nearest=nearest)
         behind = background if isinstance(background, torch.Tensor) else self.behind
@@ -606,17 +622,15 @@ def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] |
     return Exposures.of(found, cameras, falloff if config.vignetting else None), found.float().exp()
 
 
-def _nearest_depths(scene: Scene, config: Config, device: torch.device) -> torch.Tensor | None:
-    """(V,) what `near_loss` takes for the training views; None where nobody asks, or no points tell."""
-    if config.losses.near == 0 or config.max_hits == 0:
-        return None
+def _nearest_depths(scene: Scene) -> list[float]:
+    """`nearest_depth` of each training view; 0 where no points tell."""
     nearest = []
     for view in scene.train:
         camera, points, found = view.camera, view.points, None
         if points is not None:
             found = visible_points(*camera.project(points), camera.width, camera.height, view.mask)
         nearest.append(0.0 if found is None else nearest_depth(found[1]))
-    return torch.tensor(nearest, device=device) if any(nearest) else None
+    return nearest
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

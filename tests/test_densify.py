@@ -7,8 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import densify
-from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig, limit_scales, split_surfels
+from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig, split_surfels
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 
@@ -280,6 +279,21 @@ def test_no_error_means_no_split():
     assert densifier_of(surfels).step(surfels, optimizer, generator()) == (0, 0)
 
 
+def test_chosen_ones_are_removed_but_never_the_most_opaque():
+    surfels, optimizer = make(5)
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.tensor([0.0, 1.0, -9.0, 2.0, 0.5]))
+    old, moments = rows_of(surfels), moments_of(surfels, optimizer)
+    densifier = densifier_of(surfels)
+    densifier.accumulate(torch.arange(5.0))
+    assert densifier.remove(surfels, optimizer, torch.zeros(5, dtype=torch.bool)) == 0
+    assert densifier.remove(surfels, optimizer, torch.tensor([True, False, False, True, True])) == 2
+    kept = [1, 2, 3]
+    assert all(torch.equal(getattr(surfels, name), old[name][kept]) for name in PARAMETERS)
+    assert all(torch.equal(now, moments[key][kept]) for key, now in moments_of(surfels, optimizer).items())
+    assert densifier.errors.tolist() == [1.0, 2.0, 3.0]
+
+
 # When
 
 
@@ -293,7 +307,7 @@ def test_rounds_come_when_the_paper_says():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("every", 0), ("fraction", -0.1), ("fraction", 1.5), ("prune_opacity", 2.0), ("max_scale", -1.0)],
+    [("every", 0), ("fraction", -0.1), ("fraction", 1.5), ("prune_opacity", 2.0)],
 )
 def test_settings_out_of_range_are_refused(name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected at least .*, got {value}$"):
@@ -316,25 +330,3 @@ def test_the_last_surfel_is_never_pruned() -> None:
     _, pruned = densifier.step(surfels, optimizer, torch.Generator().manual_seed(0))
     assert pruned == 4 and len(surfels) == 1
     assert torch.equal(surfels.means.detach(), means[2:3])
-
-
-@pytest.mark.parametrize("distances", [10**6, 7], ids=["at once", "a row at a time"])
-def test_scales_are_limited_by_the_distance_to_the_nearest_camera(
-    distances: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One scale each of two surfels, by the distance to the nearer of two cameras; the others keep their bits."""
-    monkeypatch.setattr(densify, "DISTANCES", distances)
-    surfels, optimizer = make(3)
-    with torch.no_grad():
-        surfels.means.copy_(torch.tensor([[0.0, 0, 3], [0, 0, 3], [0, 0, 1e-9]]))
-        surfels.log_scales.copy_(torch.tensor([[1.4, 1.6], [1.5, 0.1], [0.01, 1e-4]]).log())
-    before = rows_of(surfels)
-    positions = torch.tensor([[0.0, 0, -5], [0, 0, 0]])
-    limit_scales(surfels, positions, 0.5, 0.01)
-    after = rows_of(surfels)
-    expected = torch.tensor([[1.4, 1.5], [1.5, 0.1], [0.005, 1e-4]])
-    torch.testing.assert_close(after["log_scales"].exp(), expected)
-    same = torch.tensor([[True, False], [True, True], [False, True]])
-    assert torch.equal(after["log_scales"][same], before["log_scales"][same])
-    assert all(torch.equal(after[name], before[name]) for name in PARAMETERS if name != "log_scales")
-    step(surfels, optimizer)

@@ -91,7 +91,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "densify.fraction": ("", "Adaptive Density Control"),
     "densify.prune_opacity": ("", "Adaptive Density Control"),
     "densify.prune_at_cap": ("", "code"),
-    "densify.max_scale": ("", ""),
+    "densify.floaters": ("", ""),
 }
 
 INTRODUCTION = """\

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp import floaters as floaters_module
+from nexwarp import trainer as trainer_module
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
@@ -388,11 +390,12 @@ def test_texture_follows_the_scale_of_the_scene(scene, factor):
     assert one == other
 
 
-@pytest.mark.parametrize(("factor", "near", "max_scale"), [(64.0, 0.0, 0.0), (1 / 64, 0.0, 0.0), (64.0, 1.0, 0.05)])
-def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, near, max_scale):
+@pytest.mark.parametrize(("factor", "near"), [(64.0, 0.0), (1 / 64, 0.0), (64.0, 1.0)])
+def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, near, monkeypatch):
     """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
+    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     texture = dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None)
-    often = dataclasses.replace(OFTEN, max_scale=max_scale)
+    often = dataclasses.replace(OFTEN, floaters=True)
     config = small(iterations=40, texture=texture, densify=often, losses=LossWeights(near=near))
     runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
     for step in range(config.iterations):
@@ -428,11 +431,31 @@ def test_nothing_is_too_near_where_no_points_tell(scene):
     assert "near" not in trainer.step().losses
 
 
-def test_scales_stay_limited_to_the_end(scene):
-    trainer = trained(scene, small(densify=dataclasses.replace(OFTEN, max_scale=0.02)))
-    distances = torch.cdist(trainer.surfels.means, trainer.positions).amin(dim=1)
-    widest = trainer.surfels.log_scales.exp().amax(dim=1) / distances
-    assert widest.max().item() == pytest.approx(0.02, rel=1e-4)
+def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
+    """Every second of rounds 3, 6, ..., 36 of 36 iterations, also once densification is over, but not at the end."""
+    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 2)
+    looks = []
+
+    def first(surfels, cameras, reaches, generator, *, options):
+        looks.append((trainer.iteration, len(surfels), generator.initial_seed()))
+        return torch.arange(len(surfels)) == 0
+
+    monkeypatch.setattr(trainer_module, "floaters", first)
+    trainer = Trainer(scene, small(iterations=36, densify=dataclasses.replace(OFTEN, floaters=True)), "cpu")
+    counts = {}
+    trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
+    assert [look[0] for look in looks] == [6, 12, 18, 24, 30]
+    assert len({seed for _, _, seed in looks}) == 5
+    assert all(counts[iteration] == count - 1 for iteration, count, _ in looks)
+
+
+def test_looking_for_floaters_changes_nothing_where_there_are_none(scene, monkeypatch):
+    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
+    monkeypatch.setattr(floaters_module, "LEAST_SHARE", 2.0)
+    with_look, without = (
+        trained(scene, small(densify=dataclasses.replace(OFTEN, floaters=looks))) for looks in (True, False)
+    )
+    assert_same_state(with_look, without)
 
 
 def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
