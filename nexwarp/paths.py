@@ -1,4 +1,4 @@
-"""Camera paths for videos (an ellipse around what the cameras see, a spiral before it, a flight), and cameras between."""
+"""Camera paths for videos, an ellipse, a spiral or a flight from view to view; and cameras between the views."""
 
 import math
 from collections.abc import Sequence
