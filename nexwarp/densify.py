@@ -28,7 +28,7 @@ class DensifyConfig:
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
     floaters: bool = True
-    """Remove surfels that views between those of training show large, from less than half as far as any of those."""
+    """Remove surfels that views between the training views show large, nearer than half of the nearest points."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)

@@ -42,7 +42,7 @@ class LossWeights:
     """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
     border: float = 0.1
     """Image loss beyond the frame, where the photo's edge goes on."""
-    near: float = 1.0
+    near: float = 0.0
     """Weight of what hangs in front of a view: nearer than half of the depth of the nearest points that it shows."""
 
     def __post_init__(self) -> None:

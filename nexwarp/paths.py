@@ -131,9 +131,9 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
 def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torch.Generator) -> list[Camera]:
     """Return for each camera one on the way from it to a neighbour, or at most half as far beyond either end.
 
-    The neighbour is drawn from the 4 nearest whose optical axes are within 60 degrees of the camera's; a camera without
-    any, or without reach, is left out. Position and rotation go along evenly; all else is the camera's. A rigid motion
-    and scaling of all cameras does the same to the result.
+    The neighbour is drawn from the 4 nearest whose optical axes are within 60 degrees of the camera's; without any,
+    the camera stays where it is. Position and rotation go along evenly; all else is the camera's. A rigid motion and
+    scaling of all cameras does the same to the result.
 
     Args:
         cameras: at least one.
@@ -144,27 +144,24 @@ def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torc
 
     viewmats, centres = _poses(cameras)
     drawn, places = torch.rand(2, len(cameras), generator=generator, dtype=torch.float64)
-    places = places * (1 + 2 * BEYOND) - BEYOND
     distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
     axes = viewmats[:, 2, :3]
     distances = distances.where(axes @ axes.mT >= ALIKE, torch.inf).fill_diagonal_(torch.inf)
     nearest = distances.topk(min(NEIGHBORS, len(cameras)), largest=False)
     choices = nearest.values.isfinite().sum(dim=1)
-    some = ((choices > 0) & (torch.tensor(reaches) > 0)).nonzero()[:, 0]
-    if not len(some):
-        return []
-    others = nearest.indices[some, (drawn[some] * choices[some]).long()]
-    limits = torch.tensor(reaches, dtype=torch.float64)[some] / distances[some, others]
-    places = places[some].clamp(-limits, limits)
+    chosen = (drawn * choices).long()[:, None]
+    others = nearest.indices.gather(1, chosen)[:, 0].where(choices > 0, torch.arange(len(cameras)))
+    limits = (torch.tensor(reaches, dtype=torch.float64) / nearest.values.gather(1, chosen)[:, 0]).nan_to_num(0.0)
+    places = (places * (1 + 2 * BEYOND) - BEYOND).clamp(-limits, limits)
     turned = Rotation.from_matrix(viewmats[:, :3, :3].numpy())
-    turns = (turned[others.numpy()] * turned[some.numpy()].inv()).as_rotvec() * places[:, None].numpy()
-    rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned[some.numpy()]).as_matrix())
-    positions = torch.lerp(centres[some], centres[others], places[:, None])
+    turns = (turned[others.numpy()] * turned.inv()).as_rotvec() * places[:, None].numpy()
+    rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned).as_matrix())
+    positions = torch.lerp(centres, centres[others], places[:, None])
     made = []
-    for index, rotation, position in zip(some.tolist(), rotations, positions, strict=True):
+    for camera, rotation, position in zip(cameras, rotations, positions, strict=True):
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        made.append(replace(cameras[index], viewmat=viewmat.to(cameras[index].viewmat)))
+        made.append(replace(camera, viewmat=viewmat.to(camera.viewmat)))
     return made
 
 
