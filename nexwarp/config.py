@@ -324,8 +324,8 @@ PRESETS: dict[str, Config] = {
         texture=TextureConfig(
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),
-        losses=LossWeights(depth=0.0, near=0.0, alpha_hits=MAX_HITS),
-        densify=DensifyConfig(prune_at_cap=False, floaters=False),
+        losses=LossWeights(depth=0.0, alpha_hits=MAX_HITS),
+        densify=DensifyConfig(prune_at_cap=False),
     ),
 }
 

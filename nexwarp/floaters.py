@@ -13,8 +13,11 @@ from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
 LOOKS = 60  # at least so many views between, and one for each training view
-LEAST_SHARE = 0.01
-HEIGHT = 80  # pixels, which suffice for what covers a hundredth of a picture
+LEAST_SHARE = 3e-4  # of a picture
+HEIGHT = 80  # of that, pixels: two or three of them are such a share
+# What a training camera shows from twice its reach on is no nearer than that to a view within its reach; the rest is
+# left to points that are nearer than the nearest.
+NEARER = 0.75
 
 
 @torch.no_grad()
@@ -26,11 +29,10 @@ def floaters(
     *,
     options: dict[str, Any],
 ) -> torch.Tensor:
-    """Return which surfels (N,) bool cover a hundredth of a picture, or more, from too near.
+    """Return which surfels (N,) bool cover 3 pixels in 10,000 of a picture, or more, from too near.
 
     The pictures are those of cameras on the ways between the training cameras (`nexwarp.paths.between`), each within
-    its training camera's reach; nearer than that is too near. What a training camera shows from twice its reach on
-    is no nearer to any of them.
+    its training camera's reach; nearer than three quarters of that is too near.
 
     Args:
         surfels: the surfels.
@@ -48,12 +50,12 @@ def floaters(
 
 
 def _shares(surfels: Surfels, camera: Camera, reach: float, options: dict[str, Any]) -> torch.Tensor:
-    """(N,) of the picture, by the weights of each surfel's textured hits that are nearer than the reach."""
+    """(N,) of the picture, by the weights of each surfel's textured hits that are too near."""
     if camera.height > HEIGHT:
         camera = resized(camera, max(round(camera.width * HEIGHT / camera.height), 1), HEIGHT)
     options = options | {"max_hits": max(options["max_hits"], 1)}
     out = render(surfels, None, camera.to(surfels.means.device), **options)
-    near = (out.weights >= ALPHA_MIN) & (out.depths < reach)
+    near = (out.weights >= ALPHA_MIN) & (out.depths < NEARER * reach)
     weights = torch.where(near, out.weights, 0) / (camera.width * camera.height)
     sums = out.weights.new_zeros(len(surfels))
     return sums.scatter_add_(0, out.ids.clamp_min(0).long().flatten(), weights.flatten())

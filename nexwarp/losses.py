@@ -42,13 +42,11 @@ class LossWeights:
     """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
     border: float = 0.1
     """Image loss beyond the frame, where the photo's edge goes on."""
-    near: float = 0.0
-    """Weight of what hangs in front of a view: nearer than half of the depth of the nearest points that it shows."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
         check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border", "near"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -196,23 +194,6 @@ def depth_loss(
     known = expected > 0
     errors = (means / torch.where(known, expected, 1) - 1).abs() * known
     return errors.sum() / known.sum().clamp_min(1)
-
-
-def near_loss(depths: torch.Tensor, weights: torch.Tensor, nearest: torch.Tensor) -> torch.Tensor:
-    """Mean over the pixels of sum_k W_k max(0, 1 - d_k / nearest): the weight of what is too near, the nearer the more.
-
-    Only the weights have a gradient: what hangs in front of a camera is to vanish, not to be pushed away from it.
-
-    Args:
-        depths: (H, W, K) z-depths d of the textured hits, world units.
-        weights: (H, W, K), W.
-        nearest: () depth from which on surfels may be, world units; 0 is everywhere.
-    """
-    check_tensors({"depths": (depths, ("H", "W", "K")), "weights": (weights, depths.shape)})
-    check_tensors({"nearest": (nearest, ())}, device=depths.device)
-    excess = (nearest - depths.detach()).clamp_min(0)
-    pixels = depths.shape[0] * depths.shape[1]
-    return (weights * excess).sum() / (nearest * pixels).clamp_min(torch.finfo(depths.dtype).tiny)
 
 
 def nearest_depth(depths: torch.Tensor) -> float:

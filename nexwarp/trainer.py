@@ -26,7 +26,7 @@ from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.floaters import floaters
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.losses import border_loss, depth_loss, near_loss, nearest_depth, training_losses, visible_points
+from nexwarp.losses import border_loss, depth_loss, nearest_depth, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
 from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
@@ -89,8 +89,7 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
-        self.reaches = _nearest_depths(scene)
-        self.nearest = torch.tensor(self.reaches, device=self.device)
+        self.reaches = _nearest_depths(scene) if config.densify.floaters else []
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
@@ -243,7 +242,7 @@ class Trainer:
         learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
-        if config.densify.floaters and self._floaters_due():
+        if self._floaters_due():
             self._remove_floaters()
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
@@ -317,12 +316,10 @@ class Trainer:
             if alpha is not None:
                 photo = photo + (1 - alpha)[..., None] * (background - self.behind)
         mask = self.views.mask(index, factor)
-        near = self.config.losses.near > 0 and self.config.max_hits > 0 and any(self.reaches)
-        nearest = self.nearest[index] if near else None
         if mask is None or self.config.mask_mode == "ignore":
-            return _Target(camera, photo, background, counts=mask, nearest=nearest)
+            return _Target(camera, photo, background, counts=mask)
         behind = background if isinstance(background, torch.Tensor) else self.behind
-        return _Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask, nearest=nearest)
+        return _Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
 
     def _beyond_the_frame(self, view: "_Target") -> "_Target":
         """Shift the window at random; where it leaves the photo, the photo's edge goes on.
@@ -560,8 +557,6 @@ class Trainer:
             losses["empty"] = factors.empty * (out.alpha * view.empty).mean()
         if view.places is not None and view.expected is not None:
             losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, view.places, view.expected)
-        if view.nearest is not None:
-            losses["near"] = factors.near * near_loss(out.depths, out.weights, view.nearest)
         return losses
 
     def _schedule_rates(self) -> None:
@@ -589,7 +584,6 @@ class _Target:
         beyond: (H, W) bool, what lies beyond the photo's frame; None is nothing.
         places, expected: (M,) points to compare depths with, as `depth_loss` takes them; None is no such loss.
         depth_jitter: as `render` takes it.
-        nearest: () as `near_loss` takes it; None is no such loss.
     """
 
     camera: Camera
@@ -601,7 +595,6 @@ class _Target:
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
-    nearest: torch.Tensor | None = None
 
 
 def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] | tuple[None, None]:

@@ -65,7 +65,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
     "losses.border": ("", ""),
-    "losses.near": ("", ""),
     "rates.means": ("", "code"),
     "rates.quats": ("", "code"),
     "rates.scales": ("", "code"),

@@ -347,32 +347,6 @@ def test_depth_loss_against_finite_differences() -> None:
     assert gradcheck(lambda d, w: losses.depth_loss(d, w, places, expected), [depths, weights])
 
 
-def test_near_loss_by_hand() -> None:
-    """Of 12 pixels one has hits at a quarter of the way, half in front of it; and beyond it."""
-    depths, weights = torch.full((3, 4, 2), 9.0), torch.full((3, 4, 2), 0.5)
-    depths[1, 2], weights[1, 2] = torch.tensor([0.5, 1.0]), torch.tensor([0.3, 0.2])
-    depths.requires_grad_(), weights.requires_grad_()
-    loss = losses.near_loss(depths, weights, torch.tensor(2.0))
-    assert loss.item() == pytest.approx((0.3 * 0.75 + 0.2 * 0.5) / 12, rel=1e-6)
-    to_depths, to_weights = torch.autograd.grad(loss, [depths, weights], allow_unused=True)
-    assert to_depths is None
-    expected = torch.zeros(3, 4, 2)
-    expected[1, 2] = torch.tensor([0.75, 0.5]) / 12
-    torch.testing.assert_close(to_weights, expected)
-
-
-def test_near_loss_knows_no_scale() -> None:
-    depths, weights = torch.rand(3, 4, 2), torch.rand(3, 4, 2)
-    one = losses.near_loss(depths, weights, torch.tensor(0.5))
-    torch.testing.assert_close(losses.near_loss(1000 * depths, weights, torch.tensor(500.0)), one)
-
-
-def test_without_a_nearest_depth_nothing_is_too_near() -> None:
-    depths, weights = torch.rand(3, 4, 2), torch.rand(3, 4, 2, requires_grad=True)
-    loss = losses.near_loss(depths, weights, torch.tensor(0.0))
-    assert loss.item() == 0 and not torch.autograd.grad(loss, weights)[0].any()
-
-
 def test_nearest_depth_by_hand() -> None:
     """Half of the least; of 250 points the two nearest may be wrong; 19 are too few."""
     assert losses.nearest_depth(torch.arange(30.0) + 4) == 2.0

@@ -20,7 +20,7 @@ from nexwarp.data import Scene, View, initial_points
 from nexwarp.densify import DensifyConfig
 from nexwarp.evaluate import evaluate
 from nexwarp.initial import initial_surfels, quats_towards, texture_shape
-from nexwarp.losses import LossWeights, nearest_depth
+from nexwarp.losses import LossWeights
 from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
 from tests.tolerances import assert_close
@@ -390,13 +390,13 @@ def test_texture_follows_the_scale_of_the_scene(scene, factor):
     assert one == other
 
 
-@pytest.mark.parametrize(("factor", "near"), [(64.0, 0.0), (1 / 64, 0.0), (64.0, 1.0)])
-def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, near, monkeypatch):
+@pytest.mark.parametrize(("factor", "look"), [(64.0, False), (1 / 64, False), (64.0, True)])
+def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, look, monkeypatch):
     """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     texture = dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None)
-    often = dataclasses.replace(OFTEN, floaters=True)
-    config = small(iterations=40, texture=texture, densify=often, losses=LossWeights(near=near))
+    often = dataclasses.replace(OFTEN, floaters=look)
+    config = small(iterations=40, texture=texture, densify=often)
     runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
     for step in range(config.iterations):
         one, other = (torch.stack(list(trainer.step().losses.values())) for trainer in runs)
@@ -404,31 +404,6 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, near,
     assert len(runs[0].surfels) == len(runs[1].surfels)
     images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
-
-
-def test_what_hangs_in_front_of_a_camera_is_to_vanish(scene):
-    """A surfel at a quarter of the depth from which on they may be: the near term wants its opacity alone to fall."""
-    trainer = Trainer(scene, small(losses=LossWeights(near=2.0)), "cpu")
-    camera, surfels = trainer.views.cameras[0], trainer.surfels
-    bound = nearest_depth(camera.project(scene.train[0].points)[1])
-    forward = camera.viewmat[2, :3]
-    with torch.no_grad():
-        surfels.means[0] = camera.position + bound / 4 * forward
-        surfels.raw_quats[0] = quats_towards(forward[None], torch.tensor([[1.0, 0, 0, 0]]))[0]
-        surfels.log_scales[0] = math.log(bound / 4 * camera.width / camera.fx / 8)
-    target = trainer._view(0, 1)
-    out = nw.render(surfels, trainer.texture, target.camera, **trainer.render_options())
-    hidden = (out.weights * (out.ids == 0)).sum() / out.alpha.numel()
-    term = trainer._losses(out, target)["near"]
-    assert_close(term, 2.0 * 0.75 * hidden, kind="gradient", name="term")
-    to_opacities = torch.autograd.grad(term, surfels.logit_opacities)[0]
-    assert to_opacities[0] > 0 and not to_opacities[1:].any()
-
-
-def test_nothing_is_too_near_where_no_points_tell(scene):
-    blind = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
-    trainer = Trainer(blind, small(losses=LossWeights(near=1.0)), "cpu")
-    assert "near" not in trainer.step().losses
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
@@ -447,6 +422,13 @@ def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(sc
     assert [look[0] for look in looks] == [6, 12, 18, 24, 30]
     assert len({seed for _, _, seed in looks}) == 5
     assert all(counts[iteration] == count - 1 for iteration, count, _ in looks)
+
+
+def test_without_points_nothing_tells_of_floaters(scene, monkeypatch):
+    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
+    monkeypatch.setattr(trainer_module, "floaters", lambda *_, **__: pytest.fail("looked"))
+    blind = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
+    trained(blind, small(densify=dataclasses.replace(OFTEN, floaters=True)))
 
 
 def test_looking_for_floaters_changes_nothing_where_there_are_none(scene, monkeypatch):
