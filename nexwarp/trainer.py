@@ -39,7 +39,7 @@ from nexwarp.watch import LossLog, describe, needed_memory, not_finite
 CHECK_EVERY = 100
 SNAPSHOTS = 10
 LOWERED_RATES = 0.5
-# Rounds of densification between looks for floaters.
+# Looks for floaters are so many times as far apart as rounds of densification.
 FLOATERS_EVERY = 10
 
 
@@ -247,10 +247,9 @@ class Trainer:
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
     def _floaters_due(self) -> bool:
-        """Also after the last round of densification, but not at the end: what was behind them has to be learnt."""
+        """Once densification is over, which would make others, but not at the end: what was behind has to be learnt."""
         densify = self.densifier.config
-        every = FLOATERS_EVERY * densify.every
-        due = self.iteration > densify.start and self.iteration % every == 0
+        due = self.iteration >= densify.stop and self.iteration % (FLOATERS_EVERY * densify.every) == 0
         return due and self.iteration < self.config.iterations and any(self.reaches)
 
     def _remove_floaters(self) -> None:

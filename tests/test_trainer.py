@@ -407,8 +407,8 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, look,
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
-    """Every second of rounds 3, 6, ..., 36 of 36 iterations, also once densification is over, but not at the end."""
-    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 2)
+    """Every 3 of 60 iterations, from 50 on, where densification ends; but not at the end."""
+    monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
     def first(surfels, cameras, reaches, generator, *, options):
@@ -416,11 +416,11 @@ def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(sc
         return torch.arange(len(surfels)) == 0
 
     monkeypatch.setattr(trainer_module, "floaters", first)
-    trainer = Trainer(scene, small(iterations=36, densify=dataclasses.replace(OFTEN, floaters=True)), "cpu")
+    trainer = Trainer(scene, small(iterations=60, densify=dataclasses.replace(OFTEN, floaters=True)), "cpu")
     counts = {}
     trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
-    assert [look[0] for look in looks] == [6, 12, 18, 24, 30]
-    assert len({seed for _, _, seed in looks}) == 5
+    assert [look[0] for look in looks] == [51, 54, 57]
+    assert len({seed for _, _, seed in looks}) == 3
     assert all(counts[iteration] == count - 1 for iteration, count, _ in looks)
 
 
@@ -428,14 +428,14 @@ def test_without_points_nothing_tells_of_floaters(scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     monkeypatch.setattr(trainer_module, "floaters", lambda *_, **__: pytest.fail("looked"))
     blind = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
-    trained(blind, small(densify=dataclasses.replace(OFTEN, floaters=True)))
+    trained(blind, small(iterations=30, densify=dataclasses.replace(OFTEN, floaters=True)))
 
 
 def test_looking_for_floaters_changes_nothing_where_there_are_none(scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     monkeypatch.setattr(floaters_module, "LEAST_SHARE", 2.0)
     with_look, without = (
-        trained(scene, small(densify=dataclasses.replace(OFTEN, floaters=looks))) for looks in (True, False)
+        trained(scene, small(iterations=30, densify=dataclasses.replace(OFTEN, floaters=on))) for on in (True, False)
     )
     assert_same_state(with_look, without)
 
