@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.evaluate import ALPHA_MIN
+from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.paths import between, resized
 from nexwarp.render import render
 from nexwarp.surfels import Surfels

@@ -15,7 +15,7 @@ LAYERS = [
     {"json_files", "exposures"},
     {"data", "surfels", "texture"},
     {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "splats", "video"},
-    {"densify", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},
+    {"densify", "floaters", "checkpoint", "evaluate", "passes", "export", "viewer", "training_views", "watch"},
     {"config", "step_graphs"},
     {"initial"},
     {"trainer"},
