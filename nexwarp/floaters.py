@@ -7,7 +7,9 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.data import View
 from nexwarp.kernels.types import ALPHA_MIN
+from nexwarp.losses import visible_points
 from nexwarp.paths import between, resized
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
@@ -15,9 +17,10 @@ from nexwarp.surfels import Surfels
 LOOKS = 60  # at least so many views between, and one for each training view
 LEAST_SHARE = 3e-4  # of a picture
 HEIGHT = 80  # of that, pixels: two or three of them are such a share
-# What a training camera shows from twice its reach on is no nearer than that to a view within its reach; the rest is
-# left to points that are nearer than the nearest.
+# A view within a training camera's reach is at least that far from all that this shows beyond twice its reach. The
+# share leaves room for what is nearer than the points tell.
 NEARER = 0.75
+FEWEST_POINTS = 20  # that tell how near things are to a camera
 
 
 @torch.no_grad()
@@ -37,25 +40,39 @@ def floaters(
     Args:
         surfels: the surfels.
         cameras: of the training views, on any device.
-        reaches: for each, half of the depth of the nearest points that it shows, world units; 0 where none tell.
+        reaches: for each, its `reach`.
         generator: for the places between, on the CPU.
         options: keyword arguments of `nexwarp.render`.
     """
     found = torch.zeros(len(surfels), dtype=torch.bool, device=surfels.means.device)
     for _ in range(math.ceil(LOOKS / len(cameras))):
-        for camera, reach in zip(between(cameras, reaches, generator), reaches, strict=True):
-            if reach > 0:
-                found |= _shares(surfels, camera, reach, options) >= LEAST_SHARE
+        for camera, limit in zip(between(cameras, reaches, generator), reaches, strict=True):
+            if limit > 0:
+                found |= _shares(surfels, camera, NEARER * limit, options) >= LEAST_SHARE
     return found
 
 
-def _shares(surfels: Surfels, camera: Camera, reach: float, options: dict[str, Any]) -> torch.Tensor:
-    """(N,) of the picture, by the weights of each surfel's textured hits that are too near."""
+def reach(view: View) -> float:
+    """Half of the z-depth of the nearest points that a view shows, world units; 0 when they are too few to tell.
+
+    Of the nearest of them one in a hundred may be wrong.
+    """
+    camera, found = view.camera, None
+    if view.points is not None:
+        found = visible_points(*camera.project(view.points), camera.width, camera.height, view.mask)
+    if found is None or len(found[1]) < FEWEST_POINTS:
+        return 0.0
+    depths = found[1]
+    return 0.5 * depths.kthvalue(1 + len(depths) // 100).values.item()
+
+
+def _shares(surfels: Surfels, camera: Camera, nearest: float, options: dict[str, Any]) -> torch.Tensor:
+    """(N,) of the picture, by the weights of each surfel's textured hits that are nearer than `nearest`."""
     if camera.height > HEIGHT:
         camera = resized(camera, max(round(camera.width * HEIGHT / camera.height), 1), HEIGHT)
     options = options | {"max_hits": max(options["max_hits"], 1)}
     out = render(surfels, None, camera.to(surfels.means.device), **options)
-    near = (out.weights >= ALPHA_MIN) & (out.depths < NEARER * reach)
+    near = (out.weights >= ALPHA_MIN) & (out.depths < nearest)
     weights = torch.where(near, out.weights, 0) / (camera.width * camera.height)
     sums = out.weights.new_zeros(len(surfels))
     return sums.scatter_add_(0, out.ids.clamp_min(0).long().flatten(), weights.flatten())

@@ -15,9 +15,6 @@ from nexwarp.ops.checks import check_range, check_tensors
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
 
-# Fewer points of a view than this do not tell how near a surfel may be.
-FEWEST_POINTS = 20
-
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -194,17 +191,6 @@ def depth_loss(
     known = expected > 0
     errors = (means / torch.where(known, expected, 1) - 1).abs() * known
     return errors.sum() / known.sum().clamp_min(1)
-
-
-def nearest_depth(depths: torch.Tensor) -> float:
-    """Half of the depth of the nearest points that a view shows; 0 when they are too few to tell.
-
-    Args:
-        depths: (M,) their z-depths, > 0; of the nearest of them one in a hundred may be wrong.
-    """
-    if len(depths) < FEWEST_POINTS:
-        return 0.0
-    return 0.5 * depths.kthvalue(1 + len(depths) // 100).values.item()
 
 
 def visible_points(

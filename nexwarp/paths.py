@@ -120,12 +120,8 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
     at = np.linspace(0.0, times[-1], count)
     positions = CubicSpline(times, centres.numpy()[distinct], bc_type="natural")(at)
     rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
-    first, path = cameras[0], []
-    for position, rotation in zip(torch.from_numpy(positions), torch.from_numpy(rotations), strict=True):
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
-    return path
+    placed = zip(torch.from_numpy(rotations), torch.from_numpy(positions), strict=True)
+    return [_placed(cameras[0], rotation, position) for rotation, position in placed]
 
 
 def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torch.Generator) -> list[Camera]:
@@ -157,12 +153,7 @@ def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torc
     turns = (turned[others.numpy()] * turned.inv()).as_rotvec() * places[:, None].numpy()
     rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned).as_matrix())
     positions = torch.lerp(centres, centres[others], places[:, None])
-    made = []
-    for camera, rotation, position in zip(cameras, rotations, positions, strict=True):
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-        made.append(replace(camera, viewmat=viewmat.to(camera.viewmat)))
-    return made
+    return [_placed(*each) for each in zip(cameras, rotations, positions, strict=True)]
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
@@ -213,6 +204,13 @@ def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> t
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return viewmat
+
+
+def _placed(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) -> Camera:
+    """The camera with another world-to-camera rotation (3, 3) and centre (3,), float64."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    return replace(camera, viewmat=viewmat.to(camera.viewmat))
 
 
 def _poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:

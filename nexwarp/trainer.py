@@ -24,9 +24,9 @@ from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
-from nexwarp.floaters import floaters
+from nexwarp.floaters import floaters, reach
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.losses import border_loss, depth_loss, nearest_depth, training_losses, visible_points
+from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
 from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
@@ -89,7 +89,7 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
-        self.reaches = _nearest_depths(scene) if config.densify.floaters else []
+        self.reaches = [reach(view) for view in scene.train] if config.densify.floaters else []
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
@@ -612,17 +612,6 @@ def _exposures(scene: Scene, config: Config) -> tuple[Exposures, torch.Tensor] |
     log_gains, falloff = photo_gains(cameras, photos, seen, masks)
     found = torch.from_numpy(log_gains)
     return Exposures.of(found, cameras, falloff if config.vignetting else None), found.float().exp()
-
-
-def _nearest_depths(scene: Scene) -> list[float]:
-    """`nearest_depth` of each training view; 0 where no points tell."""
-    nearest = []
-    for view in scene.train:
-        camera, points, found = view.camera, view.points, None
-        if points is not None:
-            found = visible_points(*camera.project(points), camera.width, camera.height, view.mask)
-        nearest.append(0.0 if found is None else nearest_depth(found[1]))
-    return nearest
 
 
 def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:

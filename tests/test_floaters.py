@@ -7,7 +7,8 @@ import torch
 
 import nexwarp as nw
 from nexwarp import floaters as module
-from nexwarp.floaters import floaters
+from nexwarp.data import View
+from nexwarp.floaters import floaters, reach
 
 
 def looking_ahead(z: float, width: int = 64, focal: float = 80.0) -> nw.Camera:
@@ -101,3 +102,22 @@ def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device) -> No
         generator = torch.Generator().manual_seed(seed)
         assert not floaters(surfels, ring, [1.0] * 8, generator, options={"max_hits": 2}).any()
         assert floaters(surfels, ring, [4.0] * 8, generator, options={"max_hits": 2}).any()
+
+
+def test_reach_by_hand() -> None:
+    """Half of the least depth; of 250 points the two nearest may be wrong; 19 are too few, and none is out of sight."""
+
+    def reach_of(depths: torch.Tensor, aside: float = 0.0) -> float:
+        pixels = torch.stack([torch.arange(len(depths)) % 16 * 4 + 2.0, torch.arange(len(depths)) // 16 * 3 + 1.5], 1)
+        rays = (pixels - torch.tensor([32.0, 24.0])) / 80 + torch.tensor([aside, 0.0])
+        points = torch.cat([rays, torch.ones(len(depths), 1)], 1) * depths[:, None]
+        image = torch.zeros(48, 64, 3, dtype=torch.uint8)
+        return reach(View(looking_ahead(0.0), image, None, "one", points=points))
+
+    assert reach_of(torch.arange(30.0) + 4) == pytest.approx(2.0)
+    depths = torch.arange(250.0) + 6
+    depths[:2] = 0.02
+    assert reach_of(depths[torch.randperm(250)]) == pytest.approx(4.0)
+    assert reach_of(torch.ones(19)) == 0.0 and reach_of(torch.ones(20)) == pytest.approx(0.5)
+    assert reach_of(torch.ones(20), aside=3.0) == 0.0
+    assert reach(View(looking_ahead(0.0), torch.zeros(48, 64, 3, dtype=torch.uint8), None, "one")) == 0.0

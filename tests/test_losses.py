@@ -345,12 +345,3 @@ def test_depth_loss_against_finite_differences() -> None:
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     places, expected = torch.tensor([0, 11, 0, 5]), torch.tensor([1.5, 4.0, 3.9, 2.0], dtype=torch.float64)
     assert gradcheck(lambda d, w: losses.depth_loss(d, w, places, expected), [depths, weights])
-
-
-def test_nearest_depth_by_hand() -> None:
-    """Half of the least; of 250 points the two nearest may be wrong; 19 are too few."""
-    assert losses.nearest_depth(torch.arange(30.0) + 4) == 2.0
-    depths = torch.arange(250.0) + 6
-    depths[:2] = 0.01
-    assert losses.nearest_depth(depths[torch.randperm(250)]) == 4.0
-    assert losses.nearest_depth(torch.ones(19)) == 0.0 and losses.nearest_depth(torch.ones(20)) == 0.5
