@@ -98,7 +98,10 @@ REMOVALS = (
     Row("no higher SH of surfels", settings={"sh_degree": 0, "texture.sh_degree": 3}),
     Row("no down-weighting", settings={"texture.down_weighting": False}),
 )
-HITS = tuple(Row(f"K = {k}", settings={"max_hits": k}) for k in (1, 3, 4))
+HITS = (
+    *(Row(f"K = {k}", settings={"max_hits": k}) for k in (1, 3, 4)),
+    Row("K = 4 from the start", settings={"max_hits": 4, "more_hits_from": 0}),
+)
 # Each undoes one change of the default preset against the paper.
 CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
@@ -113,6 +116,7 @@ CHANGES = (
     Row("random rotations", settings={"orient_points": False}),
     Row("clamped image", settings={"clamp_image": True}),
     Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
+    Row("floaters left", settings={"densify.floaters": False}),
     Row("no jitter of depths", settings={"depth_jitter": 0.0}),
     Row("paper's table", settings={"texture.table_size": 2**20}),
     Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),

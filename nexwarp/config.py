@@ -90,6 +90,9 @@ class Config:
     """P, the budget: never exceeded. Half of it at most comes from the point cloud."""
     max_hits: int = 2
     """K, hits a pixel textures, 0 to 8; 0 trains without a texture."""
+    more_hits_from: int = 25_000
+    """Iteration, of a run of 30,000, from which a pixel textures more than 2 hits, where K is more: surfels settle with
+    two, which leave less to what hangs in the air."""
     sh_degree: int = 3
     """Highest degree of both appearances; one more is unlocked every 1,000 iterations."""
     sh_every: int = 1000
@@ -141,6 +144,7 @@ class Config:
         check_range("iterations", self.iterations, 1)
         check_range("max_surfels", self.max_surfels, MIN_SURFELS)
         check_range("max_hits", self.max_hits, 0, MAX_HITS)
+        check_range("more_hits_from", self.more_hits_from, 0)
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
@@ -311,6 +315,7 @@ PRESETS: dict[str, Config] = {
     "default": Config(),
     "paper": Config(
         preset="paper",
+        more_hits_from=0,
         background=(0.0, 0.0, 0.0),
         border=0.0,
         depth_jitter=0.0,
@@ -325,7 +330,7 @@ PRESETS: dict[str, Config] = {
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),
         losses=LossWeights(depth=0.0, alpha_hits=MAX_HITS),
-        densify=DensifyConfig(prune_at_cap=False),
+        densify=DensifyConfig(prune_at_cap=False, floaters=False),
     ),
 }
 

@@ -27,8 +27,8 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
-    floaters: bool = False
-    """Remove surfels that views between the training views show much nearer than the nearest points are."""
+    floaters: bool = True
+    """Remove surfels that training views, or views between those, show much nearer than the nearest points are."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)

@@ -1,4 +1,4 @@
-"""Floaters: surfels that hang in the air where no training view looked, in front of views between those."""
+"""Floaters: surfels that hang in the air close to cameras, where nothing is."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,10 @@ from nexwarp.paths import between, resized
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
-LOOKS = 60  # at least so many views between, and one for each training view
+LOOKS = 60  # at least so many views between the training views, and one for each
 LEAST_SHARE = 3e-4  # of a picture
 HEIGHT = 80  # of that, pixels: two or three of them are such a share
-# A view within a training camera's reach is at least that far from all that this shows beyond twice its reach. The
-# share leaves room for what is nearer than the points tell.
-NEARER = 0.75
+NEARER = 0.6  # of the depth of the nearest points, which leaves room for what is nearer than these tell
 FEWEST_POINTS = 20  # that tell how near things are to a camera
 
 
@@ -27,43 +25,54 @@ FEWEST_POINTS = 20  # that tell how near things are to a camera
 def floaters(
     surfels: Surfels,
     cameras: Sequence[Camera],
-    reaches: Sequence[float],
+    nearest: Sequence[float],
     generator: torch.Generator,
     *,
     options: dict[str, Any],
 ) -> torch.Tensor:
     """Return which surfels (N,) bool cover 3 pixels in 10,000 of a picture, or more, from too near.
 
-    The pictures are those of cameras on the ways between the training cameras (`nexwarp.paths.between`), each within
-    its training camera's reach; nearer than three quarters of that is too near.
+    The pictures are those of the training cameras and of others on the ways between them (`nexwarp.paths.between`).
+    What a training camera shows is at least as far from it as its nearest points; from another one, at least that
+    less the way between the two, which is at most half of it. Nearer than six tenths of this is too near.
 
     Args:
         surfels: the surfels.
         cameras: of the training views, on any device.
-        reaches: for each, its `reach`.
+        nearest: for each, its `nearest_depth`.
         generator: for the places between, on the CPU.
         options: keyword arguments of `nexwarp.render`.
     """
-    found = torch.zeros(len(surfels), dtype=torch.bool, device=surfels.means.device)
+    looks = [*zip(cameras, nearest, strict=True)]
     for _ in range(math.ceil(LOOKS / len(cameras))):
-        for camera, limit in zip(between(cameras, reaches, generator), reaches, strict=True):
-            if limit > 0:
-                found |= _shares(surfels, camera, NEARER * limit, options) >= LEAST_SHARE
+        moved = between(cameras, [0.5 * depth for depth in nearest], generator)
+        for old, new, depth in zip(cameras, moved, nearest, strict=True):
+            looks.append((new, depth - torch.dist(new.position, old.position).item()))
+    found = torch.zeros(len(surfels), dtype=torch.bool, device=surfels.means.device)
+    for camera, depth in looks:
+        if depth > 0:
+            found |= _shares(surfels, camera, NEARER * depth, options) >= LEAST_SHARE
     return found
 
 
-def reach(view: View) -> float:
-    """Half of the z-depth of the nearest points that a view shows, world units; 0 when they are too few to tell.
+def nearest_depth(view: View, points: torch.Tensor) -> float:
+    """Z-depth of the nearest points before a view's camera, world units; 0 when they are too few to tell.
 
-    Of the nearest of them one in a hundred may be wrong.
+    Of the nearest one in a hundred may be wrong. Not only the view's own points count: what is close to one camera may
+    have been triangulated from others alone.
+
+    Args:
+        view: tells nothing where it has no triangulated points itself.
+        points: (P, 3) of the scene, world frame.
     """
-    camera, found = view.camera, None
-    if view.points is not None:
-        found = visible_points(*camera.project(view.points), camera.width, camera.height, view.mask)
+    if view.points is None or not len(view.points):
+        return 0.0
+    camera = view.camera
+    found = visible_points(*camera.project(points), camera.width, camera.height)
     if found is None or len(found[1]) < FEWEST_POINTS:
         return 0.0
     depths = found[1]
-    return 0.5 * depths.kthvalue(1 + len(depths) // 100).values.item()
+    return depths.kthvalue(1 + len(depths) // 100).values.item()
 
 
 def _shares(surfels: Surfels, camera: Camera, nearest: float, options: dict[str, Any]) -> torch.Tensor:

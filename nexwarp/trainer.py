@@ -18,13 +18,13 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
-from nexwarp.config import Config
+from nexwarp.config import REFERENCE_ITERATIONS, Config
 from nexwarp.data import Scene
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures, photo_gains
-from nexwarp.floaters import floaters, reach
+from nexwarp.floaters import floaters, nearest_depth
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
 from nexwarp.render import Rendering, jitter_factors, render
@@ -89,7 +89,7 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
-        self.reaches = [reach(view) for view in scene.train] if config.densify.floaters else []
+        self.nearest = [nearest_depth(view, scene.points) for view in scene.train] if config.densify.floaters else []
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
@@ -237,7 +237,7 @@ class Trainer:
         else:
             view = self._with_points(view, index)
         if config.depth_jitter > 0 and config.max_hits:
-            drawn = jitter_factors(view.camera, config.max_hits, config.depth_jitter, generator=self.noise)
+            drawn = jitter_factors(view.camera, self._hits(), config.depth_jitter, generator=self.noise)
             view = dataclasses.replace(view, depth_jitter=drawn)
         learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
@@ -250,13 +250,13 @@ class Trainer:
         """Once densification is over, which would make others, but not at the end: what was behind has to be learnt."""
         densify = self.densifier.config
         due = self.iteration >= densify.stop and self.iteration % (FLOATERS_EVERY * densify.every) == 0
-        return due and self.iteration < self.config.iterations and any(self.reaches)
+        return due and self.iteration < self.config.iterations and any(self.nearest)
 
     def _remove_floaters(self) -> None:
         # A generator of its own: where there are no floaters, nothing else changes.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
         cameras, options = self.views.cameras, self.render_options()
-        chosen = floaters(self.surfels, cameras, self.reaches, generator, options=options)
+        chosen = floaters(self.surfels, cameras, self.nearest, generator, options=options)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def _learn(self, view: "_Target") -> Learnt:
@@ -287,18 +287,25 @@ class Trainer:
         return (
             len(self.surfels),
             self.densifier.active(self.iteration),
+            self._hits(),
             self.render_options()["sh_degree"],
             torch.are_deterministic_algorithms_enabled(),
             *(x.data_ptr() for x in tensors),
             *(group["lr"].data_ptr() for group in self.optimizer.param_groups),
         )
 
+    def _hits(self) -> int:
+        """K at this point of the run."""
+        config = self.config
+        settled = self.iteration >= config.more_hits_from * config.iterations / REFERENCE_ITERATIONS
+        return config.max_hits if settled else min(config.max_hits, 2)
+
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments of `nexwarp.render` at this point of the run."""
         config = self.config
         unlocked = self.iteration // config.scaled(config.sh_every)
         return {
-            "max_hits": config.max_hits,
+            "max_hits": self._hits(),
             "background": self.background,
             "sh_degree": min(max(config.sh_degree, self.texture.sh_degree), unlocked),
             "low_pass": config.low_pass,

@@ -17,6 +17,7 @@ from nexwarp.camera import Camera
 from nexwarp.config import REFERENCE_ITERATIONS, Config
 from nexwarp.data import Scene, View
 from nexwarp.evaluate import evaluate
+from nexwarp.floaters import floaters
 from nexwarp.kernels.catalogue import thread_kernels, walk_kernels
 from nexwarp.kernels.collect import BLOCK_DIM
 from nexwarp.kernels.launch import get_num_threads
@@ -53,8 +54,12 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         fixed=config.deterministic,
     )
     low_passes = (config.low_pass,)
-    hits, fixed = (config.max_hits,), config.deterministic
-    walks = walk_kernels(wp.float32, TILE_SIZE, hits, low_passes=low_passes, cpu=cpu, fixed=fixed)
+    hits, fixed = {config.max_hits}, config.deterministic
+    if config.more_hits_from > 0:
+        hits.add(min(config.max_hits, 2))
+    if config.densify.floaters:
+        hits.add(max(config.max_hits, 1))
+    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed=fixed)
     return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 
 
@@ -85,12 +90,14 @@ def rehearse(config: Config, device: torch.device) -> None:
     """Train for a few steps, evaluate and render, with these settings on a tiny scene; seeds the generators as a run.
 
     The steps go through every SH degree, both photo sizes, rounds of density control and steps after the last one, in
-    the order of a real run.
+    the order of a real run; and looks for floaters.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
     trainer.run()
     options = trainer.render_options()
+    if config.densify.floaters:
+        floaters(trainer.surfels, trainer.views.cameras, [1.0], torch.Generator(), options=options)
     evaluate(trainer.surfels, trainer.texture, scene.test, options=options)
     with torch.no_grad():
         out = render(trainer.surfels, trainer.texture, scene.test[0].camera.to(device), **options)

@@ -37,6 +37,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "iterations": ("", "Optimization"),
     "max_surfels": ("P", "Adaptive Density Control"),
     "max_hits": ("K", "Rendering"),
+    "more_hits_from": ("", ""),
     "sh_degree": ("S = (d + 1)^2", "Results"),
     "sh_every": ("", "code"),
     "coarse": ("", ""),

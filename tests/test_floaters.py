@@ -7,8 +7,9 @@ import torch
 
 import nexwarp as nw
 from nexwarp import floaters as module
+from nexwarp import paths
 from nexwarp.data import View
-from nexwarp.floaters import floaters, reach
+from nexwarp.floaters import floaters, nearest_depth
 
 
 def looking_ahead(z: float, width: int = 64, focal: float = 80.0) -> nw.Camera:
@@ -36,60 +37,67 @@ def facing(squares: list[tuple[tuple[float, float, float], float]], device: torc
     return surfels.to(device)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def between(monkeypatch: pytest.MonkeyPatch) -> list[nw.Camera]:
-    """What `nexwarp.paths.between` returns in the test."""
+    """What `nexwarp.paths.between` returns in the test; the cameras themselves when empty."""
     cameras: list[nw.Camera] = []
-    monkeypatch.setattr(module, "between", lambda *_: cameras)
+    monkeypatch.setattr(module, "between", lambda given, *_: cameras or given)
     return cameras
 
 
-def found(surfels: nw.Surfels, reaches: list[float], max_hits: int = 2) -> list[bool]:
-    cameras = [looking_ahead(-9.0)] * len(reaches)
-    return floaters(surfels, cameras, reaches, torch.Generator(), options={"max_hits": max_hits}).tolist()
+def found(surfels: nw.Surfels, cameras: list[nw.Camera], nearest: list[float], max_hits: int = 2) -> list[bool]:
+    return floaters(surfels, cameras, nearest, torch.Generator(), options={"max_hits": max_hits}).tolist()
 
 
 @pytest.mark.parametrize("max_hits", [0, 1, 2])
-def test_floaters_are_large_and_nearer_than_the_reach(
-    max_hits: int, device: torch.device, between: list[nw.Camera]
-) -> None:
-    """From z = -1, at depths of 1, 0.9 and 1.5, which are 0.75 of 1.33, 1.2 and 2."""
+def test_floaters_are_large_and_much_nearer_than_the_nearest_points(max_hits: int, device: torch.device) -> None:
+    """From z = -1, at depths of 1, 0.9 and 1.5, which are 0.6 of 1.67, 1.5 and 2.5."""
     surfels = facing([NEAR, SMALL, BEHIND], device)
+    ahead = [looking_ahead(-1.0)]
+    assert found(surfels, ahead, [1.68], max_hits) == [True, False, False]
+    assert found(surfels, ahead, [1.65], max_hits) == [False, False, False]
+    assert found(surfels, ahead, [2.55], max_hits) == [True, False, True]
+    assert found(surfels, ahead, [0.0], max_hits) == [False, False, False]
+
+
+def test_a_view_between_may_be_nearer_by_the_way_to_it(device: torch.device, between: list[nw.Camera]) -> None:
+    """From z = -1, 2 ahead of the training camera: depths of 1 and 1.5 are 0.6 of 3.67 and 4.5, less those 2."""
+    surfels = facing([NEAR, BEHIND], device)
     between.append(looking_ahead(-1.0))
-    assert found(surfels, [1.34], max_hits) == [True, False, False]
-    assert found(surfels, [1.32], max_hits) == [False, False, False]
-    assert found(surfels, [2.1], max_hits) == [True, False, True]
-    assert found(surfels, [0.0], max_hits) == [False, False, False]
+    for nearest, expected in ((3.6, [False, False]), (3.7, [True, False]), (4.6, [True, True])):
+        assert found(surfels, [looking_ahead(-3.0)], [nearest]) == expected
 
 
-def test_any_view_tells_by_its_own_reach(device: torch.device, between: list[nw.Camera]) -> None:
+def test_any_view_tells_by_its_own_points(device: torch.device) -> None:
     """From z = -3, -1 and -3.5: the nearer square is at 3, 1 and 3.5."""
     surfels = facing([NEAR, BEHIND], device)
-    between += [looking_ahead(-3.0), looking_ahead(-1.0), looking_ahead(-3.5)]
-    assert found(surfels, [0.5, 1.5, 0.5]) == [True, False]
-    assert found(surfels, [1.5, 0.5, 1.5]) == [False, False]
-    assert found(surfels, [0.5, 0.5, 6.0]) == [True, True]
+    cameras = [looking_ahead(-3.0), looking_ahead(-1.0), looking_ahead(-3.5)]
+    assert found(surfels, cameras, [0.5, 1.7, 0.5]) == [True, False]
+    assert found(surfels, cameras, [1.7, 0.5, 1.7]) == [False, False]
+    assert found(surfels, cameras, [0.5, 0.5, 7.0]) == [True, True]
 
 
 @pytest.mark.parametrize("height", [12, 48, 240])
-def test_the_size_of_the_pictures_does_not_matter(height: int, between: list[nw.Camera]) -> None:
+def test_the_size_of_the_pictures_does_not_matter(height: int) -> None:
     factor = height / 48
     K = torch.tensor([[80.0 * factor, 0, 32 * factor], [0, 80.0 * factor, 24 * factor], [0, 0, 1]])
-    between.append(nw.Camera(looking_ahead(-1.0).viewmat, K, round(64 * factor), height, 0.01))
-    assert found(facing([NEAR, SMALL, BEHIND], torch.device("cpu")), [1.5]) == [True, False, False]
+    cameras = [nw.Camera(looking_ahead(-1.0).viewmat, K, round(64 * factor), height, 0.01)]
+    assert found(facing([NEAR, SMALL, BEHIND], torch.device("cpu")), cameras, [1.8]) == [True, False, False]
 
 
-def test_sixty_views_are_looked_at_or_one_for_each_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sixty_views_between_are_looked_at_or_one_for_each_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
     monkeypatch.setattr(module, "between", lambda cameras, *_: looks.append(len(cameras)) or cameras)
     for count in (1, 40, 130):
         looks.clear()
-        found(facing([NEAR], torch.device("cpu")), [1.0] * count)
+        found(facing([NEAR], torch.device("cpu")), [looking_ahead(-9.0)] * count, [1.0] * count)
         assert looks == [count] * {1: 60, 40: 2, 130: 1}[count]
 
 
-def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device) -> None:
-    """From twice the reach on, whatever the way between cameras: here at 2.1 times the reach, or more."""
+def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the way between cameras, which look along z from z = -0.3 to 0.3; the wall is at z = 2.4."""
+    monkeypatch.setattr(module, "between", paths.between)
+    monkeypatch.setattr(module, "NEARER", 0.999)
     ring = []
     for i in range(8):
         angle = 2 * math.pi * i / 8
@@ -100,24 +108,28 @@ def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device) -> No
     surfels = facing(wall, device)
     for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
-        assert not floaters(surfels, ring, [1.0] * 8, generator, options={"max_hits": 2}).any()
-        assert floaters(surfels, ring, [4.0] * 8, generator, options={"max_hits": 2}).any()
+        nearest = [2.4 - camera.position[2].item() for camera in ring]
+        assert not floaters(surfels, ring, nearest, generator, options={"max_hits": 2}).any()
+        assert floaters(surfels, ring, [1.1 * x for x in nearest], generator, options={"max_hits": 2}).any()
 
 
-def test_reach_by_hand() -> None:
-    """Half of the least depth; of 250 points the two nearest may be wrong; 19 are too few, and none is out of sight."""
+def test_nearest_depth_by_hand() -> None:
+    """The least; of 250 points the two nearest may be wrong; 19 are too few, and none is out of sight."""
 
-    def reach_of(depths: torch.Tensor, aside: float = 0.0) -> float:
+    def view(own: torch.Tensor | None) -> View:
+        return View(looking_ahead(0.0), torch.zeros(48, 64, 3, dtype=torch.uint8), None, "one", points=own)
+
+    def depth_of(depths: torch.Tensor, aside: float = 0.0) -> float:
         pixels = torch.stack([torch.arange(len(depths)) % 16 * 4 + 2.0, torch.arange(len(depths)) // 16 * 3 + 1.5], 1)
         rays = (pixels - torch.tensor([32.0, 24.0])) / 80 + torch.tensor([aside, 0.0])
         points = torch.cat([rays, torch.ones(len(depths), 1)], 1) * depths[:, None]
-        image = torch.zeros(48, 64, 3, dtype=torch.uint8)
-        return reach(View(looking_ahead(0.0), image, None, "one", points=points))
+        for own in (None, points[:0]):
+            assert nearest_depth(view(own), points) == 0.0
+        return nearest_depth(view(points[-1:]), points)
 
-    assert reach_of(torch.arange(30.0) + 4) == pytest.approx(2.0)
+    assert depth_of(torch.arange(30.0) + 4) == pytest.approx(4.0)
     depths = torch.arange(250.0) + 6
     depths[:2] = 0.02
-    assert reach_of(depths[torch.randperm(250)]) == pytest.approx(4.0)
-    assert reach_of(torch.ones(19)) == 0.0 and reach_of(torch.ones(20)) == pytest.approx(0.5)
-    assert reach_of(torch.ones(20), aside=3.0) == 0.0
-    assert reach(View(looking_ahead(0.0), torch.zeros(48, 64, 3, dtype=torch.uint8), None, "one")) == 0.0
+    assert depth_of(depths[torch.randperm(250)]) == pytest.approx(8.0)
+    assert depth_of(torch.ones(19)) == 0.0 and depth_of(torch.ones(20)) == pytest.approx(1.0)
+    assert depth_of(torch.ones(20), aside=3.0) == 0.0

@@ -270,6 +270,7 @@ def test_paper_is_the_paper():
     """The numbers of recipe.md 3.9, spelt out."""
     p = preset("paper")
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
+    assert p.more_hits_from == 0
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
     assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
     assert p.coarse == 0.0
@@ -301,13 +302,13 @@ def test_paper_is_the_paper():
         down_weighting=True,
     )
     assert p.densify == DensifyConfig(
-        start=500, stop=25_000, every=100, fraction=0.05, prune_opacity=0.005, prune_at_cap=False
+        start=500, stop=25_000, every=100, fraction=0.05, prune_opacity=0.005, prune_at_cap=False, floaters=False
     )
 
 
 def test_default_prunes_at_the_cap_and_filters_points():
     p = preset("default")
-    assert p == Config() and p.densify.prune_at_cap and p.filter_points and not p.clamp_image
+    assert p == Config() and p.densify.prune_at_cap and p.densify.floaters and p.filter_points and not p.clamp_image
     assert p.texture.min_resolution is None and p.texture.max_resolution is None
     assert p.texture.residual and p.background is None and p.border > 0 and p.losses.depth > 0
 
@@ -347,6 +348,7 @@ def test_unknown_settings_are_refused(change):
         ("iterations", 0),
         ("max_hits", 9),
         ("max_hits", -1),
+        ("more_hits_from", -1),
         ("sh_degree", 4),
     ],
 )
@@ -407,6 +409,26 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, look,
     assert len(runs[1].surfels) == counts[-1] and (counts[-1] < max(counts)) == look
     images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
+
+
+def test_surfels_settle_with_two_hits(scene):
+    """Up to 25,000 of 30,000 iterations, a run with more is one with two; `more_hits_from` 0 has all from the start."""
+    two, four, early = (
+        Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
+        for hits, start in ((2, 25_000), (4, 25_000), (4, 0))
+    )
+    assert [t.render_options()["max_hits"] for t in (two, four, early)] == [2, 2, 4]
+    for iteration in range(1, 13):
+        for trainer in (two, four, early):
+            trainer.step()
+        assert_same_state(four, two) if iteration < 10 else None
+        hits = [t.render_options()["max_hits"] for t in (two, four, early)]
+        assert hits == [2, 2 if iteration < 10 else 4, 4]
+    assert not torch.equal(four.texture.grid, two.texture.grid)
+    assert four.finish().meta["max_hits"] == 4
+    for hits in (0, 1):
+        few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
+        assert few.render_options()["max_hits"] == hits
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
