@@ -281,14 +281,14 @@ class Trainer:
 
     def _launched(self) -> Hashable:
         """What the launches of a step follow from, beside its target."""
-        tensors = [self.densifier.errors]
+        options, tensors = self.render_options(), [self.densifier.errors]
         for _, parameter in self._named_parameters():
             tensors += [parameter, *self.optimizer.state.get(parameter, {}).values()]
         return (
             len(self.surfels),
             self.densifier.active(self.iteration),
-            self._hits(),
-            self.render_options()["sh_degree"],
+            options["max_hits"],
+            options["sh_degree"],
             torch.are_deterministic_algorithms_enabled(),
             *(x.data_ptr() for x in tensors),
             *(group["lr"].data_ptr() for group in self.optimizer.param_groups),

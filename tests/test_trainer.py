@@ -421,7 +421,8 @@ def test_surfels_settle_with_two_hits(scene):
     for iteration in range(1, 13):
         for trainer in (two, four, early):
             trainer.step()
-        assert_same_state(four, two) if iteration < 10 else None
+        if iteration < 10:
+            assert_same_state(four, two)
         hits = [t.render_options()["max_hits"] for t in (two, four, early)]
         assert hits == [2, 2 if iteration < 10 else 4, 4]
     assert not torch.equal(four.texture.grid, two.texture.grid)
@@ -436,7 +437,7 @@ def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(sc
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
-    def first(surfels, cameras, reaches, generator, *, options):
+    def first(surfels, cameras, nearest, generator, *, options):
         looks.append((trainer.iteration, len(surfels), generator.initial_seed()))
         return torch.arange(len(surfels)) == 0
 
