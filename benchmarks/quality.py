@@ -5,7 +5,8 @@
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
-several machines too. `table` makes Markdown of them, means and spreads over seeds, and what each row has more than the
+several machines too. Rows of which only K differs train alike until K counts (`more_hits_from`): up to there they
+are one training. `table` makes Markdown of them, means and spreads over seeds, and what each row has more than the
 default on the mean of the scenes; nothing is trained twice for two tables. `curve` draws a metric over the number of
 primitives. Metrics are those of `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be
 had. Speed and memory of a training count when it ran alone (`--jobs 1`).
@@ -21,8 +22,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from multiprocessing import get_context
@@ -33,8 +34,8 @@ import torch
 
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import save_model
-from nexwarp.config import preset, with_settings
+from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
+from nexwarp.config import Config, preset, with_settings
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
@@ -207,22 +208,89 @@ def _scene(path: Path, variant: str, downscale: int) -> Scene:
 # One training
 
 
-def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path | None) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Beginning:
+    """What several trainings have in common.
+
+    Attributes:
+        rows: of the trainings.
+        iterations: how many.
+        folder: with a checkpoint from there.
+    """
+
+    rows: tuple[str, ...]
+    iterations: int
+    folder: Path
+
+
+def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Job], int]]:
+    """Trainings that begin as one, because K alone differs and does not count at first; and for how many iterations.
+
+    Those that begin alone come alone, with 0. All are in the order of their first.
+    """
+    groups: dict[Any, tuple[list[Job], int]] = {}
+    for job in jobs:
+        key, alike = (job, ""), 0
+        if rows[job.row].preset is not None:
+            config = _config(job, rows[job.row])
+            alike = min(config.settled - 1, job.iterations)
+            if config.max_hits >= 2 and alike > 0:
+                settings = json.dumps(dataclasses.replace(config, max_hits=2).as_dict())
+                key = (dataclasses.replace(job, row=""), settings)
+        groups.setdefault(key, ([], alike))[0].append(job)
+    return [(found, alike if len(found) > 1 else 0) for found, alike in groups.values()]
+
+
+def begin(jobs: Sequence[Job], data: Path, row: Row, iterations: int, folder: Path) -> Beginning:
+    """Train what several trainings have in common.
+
+    Args:
+        jobs: those.
+        data: folder of the scenes.
+        row: of any of them.
+        iterations: how many.
+        folder: for the checkpoint.
+    """
+    job = jobs[0]
+    trainer = Trainer(_scene(data / job.scene, job.variant, job.downscale), _config(job, row), _device())
+    trainer.run(until=iterations)
+    folder.mkdir()
+    trainer.save(folder)
+    return Beginning(tuple(job.row for job in jobs), iterations, folder)
+
+
+def run_job(
+    job: Job,
+    data: Path,
+    row: Row,
+    pictures: Path | None = None,
+    models: Path | None = None,
+    beginning: Beginning | None = None,
+) -> dict[str, Any]:
     """Train, render the test views and compare.
+
+    Args:
+        job: what to train.
+        data: folder of the scenes.
+        row: the job's.
+        pictures: folder for photo, render and error of each test view.
+        models: folder to keep the model in.
+        beginning: where to go on from.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` of training, `peak_mib` of GPU memory (torch's),
-        `train_psnr` and `zoom_psnr` of nexwarp; the metrics by view; device, date and commit.
+        `train_psnr` and `zoom_psnr` of nexwarp; `together`, the rows and iterations of its beginning, if any; the
+        metrics by view; device, date and commit.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = _device()
     scene = _scene(data / job.scene, job.variant, job.downscale)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     if row.preset is None:
         pictured, facts = _train_gsplat(job, scene, device)
     else:
-        pictured, facts = _train_nexwarp(job, row, scene, device, models)
+        pictured, facts = _train_nexwarp(job, row, scene, device, models, beginning)
     if device.type == "cuda":
         facts["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
     views = {}
@@ -251,16 +319,29 @@ def run_job(job: Job, data: Path, row: Row, pictures: Path | None, models: Path 
     }
 
 
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _config(job: Job, row: Row) -> Config:
+    config = with_settings(preset(row.preset), row.settings)
+    return dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
+
+
 def _name(job: Job) -> str:
     """Of a training's files."""
     reduced = f"-downscale{job.downscale}" if job.downscale > 1 else ""
     return f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}{reduced}".replace(" ", "_")
 
 
-def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None) -> tuple[Any, dict]:
-    config = with_settings(preset(row.preset), row.settings)
-    config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
-    trainer = Trainer(scene, config, device)
+def _train_nexwarp(
+    job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None, beginning: Beginning | None
+) -> tuple[Any, dict]:
+    trainer = Trainer(scene, _config(job, row), device)
+    shared = {}
+    if beginning is not None:
+        _go_on(trainer, beginning.folder)
+        shared = {"together": {"rows": beginning.rows, "iterations": beginning.iterations}}
     trainer.run()
     model = trainer.finish()
     with tempfile.TemporaryDirectory() as temporary:
@@ -275,10 +356,19 @@ def _train_nexwarp(job: Job, row: Row, scene: Scene, device: torch.device, model
         "seconds": trainer.seconds,
         "train_psnr": _train_psnr(trainer),
         "zoom_psnr": _zoom_psnr(trainer),
+        **shared,
     }
     with torch.no_grad():
         pictured = [(view, to_uint8(_image(trainer, view.camera, device)).cpu()) for view in scene.test]
     return pictured, facts
+
+
+def _go_on(trainer: Trainer, folder: Path) -> None:
+    """From a checkpoint of other settings, as if it had been made with the trainer's own."""
+    tensors, state = load_checkpoint(folder)
+    with tempfile.TemporaryDirectory() as own:
+        save_checkpoint(Path(own), tensors, state | {"config": trainer.config.as_dict()})
+        trainer.restore(Path(own))
 
 
 def _image(trainer: Trainer, camera: Camera, device: torch.device) -> torch.Tensor:
@@ -384,29 +474,47 @@ def train(given: argparse.Namespace) -> int:
     jobs = [job for job in wanted if job not in have]
     print(f"{len(jobs)} of {len(wanted)} trainings to do")
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
-        arguments = (given.data, given.pictures, given.models)
-        futures = {pool.submit(_worker, job, rows[job.row], *arguments): job for job in jobs}
-        failed = 0
-        for future in as_completed(futures):
-            job = futures[future]
-            try:
-                result = future.result() | {"jobs": given.jobs}
-            except Exception as error:  # one failure must not lose the others' results
-                failed += 1
-                print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
-                continue
-            with given.out.open("a") as file:
-                file.write(json.dumps(result) + "\n")
-            shown = ", ".join(f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None)
-            facts = ", ".join(f"{k[:-5]} {result[k]:.2f} dB" for k in ("train_psnr", "zoom_psnr") if k in result)
-            facts += f", {result['seconds']:.0f} s"
-            print(f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {shown}, {facts}", flush=True)
+    failed = 0
+    with tempfile.TemporaryDirectory() as beginnings, ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
+        waiting: dict[Future, list[Job]] = {}
+
+        def start(job: Job, beginning: Beginning | None = None) -> None:
+            future = pool.submit(run_job, job, given.data, rows[job.row], given.pictures, given.models, beginning)
+            waiting[future] = [job]
+
+        for number, (members, alike) in enumerate(together(jobs, rows)):
+            if alike:
+                folder = Path(beginnings) / str(number)
+                future = pool.submit(begin, members, given.data, rows[members[0].row], alike, folder)
+                waiting[future] = members
+            else:
+                start(*members)
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                members = waiting.pop(future)
+                try:
+                    result = future.result()
+                except Exception as error:  # one failure must not lose the others' results
+                    failed += len(members)
+                    for job in members:
+                        print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
+                    continue
+                if isinstance(result, Beginning):
+                    for job in members:
+                        start(job, result)
+                    continue
+                with given.out.open("a") as file:
+                    file.write(json.dumps(result | {"jobs": given.jobs}) + "\n")
+                print(_told(members[0], result), flush=True)
     return 1 if failed else 0
 
 
-def _worker(job: Job, row: Row, data: Path, pictures: Path | None, models: Path | None) -> dict[str, Any]:
-    return run_job(job, data, row, pictures, models)
+def _told(job: Job, result: dict[str, Any]) -> str:
+    """A training in a line."""
+    facts = [f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None]
+    facts += [f"{k[:-5]} {result[k]:.2f} dB" for k in ("train_psnr", "zoom_psnr") if k in result]
+    facts.append(f"{result['seconds']:.0f} s")
+    return f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {', '.join(facts)}"
 
 
 # Tables

@@ -18,7 +18,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import Model, load_checkpoint, save_checkpoint
-from nexwarp.config import REFERENCE_ITERATIONS, Config
+from nexwarp.config import Config
 from nexwarp.data import Scene
 from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
@@ -89,7 +89,6 @@ class Trainer:
         self.seconds = 0.0
         self.order: list[int] = []
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
-        self.nearest = [nearest_depth(view, scene.points) for view in scene.train] if config.densify.floaters else []
         self.exposures, gains = _exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
@@ -100,9 +99,12 @@ class Trainer:
         self.good: tuple[dict[str, torch.Tensor], dict[str, Any]] | None = None
 
     def run(
-        self, observe: Callable[[Progress], None] | None = None, warn: Callable[[str], None] = lambda _: None
+        self,
+        observe: Callable[[Progress], None] | None = None,
+        warn: Callable[[str], None] = lambda _: None,
+        until: int | None = None,
     ) -> None:
-        """Train until `config.iterations`, calling `observe` after each step.
+        """Train until `config.iterations`, or `until` an earlier one, calling `observe` after each step.
 
         Losses, parameters and Adam's moments are looked at every CHECK_EVERY iterations, before each checkpoint and at
         the end. Where one is not finite, training goes back to the last good state, once, with half the learning
@@ -113,18 +115,19 @@ class Trainer:
             OutOfMemoryError: a step needs more memory than there is; the trainer is in the middle of that step.
         """
         total = self.config.iterations
-        if self.iteration < total:
+        last = total if until is None else min(until, total)
+        if self.iteration < last:
             self.good = self._state()
-        while self.iteration < total:
+        while self.iteration < last:
             try:
                 start = time.perf_counter()
                 progress = self.step()
-                if self.iteration == total and self.device.type == "cuda":
+                if self.iteration == last and self.device.type == "cuda":
                     torch.cuda.synchronize(self.device)
                 self.seconds += time.perf_counter() - start
                 self.loss_log.note(self.iteration, progress.losses)
                 keep = self.iteration % max(total // SNAPSHOTS, 1) == 0
-                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == total:
+                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == last:
                     self.check()
                 if keep:
                     self.good = self._state()
@@ -237,7 +240,8 @@ class Trainer:
         else:
             view = self._with_points(view, index)
         if config.depth_jitter > 0 and config.max_hits:
-            drawn = jitter_factors(view.camera, self._hits(), config.depth_jitter, generator=self.noise)
+            hits = config.hits_at(self.iteration)
+            drawn = jitter_factors(view.camera, hits, config.depth_jitter, generator=self.noise)
             view = dataclasses.replace(view, depth_jitter=drawn)
         learnt = self._learn(view) if self.graphs is None else self.graphs.run(view, self._learn, self._launched())
         if self.densifier.due(self.iteration):
@@ -250,13 +254,18 @@ class Trainer:
         """Once densification is over, which would make others, but not at the end: what was behind has to be learnt."""
         densify = self.densifier.config
         due = self.iteration >= densify.stop and self.iteration % (FLOATERS_EVERY * densify.every) == 0
-        return due and self.iteration < self.config.iterations and any(self.nearest)
+        return due and densify.floaters and self.iteration < self.config.iterations and any(self._nearest)
+
+    @cached_property
+    def _nearest(self) -> list[float]:
+        # Not before a look for floaters asks: it takes a second where photos and points are many.
+        return [nearest_depth(view, self.scene.points) for view in self.scene.train]
 
     def _remove_floaters(self) -> None:
         # A generator of its own: where there are no floaters, nothing else changes.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
         cameras, options = self.views.cameras, self.render_options()
-        chosen = floaters(self.surfels, cameras, self.nearest, generator, options=options)
+        chosen = floaters(self.surfels, cameras, self._nearest, generator, options=options)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def _learn(self, view: "_Target") -> Learnt:
@@ -294,18 +303,12 @@ class Trainer:
             *(group["lr"].data_ptr() for group in self.optimizer.param_groups),
         )
 
-    def _hits(self) -> int:
-        """K at this point of the run."""
-        config = self.config
-        settled = self.iteration >= config.more_hits_from * config.iterations / REFERENCE_ITERATIONS
-        return config.max_hits if settled else min(config.max_hits, 2)
-
     def render_options(self) -> dict[str, Any]:
         """Keyword arguments of `nexwarp.render` at this point of the run."""
         config = self.config
         unlocked = self.iteration // config.scaled(config.sh_every)
         return {
-            "max_hits": self._hits(),
+            "max_hits": config.hits_at(self.iteration),
             "background": self.background,
             "sh_degree": min(max(config.sh_degree, self.texture.sh_degree), unlocked),
             "low_pass": config.low_pass,

@@ -171,6 +171,58 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     torch.set_num_threads(threads)
 
 
+def test_rows_of_which_only_hits_differ_begin_together() -> None:
+    """Until K counts, 25,000 of 30,000 iterations; what differs in anything else is alone."""
+    jobs = list(jobs_of("hits", ("fox", "car"), (0, 1), 30_000, 40))
+    groups = quality.together(jobs, ROWS)
+    assert sorted(map(str, jobs)) == sorted(str(job) for members, _ in groups for job in members)
+    several = [(members, alike) for members, alike in groups if len(members) > 1]
+    assert [[job.row for job in members] for members, _ in several] == [["default", "K = 3", "K = 4"]] * 4
+    assert {(job.scene, job.seed) for members, _ in several for job in members[:1]} == {
+        (scene, seed) for scene in ("fox", "car") for seed in (0, 1)
+    }
+    assert all(len({(job.scene, job.seed) for job in members}) == 1 for members, _ in several)
+    assert [alike for _, alike in several] == [24_999] * 4
+    assert all(alike == 0 for members, alike in groups if len(members) == 1)
+    peers = [Job("fox", "", GSPLAT, 40, 0, 100), Job("fox", "", "paper", 40, 0, 100)]
+    assert quality.together(peers, ROWS) == [([job], 0) for job in peers]
+    four = quality.Row("four", "paper", {"max_hits": 4})  # which counts from the start there
+    rows = {"paper": ROWS["paper"], "four": four}
+    jobs = [dataclasses.replace(peers[1], row=row) for row in rows]
+    assert quality.together(jobs, rows) == [([job], 0) for job in jobs]
+
+
+def test_a_training_from_a_common_beginning_is_the_training(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit: its surfels, its texture and its figures."""
+    monkeypatch.setattr(quality, "lpips_vgg", lambda *_: None)  # it warns where its weights are not
+    threads = torch.get_num_threads()
+    out, models = tmp_path / "out.jsonl", tmp_path / "models"
+    rows = {f"{k} hits": {"max_hits": k, "texture.levels": 4, "texture.table_size": 1024} for k in (2, 3)}
+    command = ["train", "--scenes", "tiny", "--seeds", "1", "--size", "60", "--iterations", "12", "--data", str(folder)]
+    command += ["--out", str(out), "--models", str(models)]
+    for name, settings in rows.items():
+        command += ["--row", f"{name}:default:{json.dumps(settings)}"]
+    assert quality.main(command) == 0
+    found = read_results([out])
+    assert {job.row for job in found} == set(rows)
+    texture = []
+    for job, result in found.items():
+        assert result["together"] == {"rows": [*rows], "iterations": 9}
+        row = quality.Row(job.row, settings=rows[job.row])
+        alone = quality.run_job(job, folder, row, models=tmp_path / "alone")
+        assert alone["views"] == result["views"] and "together" not in alone
+        one, other = (nw.load(path / quality._name(job)) for path in (models, tmp_path / "alone"))
+        assert one.meta == other.meta and one.meta["max_hits"] == rows[job.row]["max_hits"]
+        for part, same in ((one.surfels, other.surfels), (one.texture, other.texture)):
+            state = same.state_dict()
+            assert all(torch.equal(tensor, state[name]) for name, tensor in part.state_dict().items())
+        texture.append(one.texture.grid)
+    assert not torch.equal(*texture)
+    torch.set_num_threads(threads)
+
+
 def test_only_some_rows_of_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "results.jsonl"
     file.write_text(json.dumps(result("no gamma", 0)) + "\n" + json.dumps(result("K = 3", 0)) + "\n")
