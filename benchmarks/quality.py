@@ -607,7 +607,7 @@ def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
         By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
         best PSNR first, each with its `scenes` and, by metric, [difference, its standard error], None where a scene
         lacks the metric. Each scene counts alike, with the means over its seeds; the error is that of the seeds'
-        spread, None where a scene has one seed alone.
+        spread, of their differences where each pair began together, None where a scene has one seed alone.
     """
     groups: dict[tuple, dict[str, dict[str, list[dict[str, Any]]]]] = {}
     for job, result in results.items():
@@ -632,11 +632,22 @@ def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _difference(one: list[dict], two: list[dict], metric: str) -> tuple[float, float | None] | None:
     """Of two means over seeds, and its variance."""
+    pairs = {result["seed"]: result for result in two}
+    if all(_began_together(result, pairs.get(result["seed"])) for result in one):
+        values = [(result[metric], pairs[result["seed"]][metric]) for result in one]
+        spread = None if any(None in x for x in values) else _spread(a - b for a, b in values)
+        return spread and (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
     spreads = [_spread(result[metric] for result in each) for each in (one, two)]
     if None in spreads:
         return None
     (a, s), (b, t) = spreads
     return a - b, None if s is None or t is None else s**2 / len(one) + t**2 / len(two)
+
+
+def _began_together(one: dict, two: dict | None) -> bool:
+    if two is None or one.get("together") is None or one["commit"] != two["commit"]:
+        return False
+    return one["together"] == two.get("together") and {one["row"], two["row"]} <= {*one["together"]["rows"]}
 
 
 def _mean_difference(each: list[tuple[float, float | None] | None]) -> list[float | None] | None:

@@ -131,6 +131,33 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     assert "| no gamma | -0.75 +- 0.90 | +0.0000 +- 0.0000 | +0.1000 +- 0.0500 |  | fox, kitchen |" in text
 
 
+def test_trainings_that_began_together_differ_by_pairs() -> None:
+    """Their seeds' spread is common; of another commit, or alone, it is not."""
+    alike = {"rows": ["default", "K = 3", "K = 4"], "iterations": 9}
+    results = {}
+    for scene in ("fox", "kitchen"):
+        for row, seed, figure, more in (
+            ("default", 0, 30.0, {"together": alike}),
+            ("default", 1, 34.0, {"together": alike}),
+            ("K = 3", 0, 30.0, {"together": alike}),
+            ("K = 3", 1, 34.2, {"together": alike}),
+            ("K = 4", 0, 30.0, {"together": alike, "commit": "abd"}),
+            ("K = 4", 1, 34.2, {"together": alike, "commit": "abd"}),
+            ("K = 1", 0, 30.0, {}),
+            ("K = 1", 1, 34.2, {}),
+        ):
+            job = Job(scene, "", row, 40, seed, 100)
+            results[job] = result(row, seed, psnr=figure) | dataclasses.asdict(job) | more
+    (group,) = quality.differences(results)
+    errors = {row["row"]: row["psnr"] for row in group["rows"]}
+    assert {row: figures[0] for row, figures in errors.items()} == pytest.approx(dict.fromkeys(errors, 0.1))
+    # Each scene's differences are 0 and 0.2, of variance 0.02; seeds alone have variances of 8 and 8.82.
+    assert errors["K = 3"][1] == pytest.approx((0.02 / 2 * 2) ** 0.5 / 2)
+    for row in ("K = 4", "K = 1"):
+        assert errors[row][1] == pytest.approx(((8 + 8.82) / 2 * 2) ** 0.5 / 2)
+    assert all(row["lpips"] is None for row in group["rows"])
+
+
 def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, table = tmp_path / "results.jsonl", tmp_path / "table.json"
     lines = [result("default", 1), result("default", 0, psnr=32.0), result(GSPLAT, 0, jobs=4, commit="abd")]
