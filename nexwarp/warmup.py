@@ -54,9 +54,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         fixed=config.deterministic,
     )
     low_passes = (config.low_pass,)
-    hits, fixed = {config.max_hits}, config.deterministic
-    if config.more_hits_from > 0:
-        hits.add(min(config.max_hits, 2))  # until then
+    hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
     if config.densify.floaters:
         hits.add(max(config.max_hits, 1))  # which a look for them tells by
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed=fixed)
