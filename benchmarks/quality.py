@@ -15,16 +15,15 @@ had. Speed and memory of a training count when it ran alone (`--jobs 1`).
 import argparse
 import dataclasses
 import json
-import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,132 +31,18 @@ from typing import Any
 
 import torch
 
+from benchmarks.quality_rows import DEFAULT, ROWS, SCENES, TABLES, Job, Row, config_of, jobs_of, together
+from benchmarks.quality_tables import DIGITS, METRICS, UNITS, curves_of, differences, markdown, read_results, summary
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
-from nexwarp.config import Config, preset, with_settings
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
 from nexwarp.render import render
 from nexwarp.trainer import Trainer
 
-SCENES = ("fox", "saharov", "kitchen25")
-METRICS = ("psnr", "ssim", "flip", "lpips")
-UNITS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS"}
-DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4}
-GSPLAT = "gsplat MCMC"
 ARC = 8  # held-out cameras in a row
-
-
-@dataclass(frozen=True)
-class Row:
-    """One way of training.
-
-    Attributes:
-        name: as the tables print it.
-        preset: of nexwarp, or None for gsplat.
-        settings: what differs from the preset.
-    """
-
-    name: str
-    preset: str | None = "default"
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Job:
-    """One training.
-
-    Attributes:
-        scene: folder below the data.
-        variant: "" or one of `VARIANTS`.
-        row: name of a `Row`.
-        size: budget of primitives.
-        seed: of all random choices.
-        iterations: training steps.
-        downscale: photos are reduced by this factor, for a machine without a GPU.
-    """
-
-    scene: str
-    variant: str
-    row: str
-    size: int
-    seed: int
-    iterations: int
-    downscale: int = 1
-
-
-PAPER = Row("paper", "paper")
-DEFAULT = Row("default")
-PEER = Row(GSPLAT, None)
-NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
-# The paper's ablation (its Sec. "Ablations").
-REMOVALS = (
-    NO_TEXTURE,
-    Row("no gamma", settings={"rates.gammas": 0.0}),
-    Row("no higher SH of surfels", settings={"sh_degree": 0, "texture.sh_degree": 3}),
-    Row("no down-weighting", settings={"texture.down_weighting": False}),
-)
-HITS = (
-    *(Row(f"K = {k}", settings={"max_hits": k}) for k in (1, 3, 4)),
-    Row("K = 4 from the start", settings={"max_hits": 4, "more_hits_from": 0}),
-)
-# Each undoes one change of the default preset against the paper.
-CHANGES = (
-    Row("replacing texture", settings={"texture.residual": False}),
-    Row("texture from closer than seen", settings={"footprints": False}),
-    Row("each photo's own exposure", settings={"exposures": False}),
-    Row("the lens's dark corners", settings={"vignetting": False}),
-    Row("no look beyond the frame", settings={"border": 0.0}),
-    Row("no depths of points", settings={"losses.depth": 0.0}),
-    Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
-    Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),
-    Row("all points", settings={"filter_points": False}),
-    Row("random rotations", settings={"orient_points": False}),
-    Row("clamped image", settings={"clamp_image": True}),
-    Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
-    Row("floaters left", settings={"densify.floaters": False}),
-    Row("no jitter of depths", settings={"depth_jitter": 0.0}),
-    Row("paper's table", settings={"texture.table_size": 2**20}),
-    Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),
-    Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
-)
-ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES)}
-TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames")
-CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
-
-
-def jobs_of(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations: int, size: int) -> Iterator[Job]:
-    """Yield the trainings that a table is made of."""
-    seeds = tuple(seeds)
-
-    def each(rows: Iterable[Row], sizes: Iterable[int], variants: Iterable[str] = ("",), of: Iterable[str] = ()):
-        for scene in of or scenes:
-            for count in sizes:
-                for variant in variants:
-                    for row in rows:
-                        for seed in seeds:
-                            yield Job(scene, variant, row.name, count, seed, iterations)
-
-    if table == "peers":
-        yield from each((DEFAULT, PEER), (size, size // 4))
-    elif table == "curve":
-        yield from each((DEFAULT, PEER), CURVE, of=("fox",))
-    elif table == "paper":
-        yield from each((DEFAULT, PAPER), (size,))
-    elif table == "ablation":
-        yield from each((DEFAULT, *REMOVALS), (size,))
-    elif table == "hits":
-        yield from each((DEFAULT, NO_TEXTURE, *HITS), (size,))
-    elif table == "changes":
-        yield from each((DEFAULT, *CHANGES), (size,))
-    elif table == "arc":
-        yield from each((DEFAULT, PAPER), (size,), ("arc",), of=("fox",))
-    elif table == "frames":
-        yield from each((DEFAULT,), (size,), ("", "x100", "moved"), of=("fox",))
-    else:
-        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
 
 
 # Scenes
@@ -223,24 +108,6 @@ class Beginning:
     folder: Path
 
 
-def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Job], int]]:
-    """Trainings that begin as one, because K alone differs and does not count at first; and for how many iterations.
-
-    Those that begin alone come alone, with 0. All are in the order of their first.
-    """
-    groups: dict[Any, tuple[list[Job], int]] = {}
-    for job in jobs:
-        key, alike = (job, ""), 0
-        if rows[job.row].preset is not None:
-            config = _config(job, rows[job.row])
-            alike = min(config.settled - 1, job.iterations)
-            if config.max_hits >= 2 and alike > 0:
-                settings = json.dumps(dataclasses.replace(config, max_hits=2).as_dict())
-                key = (dataclasses.replace(job, row=""), settings)
-        groups.setdefault(key, ([], alike))[0].append(job)
-    return [(found, alike if len(found) > 1 else 0) for found, alike in groups.values()]
-
-
 def begin(jobs: Sequence[Job], data: Path, row: Row, iterations: int, folder: Path) -> Beginning:
     """Train what several trainings have in common.
 
@@ -252,7 +119,7 @@ def begin(jobs: Sequence[Job], data: Path, row: Row, iterations: int, folder: Pa
         folder: for the checkpoint.
     """
     job = jobs[0]
-    trainer = Trainer(_scene(data / job.scene, job.variant, job.downscale), _config(job, row), _device())
+    trainer = Trainer(_scene(data / job.scene, job.variant, job.downscale), config_of(job, row), _device())
     trainer.run(until=iterations)
     folder.mkdir()
     trainer.save(folder)
@@ -323,11 +190,6 @@ def _device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _config(job: Job, row: Row) -> Config:
-    config = with_settings(preset(row.preset), row.settings)
-    return dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
-
-
 def _name(job: Job) -> str:
     """Of a training's files."""
     reduced = f"-downscale{job.downscale}" if job.downscale > 1 else ""
@@ -337,7 +199,7 @@ def _name(job: Job) -> str:
 def _train_nexwarp(
     job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None, beginning: Beginning | None
 ) -> tuple[Any, dict]:
-    trainer = Trainer(scene, _config(job, row), device)
+    trainer = Trainer(scene, config_of(job, row), device)
     shared = {}
     if beginning is not None:
         _go_on(trainer, beginning.folder)
@@ -435,19 +297,7 @@ def _commit() -> str:
         return "unknown"
 
 
-# Results
-
-
-def read_results(paths: Iterable[Path]) -> dict[Job, dict[str, Any]]:
-    """Results by job; of two for one job the later counts."""
-    defaults = {f.name: f.default for f in dataclasses.fields(Job)}  # older lines lack what came later
-    found = {}
-    for path in paths:
-        if path.exists():
-            for line in path.read_text().splitlines():
-                result = json.loads(line)
-                found[Job(**{name: result.get(name, default) for name, default in defaults.items()})] = result
-    return found
+# Commands
 
 
 def train(given: argparse.Namespace) -> int:
@@ -517,9 +367,6 @@ def _told(job: Job, result: dict[str, Any]) -> str:
     return f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {', '.join(facts)}"
 
 
-# Tables
-
-
 def table(given: argparse.Namespace) -> int:
     """Write Markdown, and JSON where that is asked for."""
     results = read_results(given.results)
@@ -532,131 +379,6 @@ def table(given: argparse.Namespace) -> int:
     else:
         print(text)
     return 0
-
-
-def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Results with seeds together, by scene, variant, downscale, size and length, best PSNR first.
-
-    Each has the settings that differ from its preset, the seeds, and, by figure, [mean, standard deviation] over those
-    that have it, None without any: the metrics, `megabytes`, and `seconds`, `rate` (it/s) and `peak_mib` of trainings
-    that ran alone. The standard deviation of one is None.
-    """
-    groups: dict[tuple, list[tuple[Job, dict[str, Any]]]] = {}
-    for job, result in results.items():
-        key = (job.scene, job.variant, job.downscale, job.size, job.iterations, job.row)
-        groups.setdefault(key, []).append((job, result))
-    rows: list[dict[str, Any]] = []
-    for (scene, variant, downscale, size, iterations, name), found in groups.items():
-        each = [result for _, result in found]
-        alone = [result for result in each if result.get("jobs") == 1]
-        figures = {metric: [r[metric] for r in each] for metric in METRICS}
-        figures["megabytes"] = [r["megabytes"] for r in each]
-        figures["seconds"] = [r["seconds"] for r in alone]
-        figures["rate"] = [iterations / r["seconds"] for r in alone]
-        figures["peak_mib"] = [r.get("peak_mib") for r in alone]
-        what = {"scene": scene, "variant": variant, "downscale": downscale}
-        what |= {"size": size, "iterations": iterations, "row": name}
-        known = {"settings": each[0]["settings"], "seeds": sorted(job.seed for job, _ in found)}
-        known["commits"] = sorted({r["commit"] for r in each})
-        rows.append(what | known | {figure: _spread(values) for figure, values in figures.items()})
-
-    def order(row: dict[str, Any]) -> tuple:
-        psnr = (row["psnr"] or [-math.inf])[0]
-        return row["scene"], row["variant"], row["downscale"], row["size"], row["iterations"], -psnr
-
-    return sorted(rows, key=order)
-
-
-def markdown(results: dict[Job, dict[str, Any]]) -> str:
-    """All of `summary` and `differences`."""
-    rows = summary(results)
-    lines = ["# Quality", "", CONVENTION, ""]
-    if any(row["lpips"] is None for row in rows):
-        lines += ["LPIPS is left out where the weights of VGG could not be had.", ""]
-    columns = [*(UNITS[m] for m in METRICS), "MB", "s", "it/s", "MiB", "seeds"]
-    digits = DIGITS | {"megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
-    title = ""
-    for row in rows:
-        variant = f", {row['variant']}" if row["variant"] else ""
-        here = f"{row['scene']}{variant}{_extent(row)}"
-        if here != title:
-            lines += [""] * bool(title) + [f"## {here}", "", f"| | {' | '.join(columns)} |"]
-            lines += ["|---" * (len(columns) + 1) + "|"]
-            title = here
-        cells = [_cell(row[figure], digits[figure]) for figure in digits]
-        lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
-    for group in differences(results):
-        lines += ["", f"## Mean of the scenes less the default's{_extent(group)}", ""]
-        lines += [f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
-        for row in group["rows"]:
-            cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]
-            lines.append(f"| {row['row']} | {' | '.join(cells)} | {', '.join(row['scenes'])} |")
-    return "\n".join([*lines, ""])
-
-
-def _extent(what: dict[str, Any]) -> str:
-    """Of trainings, for a heading."""
-    reduced = f", photos reduced by {what['downscale']}" if what["downscale"] > 1 else ""
-    return f"{reduced}, {what['size']:,} primitives, {what['iterations']:,} iterations"
-
-
-def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
-    """What each row has more than the default, on the mean of the scenes that both were trained on.
-
-    Returns:
-        By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
-        best PSNR first, each with its `scenes` and, by metric, [difference, its standard error], None where a scene
-        lacks the metric. Each scene counts alike, with the means over its seeds; the error is that of the seeds'
-        spread, of their differences where each pair began together, None where a scene has one seed alone.
-    """
-    groups: dict[tuple, dict[str, dict[str, list[dict[str, Any]]]]] = {}
-    for job, result in results.items():
-        if not job.variant:
-            rows = groups.setdefault((job.size, job.downscale, job.iterations), {})
-            rows.setdefault(job.row, {}).setdefault(job.scene, []).append(result)
-    found = []
-    for (size, downscale, iterations), rows in sorted(groups.items()):
-        base = rows.pop(DEFAULT.name, {})
-        shown = []
-        for name, scenes in rows.items():
-            both = [scene for scene in scenes if scene in base]
-            if len(both) < 2:
-                continue
-            figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in METRICS}
-            shown.append({"row": name, "scenes": sorted(both)} | {m: _mean_difference(x) for m, x in figures.items()})
-        if shown:
-            shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
-            found.append({"size": size, "downscale": downscale, "iterations": iterations, "rows": shown})
-    return found
-
-
-def _difference(one: list[dict], two: list[dict], metric: str) -> tuple[float, float | None] | None:
-    """Of two means over seeds, and its variance."""
-    pairs = {result["seed"]: result for result in two}
-    if all(_began_together(result, pairs.get(result["seed"])) for result in one):
-        values = [(result[metric], pairs[result["seed"]][metric]) for result in one]
-        spread = None if any(None in x for x in values) else _spread(a - b for a, b in values)
-        return spread and (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
-    spreads = [_spread(result[metric] for result in each) for each in (one, two)]
-    if None in spreads:
-        return None
-    (a, s), (b, t) = spreads
-    return a - b, None if s is None or t is None else s**2 / len(one) + t**2 / len(two)
-
-
-def _began_together(one: dict, two: dict | None) -> bool:
-    if two is None or one.get("together") is None or one["commit"] != two["commit"]:
-        return False
-    return one["together"] == two.get("together") and {one["row"], two["row"]} <= {*one["together"]["rows"]}
-
-
-def _mean_difference(each: list[tuple[float, float | None] | None]) -> list[float | None] | None:
-    """[mean, standard error] of differences with their variances."""
-    if any(x is None for x in each):
-        return None
-    values, variances = zip(*each, strict=True)
-    error = None if None in variances else math.sqrt(sum(variances)) / len(values)
-    return [statistics.fmean(values), error]
 
 
 def curve(given: argparse.Namespace) -> int:
@@ -686,40 +408,6 @@ def curve(given: argparse.Namespace) -> int:
     for name, points in curves.items():
         print(f"{name}: " + ", ".join(f"{size:,} {mean:.{DIGITS[given.metric]}f}" for size, mean, _ in points))
     return 0
-
-
-def curves_of(
-    results: dict[Job, dict[str, Any]], scene: str, metric: str, iterations: int
-) -> dict[str, list[tuple[int, float, float]]]:
-    """Curves of our default and of gsplat, photos at full size.
-
-    Returns:
-        (primitives, mean over seeds, their standard deviation) by size, for each of the two that has results.
-    """
-    found: dict[str, dict[int, list[float]]] = {}
-    for job, result in results.items():
-        which = (job.scene, job.variant, job.iterations, job.downscale)
-        named = job.row in (DEFAULT.name, GSPLAT) and which == (scene, "", iterations, 1)
-        if named and result[metric] is not None:
-            found.setdefault(job.row, {}).setdefault(job.size, []).append(result[metric])
-    return {
-        row: [(n, statistics.fmean(x), statistics.stdev(x) if len(x) > 1 else 0.0) for n, x in sorted(sizes.items())]
-        for row, sizes in found.items()
-    }
-
-
-def _spread(values: Iterable[float | None]) -> list[float | None] | None:
-    """[mean, standard deviation]; None of nothing."""
-    values = [x for x in values if x is not None]
-    if not values:
-        return None
-    return [statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None]
-
-
-def _cell(values: list[float | None] | None, digits: int, signed: bool = False) -> str:
-    formats = f"{'+' * signed}.{digits}f", f".{digits}f"
-    pairs = zip(values or (), formats, strict=False)
-    return " +- ".join(f"{value:{form}}" for value, form in pairs if value is not None)
 
 
 def main(arguments: list[str] | None = None) -> int:

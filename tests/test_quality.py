@@ -9,7 +9,9 @@ import torch
 
 import nexwarp as nw
 from benchmarks import quality
-from benchmarks.quality import ARC, GSPLAT, ROWS, Job, arc, jobs_of, markdown, moved, read_results
+from benchmarks.quality import ARC, VARIANTS, arc, moved
+from benchmarks.quality_rows import GSPLAT, ROWS, TABLES, Job, Row, jobs_of, together
+from benchmarks.quality_tables import curves_of, differences, markdown, read_results
 from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
@@ -35,13 +37,13 @@ def test_every_row_is_a_setting() -> None:
             assert (config != preset(row.preset)) == bool(row.settings), row.name
 
 
-@pytest.mark.parametrize("table", quality.TABLES)
+@pytest.mark.parametrize("table", TABLES)
 def test_tables_are_made_of_known_rows(table: str) -> None:
     jobs = list(jobs_of(table, ("fox", "saharov"), (0, 1), 100, 40))
     assert len(jobs) == len(set(jobs)) > 0
     assert all(job.row in ROWS and job.iterations == 100 for job in jobs)
     assert {job.seed for job in jobs} == {0, 1}
-    assert all(job.variant in ("", *quality.VARIANTS) for job in jobs)
+    assert all(job.variant in ("", *VARIANTS) for job in jobs)
 
 
 def test_arc_holds_out_neighbours(scene: Scene) -> None:
@@ -117,7 +119,7 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
         job = Job(scene, "", row, 40, seed, 100)
         results[job] = result(row, seed, psnr=figure, flip=flip) | dataclasses.asdict(job)
     results |= {dataclasses.replace(job, variant="moved"): found for job, found in results.items()}
-    (group,) = quality.differences(results)
+    (group,) = differences(results)
     assert (group["size"], group["downscale"], group["iterations"]) == (40, 1, 100)
     first, second = group["rows"]
     assert (first["row"], first["scenes"], first["psnr"]) == ("K = 3", ["fox", "kitchen"], [1.5, None])
@@ -148,7 +150,7 @@ def test_trainings_that_began_together_differ_by_pairs() -> None:
         ):
             job = Job(scene, "", row, 40, seed, 100)
             results[job] = result(row, seed, psnr=figure) | dataclasses.asdict(job) | more
-    (group,) = quality.differences(results)
+    (group,) = differences(results)
     errors = {row["row"]: row["psnr"] for row in group["rows"]}
     assert {row: figures[0] for row, figures in errors.items()} == pytest.approx(dict.fromkeys(errors, 0.1))
     # Each scene's differences are 0 and 0.2, of variance 0.02; seeds alone have variances of 8 and 8.82.
@@ -201,7 +203,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
 def test_rows_of_which_only_hits_differ_begin_together() -> None:
     """Until K counts, 25,000 of 30,000 iterations; what differs in anything else is alone."""
     jobs = list(jobs_of("hits", ("fox", "car"), (0, 1), 30_000, 40))
-    groups = quality.together(jobs, ROWS)
+    groups = together(jobs, ROWS)
     assert sorted(map(str, jobs)) == sorted(str(job) for members, _ in groups for job in members)
     several = [(members, alike) for members, alike in groups if len(members) > 1]
     assert [[job.row for job in members] for members, _ in several] == [["default", "K = 3", "K = 4"]] * 4
@@ -212,11 +214,11 @@ def test_rows_of_which_only_hits_differ_begin_together() -> None:
     assert [alike for _, alike in several] == [24_999] * 4
     assert all(alike == 0 for members, alike in groups if len(members) == 1)
     peers = [Job("fox", "", GSPLAT, 40, 0, 100), Job("fox", "", "paper", 40, 0, 100)]
-    assert quality.together(peers, ROWS) == [([job], 0) for job in peers]
-    four = quality.Row("four", "paper", {"max_hits": 4})  # which counts from the start there
+    assert together(peers, ROWS) == [([job], 0) for job in peers]
+    four = Row("four", "paper", {"max_hits": 4})  # which counts from the start there
     rows = {"paper": ROWS["paper"], "four": four}
     jobs = [dataclasses.replace(peers[1], row=row) for row in rows]
-    assert quality.together(jobs, rows) == [([job], 0) for job in jobs]
+    assert together(jobs, rows) == [([job], 0) for job in jobs]
 
 
 def test_a_training_from_a_common_beginning_is_the_training(
@@ -237,7 +239,7 @@ def test_a_training_from_a_common_beginning_is_the_training(
     texture = []
     for job, result in found.items():
         assert result["together"] == {"rows": [*rows], "iterations": 9}
-        row = quality.Row(job.row, settings=rows[job.row])
+        row = Row(job.row, settings=rows[job.row])
         alone = quality.run_job(job, folder, row, models=tmp_path / "alone")
         assert alone["views"] == result["views"] and "together" not in alone
         one, other = (nw.load(path / quality._name(job)) for path in (models, tmp_path / "alone"))
@@ -277,11 +279,11 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
         lines.append(json.dumps(dataclasses.asdict(other) | {"flip": 9.0, "psnr": 1.0}))
     file = tmp_path / "results.jsonl"
     file.write_text("\n".join(lines))
-    curves = quality.curves_of(read_results([file]), "fox", "flip", 30)
+    curves = curves_of(read_results([file]), "fox", "flip", 30)
     assert curves.keys() == {"default", GSPLAT}
     assert curves["default"] == [(1000, 0.5, 0.0), (5000, pytest.approx(0.3), pytest.approx(0.02**0.5))]
     assert curves[GSPLAT] == [(5000, 0.6, 0.0)]
-    assert quality.curves_of(read_results([file]), "fox", "psnr", 30) == {}
+    assert curves_of(read_results([file]), "fox", "psnr", 30) == {}
     pytest.importorskip("matplotlib", reason="draws the curves (extra `dev`)")
     picture = tmp_path / "curve.png"
     assert quality.main(["curve", str(file), "--iterations", "30", "--out", str(picture)]) == 0
