@@ -370,9 +370,14 @@ def _told(job: Job, result: dict[str, Any]) -> str:
 def table(given: argparse.Namespace) -> int:
     """Write Markdown, and JSON where that is asked for."""
     results = read_results(given.results)
-    text = markdown(results)
+    rows = {DEFAULT.name} | {job.row for job in results}
+    if given.against not in rows:
+        print(f"--against: expected one of {', '.join(sorted(rows))}, got {given.against}")
+        return 2
+    text = markdown(results, given.against)
     if given.json:
-        tables = {"convention": CONVENTION, "rows": summary(results), "differences": differences(results)}
+        tables = {"convention": CONVENTION, "rows": summary(results), "against": given.against}
+        tables["differences"] = differences(results, given.against)
         given.json.write_text(json.dumps(tables, indent=1) + "\n")
     if given.out:
         given.out.write_text(text)
@@ -433,6 +438,7 @@ def main(arguments: list[str] | None = None) -> int:
     tables = commands.add_parser("table", help="make Markdown of results")
     tables.set_defaults(run=table)
     tables.add_argument("results", type=Path, nargs="+")
+    tables.add_argument("--against", default=DEFAULT.name, help="row to compare with (default: %(default)s)")
     tables.add_argument("--out", type=Path, help="file to write; default: the screen")
     tables.add_argument("--json", type=Path, help="file to write the same to, as JSON")
     curves = commands.add_parser("curve", help="draw a metric over the number of primitives")

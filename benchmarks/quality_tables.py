@@ -61,8 +61,13 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(rows, key=order)
 
 
-def markdown(results: dict[Job, dict[str, Any]]) -> str:
-    """All of `summary` and `differences`."""
+def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) -> str:
+    """All of `summary` and `differences`.
+
+    Args:
+        results: by job.
+        against: which row to compare with.
+    """
     rows = summary(results)
     lines = ["# Quality", "", CONVENTION, ""]
     if any(row["lpips"] is None for row in rows):
@@ -79,8 +84,8 @@ def markdown(results: dict[Job, dict[str, Any]]) -> str:
             title = here
         cells = [_cell(row[figure], digits[figure]) for figure in digits]
         lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
-    for group in differences(results):
-        lines += ["", f"## Mean of the scenes less the default's{_extent(group)}", ""]
+    for group in differences(results, against):
+        lines += ["", f"## Mean of the scenes less that of {against}{_extent(group)}", ""]
         lines += [f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
         for row in group["rows"]:
             cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]
@@ -94,8 +99,12 @@ def _extent(what: dict[str, Any]) -> str:
     return f"{reduced}, {what['size']:,} primitives, {what['iterations']:,} iterations"
 
 
-def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
-    """What each row has more than the default, on the mean of the scenes that both were trained on.
+def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) -> list[dict[str, Any]]:
+    """What each row has more than a certain one, on the mean of the scenes that both were trained on.
+
+    Args:
+        results: by job.
+        against: that row.
 
     Returns:
         By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
@@ -110,7 +119,7 @@ def differences(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
             rows.setdefault(job.row, {}).setdefault(job.scene, []).append(result)
     found = []
     for (size, downscale, iterations), rows in sorted(groups.items()):
-        base = rows.pop(DEFAULT.name, {})
+        base = rows.pop(against, {})
         shown = []
         for name, scenes in rows.items():
             both = [scene for scene in scenes if scene in base]

@@ -128,9 +128,15 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     assert second["psnr"] == [pytest.approx(-0.75), pytest.approx((1 + 2.25) ** 0.5 / 2)]
     assert second["flip"] == [pytest.approx(0.1), pytest.approx(0.01**0.5 / 2)]
     text = markdown(results)
-    assert "## Mean of the scenes less the default's, 40 primitives, 100 iterations" in text
+    assert "## Mean of the scenes less that of default, 40 primitives, 100 iterations" in text
     assert "| K = 3 | +1.50 | +0.0000 | +0.0000 |  | fox, kitchen |" in text
     assert "| no gamma | -0.75 +- 0.90 | +0.0000 +- 0.0000 | +0.1000 +- 0.0500 |  | fox, kitchen |" in text
+    (group,) = differences(results, "no gamma")
+    figures = {row["row"]: row["psnr"] for row in group["rows"]}
+    assert figures == {"K = 3": [2.25, None], "default": [-second["psnr"][0], second["psnr"][1]]}
+    text = markdown(results, "no gamma")
+    assert "## Mean of the scenes less that of no gamma, 40 primitives, 100 iterations" in text
+    assert "| default | +0.75 +- 0.90 |" in text
 
 
 def test_trainings_that_began_together_differ_by_pairs() -> None:
@@ -172,6 +178,10 @@ def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.C
     assert (ours["row"], ours["seeds"], ours["commits"]) == ("default", [0, 1], ["abc"])
     assert ours["psnr"] == [31.0, pytest.approx(2**0.5)] and ours["rate"] == [20.0, 0.0] and ours["lpips"] is None
     assert (theirs["row"], theirs["psnr"], theirs["seconds"]) == (GSPLAT, [30.0, None], None)
+    assert found["against"] == "default" and found["differences"] == []
+    assert quality.main(["table", str(file), "--against", "K = 3", "--out", str(tmp_path / "table.md")]) == 2
+    assert f"--against: expected one of default, {GSPLAT}, got K = 3" in capsys.readouterr().out
+    assert not (tmp_path / "table.md").exists()
 
 
 def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
