@@ -5,11 +5,12 @@
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
-several machines too. Rows of which only K differs train alike until K counts (`more_hits_from`): up to there they
-are one training. `table` makes Markdown of them, means and spreads over seeds, and what each row has more than the
-default on the mean of the scenes; nothing is trained twice for two tables. `curve` draws a metric over the number of
-primitives. Metrics are those of `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be
-had. Speed and memory of a training count when it ran alone (`--jobs 1`).
+several machines too. Rows of which only K or the removal of floaters differs train alike until that counts
+(`more_hits_from`, `densify.stop`): up to there they are one training. `table` makes Markdown of them, means and spreads
+over seeds, and what each row has more than the default, or the row `--against`, on the mean of the scenes; nothing is
+trained twice for two tables. `curve` draws a metric over the number of primitives. Metrics are those of
+`nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had. Speed and memory of a
+training count when it ran alone (`--jobs 1`).
 """
 
 import argparse

@@ -129,18 +129,21 @@ def config_of(job: Job, row: Row) -> Config:
 
 
 def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Job], int]]:
-    """Trainings that begin as one, because K alone differs and does not count at first; and for how many iterations.
+    """Trainings that begin as one, because what differs does not count at first; and for how many iterations.
 
-    Those that begin alone come alone, with 0. All are in the order of their first.
+    That is K, where it is 2 or more, and whether floaters are removed. Those that begin alone come alone, with 0. All
+    are in the order of their first.
     """
     groups: dict[Any, tuple[list[Job], int]] = {}
     for job in jobs:
         key, alike = (job, ""), 0
         if rows[job.row].preset is not None:
             config = config_of(job, rows[job.row])
-            alike = min(config.settled - 1, job.iterations)
-            if config.max_hits >= 2 and alike > 0:
-                settings = json.dumps(dataclasses.replace(config, max_hits=2).as_dict())
-                key = (dataclasses.replace(job, row=""), settings)
+            looked = config.scaled(config.densify.stop)  # for floaters, from there on
+            alike = min(config.settled - 1, looked - 1, job.iterations)
+            if alike > 0:
+                densify = dataclasses.replace(config.densify, floaters=False)
+                begun = dataclasses.replace(config, max_hits=min(config.max_hits, 2), densify=densify)
+                key = (dataclasses.replace(job, row=""), json.dumps(begun.as_dict()))
         groups.setdefault(key, ([], alike))[0].append(job)
     return [(found, alike if len(found) > 1 else 0) for found, alike in groups.values()]
