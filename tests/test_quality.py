@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import nexwarp as nw
 from benchmarks import quality
 from benchmarks.quality import ARC, VARIANTS, arc, moved
 from benchmarks.quality_rows import GSPLAT, ROWS, TABLES, Job, Row, jobs_of, together
-from benchmarks.quality_tables import curves_of, differences, markdown, read_results
+from benchmarks.quality_tables import curves_of, differences, markdown, read_results, summary
 from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
@@ -315,3 +316,25 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert quality.main(["curve", str(file), "--scene", "car", "--out", str(tmp_path / "no.png")]) == 2
     assert not (tmp_path / "no.png").exists()
+
+
+def test_the_documents_figures_are_those_of_the_kept_trainings() -> None:
+    """Means with their spreads, and differences with their errors; a document is not older than its results."""
+    kept = set()
+    for name in ("quality", "quality_small"):
+        results = read_results([quality.ROOT / "benchmarks" / "results" / f"{name}.jsonl"])
+        for row in summary(results):
+            (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
+            if spread is not None:
+                kept.add(f"{figure:.2f} +- {spread:.2f}, {similarity:.4f}, {error:.4f}")
+        for against in ("default", "floaters left"):
+            for row in (row for group in differences(results, against) for row in group["rows"]):
+                if row["psnr"][1] is not None:
+                    each = [(row[metric], digits) for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
+                    kept.add(", ".join(f"{mean:+.{digits}f} +- {error:.{digits}f}" for (mean, error), digits in each))
+    a_mean = r"\d+\.\d\d \+- \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
+    a_difference = r"[+-]\d+\.\d\d \+- \d\.\d\d, [+-]0\.\d{4} \+- 0\.\d{4}, [+-]0\.\d{4} \+- 0\.\d{4}"
+    for page, least in (("README.md", 15), ("docs/quality.md", 35), ("benchmarks/NOTES.md", 50)):
+        shown = re.findall(f"{a_mean}|{a_difference}", (quality.ROOT / page).read_text(encoding="utf-8"))
+        assert len(shown) >= least, f"{page}: the tables' figures are written otherwise"
+        assert not (wrong := [figures for figures in shown if figures not in kept]), f"{page}: {wrong}"
