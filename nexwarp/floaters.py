@@ -16,6 +16,7 @@ from nexwarp.surfels import Surfels
 
 LOOKS = 60  # at least so many views between the training views, and one for each
 LEAST_SHARE = 3e-4  # of a picture
+GROSS_SHARE = 1e-2  # likewise, where what is behind can no more be learnt
 HEIGHT = 80  # of that, pixels: two or three of them are such a share
 NEARER = 0.6  # of the depth of the nearest points, which leaves room for what is nearer than these tell
 FEWEST_POINTS = 20  # that tell how near things are to a camera
@@ -29,6 +30,7 @@ def floaters(
     generator: torch.Generator,
     *,
     options: dict[str, Any],
+    gross: bool = False,
 ) -> torch.Tensor:
     """Return which surfels (N,) bool cover 3 pixels in 10,000 of a picture, or more, from too near.
 
@@ -42,7 +44,9 @@ def floaters(
         nearest: for each, its `nearest_depth`.
         generator: for the places between, on the CPU.
         options: keyword arguments of `nexwarp.render`.
+        gross: look for those alone that cover one pixel in 100, or more.
     """
+    least = GROSS_SHARE if gross else LEAST_SHARE
     looks = [*zip(cameras, nearest, strict=True)]
     for _ in range(math.ceil(LOOKS / len(cameras))):
         moved = between(cameras, [0.5 * depth for depth in nearest], generator)
@@ -51,7 +55,7 @@ def floaters(
     found = torch.zeros(len(surfels), dtype=torch.bool, device=surfels.means.device)
     for camera, depth in looks:
         if depth > 0:
-            found |= _shares(surfels, camera, NEARER * depth, options) >= LEAST_SHARE
+            found |= _shares(surfels, camera, NEARER * depth, options) >= least
     return found
 
 

@@ -247,25 +247,26 @@ class Trainer:
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
         if self._floaters_due():
-            self._remove_floaters()
+            self._remove_floaters(gross=self.iteration == config.iterations)
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
     def _floaters_due(self) -> bool:
-        """Once densification is over, which would make others, but not at the end: what was behind has to be learnt."""
+        """Once densification is over, which would make others; and at the end."""
         densify = self.densifier.config
-        due = self.iteration >= densify.stop and self.iteration % (FLOATERS_EVERY * densify.every) == 0
-        return due and densify.floaters and self.iteration < self.config.iterations and any(self._nearest)
+        due = self.iteration % (FLOATERS_EVERY * densify.every) == 0 or self.iteration == self.config.iterations
+        return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
     def _nearest(self) -> list[float]:
         # Not before a look for floaters asks: it takes a second where photos and points are many.
         return [nearest_depth(view, self.scene.points) for view in self.scene.train]
 
-    def _remove_floaters(self) -> None:
+    def _remove_floaters(self, gross: bool) -> None:
+        # What was behind has to be learnt: at the end, only the gross ones go, one of which can hide a whole view.
         # A generator of its own: where there are no floaters, nothing else changes.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
         cameras, options = self.views.cameras, self.render_options()
-        chosen = floaters(self.surfels, cameras, self._nearest, generator, options=options)
+        chosen = floaters(self.surfels, cameras, self._nearest, generator, options=options, gross=gross)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def _learn(self, view: "_Target") -> Learnt:

@@ -60,6 +60,16 @@ def test_floaters_are_large_and_much_nearer_than_the_nearest_points(max_hits: in
     assert found(surfels, ahead, [0.0], max_hits) == [False, False, False]
 
 
+def test_gross_ones_cover_a_hundredth_of_a_picture(device: torch.device) -> None:
+    """Half of one, 2 hundredths and far more, of 3,072 pixels at 80 a unit."""
+    half, two = (((0.2 * side, 0.1, -0.01), size) for side, size in ((-1, 0.022), (1, 0.044)))
+    surfels, ahead, options = facing([half, two, NEAR], device), [looking_ahead(-1.0)], {"max_hits": 2}
+    shares = module._shares(surfels, ahead[0], 2.0, options).tolist()
+    assert 0.004 < shares[0] < 0.006 and 0.015 < shares[1] < 0.025 and shares[2] > 0.2
+    for gross, expected in ((False, [True, True, True]), (True, [False, True, True])):
+        assert floaters(surfels, ahead, [2.0], torch.Generator(), options=options, gross=gross).tolist() == expected
+
+
 def test_a_view_between_may_be_nearer_by_the_way_to_it(device: torch.device, between: list[nw.Camera]) -> None:
     """From z = -1, 2 ahead of the training camera: depths of 1 and 1.5 are 0.6 of 3.67 and 4.5, less those 2."""
     surfels = facing([NEAR, BEHIND], device)

@@ -433,20 +433,21 @@ def test_surfels_settle_with_two_hits(scene):
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
-    """Every 3 of 60 iterations, from 50 on, where densification ends; but not at the end."""
+    """Every 3 of 60 iterations, from 50 on, where densification ends; at the end only gross ones."""
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
-    def first(surfels, cameras, nearest, generator, *, options):
+    def first(surfels, cameras, nearest, generator, *, options, gross):
         looks.append((trainer.iteration, len(surfels), generator.initial_seed()))
+        assert gross == (trainer.iteration == 60)
         return torch.arange(len(surfels)) == 0
 
     monkeypatch.setattr(trainer_module, "floaters", first)
     trainer = Trainer(scene, small(iterations=60, densify=dataclasses.replace(OFTEN, floaters=True)), "cpu")
     counts = {}
     trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
-    assert [look[0] for look in looks] == [51, 54, 57]
-    assert len({seed for _, _, seed in looks}) == 3
+    assert [look[0] for look in looks] == [51, 54, 57, 60]
+    assert len({seed for _, _, seed in looks}) == 4
     assert all(counts[iteration] == count - 1 for iteration, count, _ in looks)
 
 
@@ -460,6 +461,7 @@ def test_without_points_nothing_tells_of_floaters(scene, monkeypatch):
 def test_looking_for_floaters_changes_nothing_where_there_are_none(scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     monkeypatch.setattr(floaters_module, "LEAST_SHARE", 2.0)
+    monkeypatch.setattr(floaters_module, "GROSS_SHARE", 2.0)
     with_look, without = (
         trained(scene, small(iterations=30, densify=dataclasses.replace(OFTEN, floaters=on))) for on in (True, False)
     )
