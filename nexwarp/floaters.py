@@ -15,8 +15,9 @@ from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
 LOOKS = 60  # at least so many views between the training views, and one for each
+LAST_LOOKS = 240  # likewise, where there is no next time
 LEAST_SHARE = 3e-4  # of a picture
-GROSS_SHARE = 1e-2  # likewise, where what is behind can no more be learnt
+LAST_SHARE = 3e-3  # likewise, where what is behind can no more be learnt
 HEIGHT = 80  # of that, pixels: two or three of them are such a share
 NEARER = 0.6  # of the depth of the nearest points, which leaves room for what is nearer than these tell
 FEWEST_POINTS = 20  # that tell how near things are to a camera
@@ -30,7 +31,7 @@ def floaters(
     generator: torch.Generator,
     *,
     options: dict[str, Any],
-    gross: bool = False,
+    last: bool = False,
 ) -> torch.Tensor:
     """Return which surfels (N,) bool cover 3 pixels in 10,000 of a picture, or more, from too near.
 
@@ -44,11 +45,12 @@ def floaters(
         nearest: for each, its `nearest_depth`.
         generator: for the places between, on the CPU.
         options: keyword arguments of `nexwarp.render`.
-        gross: look for those alone that cover one pixel in 100, or more.
+        last: what is behind will not be learnt: look for those alone that cover 3 pixels in 1,000, or more, but in four
+            times as many views between.
     """
-    least = GROSS_SHARE if gross else LEAST_SHARE
+    least, count = (LAST_SHARE, LAST_LOOKS) if last else (LEAST_SHARE, LOOKS)
     looks = [*zip(cameras, nearest, strict=True)]
-    for _ in range(math.ceil(LOOKS / len(cameras))):
+    for _ in range(math.ceil(count / len(cameras))):
         moved = between(cameras, [0.5 * depth for depth in nearest], generator)
         for old, new, depth in zip(cameras, moved, nearest, strict=True):
             looks.append((new, depth - torch.dist(new.position, old.position).item()))

@@ -247,7 +247,7 @@ class Trainer:
         if self.densifier.due(self.iteration):
             self.densifier.step(self.surfels, self.optimizer, self.generator)
         if self._floaters_due():
-            self._remove_floaters(gross=self.iteration == config.iterations)
+            self._remove_floaters(last=self.iteration == config.iterations)
         return Progress(self.iteration, len(self.surfels), learnt.losses, learnt.image, view.photo)
 
     def _floaters_due(self) -> bool:
@@ -261,12 +261,12 @@ class Trainer:
         # Not before a look for floaters asks: it takes a second where photos and points are many.
         return [nearest_depth(view, self.scene.points) for view in self.scene.train]
 
-    def _remove_floaters(self, gross: bool) -> None:
-        # What was behind has to be learnt: at the end, only the gross ones go, one of which can hide a whole view.
+    def _remove_floaters(self, last: bool) -> None:
+        # What was behind has to be learnt: at the end, only large ones go, one of which can hide a whole view.
         # A generator of its own: where there are no floaters, nothing else changes.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
         cameras, options = self.views.cameras, self.render_options()
-        chosen = floaters(self.surfels, cameras, self._nearest, generator, options=options, gross=gross)
+        chosen = floaters(self.surfels, cameras, self._nearest, generator, options=options, last=last)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def _learn(self, view: "_Target") -> Learnt:

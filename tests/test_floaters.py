@@ -60,14 +60,14 @@ def test_floaters_are_large_and_much_nearer_than_the_nearest_points(max_hits: in
     assert found(surfels, ahead, [0.0], max_hits) == [False, False, False]
 
 
-def test_gross_ones_cover_a_hundredth_of_a_picture(device: torch.device) -> None:
-    """Half of one, 2 hundredths and far more, of 3,072 pixels at 80 a unit."""
-    half, two = (((0.2 * side, 0.1, -0.01), size) for side, size in ((-1, 0.022), (1, 0.044)))
-    surfels, ahead, options = facing([half, two, NEAR], device), [looking_ahead(-1.0)], {"max_hits": 2}
+def test_the_last_ones_cover_three_thousandths_of_a_picture(device: torch.device) -> None:
+    """Two, four and far more, of 3,072 pixels at 80 a unit."""
+    two, four = (((0.2 * side, 0.1, -0.01), size) for side, size in ((-1, 0.014), (1, 0.02)))
+    surfels, ahead, options = facing([two, four, NEAR], device), [looking_ahead(-1.0)], {"max_hits": 2}
     shares = module._shares(surfels, ahead[0], 2.0, options).tolist()
-    assert 0.004 < shares[0] < 0.006 and 0.015 < shares[1] < 0.025 and shares[2] > 0.2
-    for gross, expected in ((False, [True, True, True]), (True, [False, True, True])):
-        assert floaters(surfels, ahead, [2.0], torch.Generator(), options=options, gross=gross).tolist() == expected
+    assert 1e-3 < shares[0] < 2.5e-3 and 3.5e-3 < shares[1] < 6e-3 and shares[2] > 0.2
+    for last, expected in ((False, [True, True, True]), (True, [False, True, True])):
+        assert floaters(surfels, ahead, [2.0], torch.Generator(), options=options, last=last).tolist() == expected
 
 
 def test_a_view_between_may_be_nearer_by_the_way_to_it(device: torch.device, between: list[nw.Camera]) -> None:
@@ -96,12 +96,19 @@ def test_the_size_of_the_pictures_does_not_matter(height: int) -> None:
 
 
 def test_sixty_views_between_are_looked_at_or_one_for_each_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last time it is 240."""
     looks = []
     monkeypatch.setattr(module, "between", lambda cameras, *_: looks.append(len(cameras)) or cameras)
     for count in (1, 40, 130):
         looks.clear()
         found(facing([NEAR], torch.device("cpu")), [looking_ahead(-9.0)] * count, [1.0] * count)
         assert looks == [count] * {1: 60, 40: 2, 130: 1}[count]
+        looks.clear()
+        cameras, options = [looking_ahead(-9.0)] * count, {"max_hits": 2}
+        floaters(
+            facing([NEAR], torch.device("cpu")), cameras, [1.0] * count, torch.Generator(), options=options, last=True
+        )
+        assert looks == [count] * {1: 240, 40: 6, 130: 2}[count]
 
 
 def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:

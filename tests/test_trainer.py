@@ -460,13 +460,13 @@ def test_surfels_settle_with_two_hits(scene):
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
-    """Every 3 of 60 iterations, from 50 on, where densification ends; at the end only gross ones."""
+    """Every 3 of 60 iterations, from 50 on, where densification ends; at the end a last time."""
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
-    def first(surfels, cameras, nearest, generator, *, options, gross):
+    def first(surfels, cameras, nearest, generator, *, options, last):
         looks.append((trainer.iteration, len(surfels), generator.initial_seed()))
-        assert gross == (trainer.iteration == 60)
+        assert last == (trainer.iteration == 60)
         return torch.arange(len(surfels)) == 0
 
     monkeypatch.setattr(trainer_module, "floaters", first)
@@ -488,7 +488,7 @@ def test_without_points_nothing_tells_of_floaters(scene, monkeypatch):
 def test_looking_for_floaters_changes_nothing_where_there_are_none(scene, monkeypatch):
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     monkeypatch.setattr(floaters_module, "LEAST_SHARE", 2.0)
-    monkeypatch.setattr(floaters_module, "GROSS_SHARE", 2.0)
+    monkeypatch.setattr(floaters_module, "LAST_SHARE", 2.0)
     with_look, without = (
         trained(scene, small(iterations=30, densify=dataclasses.replace(OFTEN, floaters=on))) for on in (True, False)
     )
