@@ -76,7 +76,7 @@ DEMO_SETTINGS: dict[str, Any] = {
     "rates.quats": 5e-3,
     "rates.scales": 2.5e-2,
     "rates.opacities": 0.05,
-    "rates.gammas_boost": 5.0,
+    "rates.gammas": 5e-3,
     "rates.sh0": 1.25e-2,
     "rates.shN": 6e-4,
     "rates.grid": (2e-2, 2e-4),

@@ -36,8 +36,6 @@ class LearningRates:
     """Of the logits of the opacities."""
     gammas: float = 1e-3
     """Of the logarithms of gamma - 1."""
-    gammas_boost: float = 5.0
-    """In runs shorter than 30,000 iterations that is raised by as much as they are shorter, at most this many times."""
     sh0: float = 2.5e-3
     """Of the plain colours' constant coefficients."""
     shN: float = 1.25e-4
@@ -53,7 +51,6 @@ class LearningRates:
             ends = value if isinstance(value, tuple) else (value, value)
             if not (min(ends) > 0 or ends == (0.0, 0.0)):
                 raise ValueError(f"{rate.name}: expected rates > 0, or 0 throughout, got {value}")
-        check_range("gammas_boost", self.gammas_boost, 1.0)
 
 
 @dataclass(frozen=True)
@@ -166,12 +163,6 @@ class Config:
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""
         return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
-
-    @property
-    def gamma_rate(self) -> float:
-        """Learning rate of gammas in this run: they start next to 1, and a short run has few steps to move them."""
-        shorter = max(REFERENCE_ITERATIONS / self.iterations, 1.0)
-        return self.rates.gammas * min(shorter, self.rates.gammas_boost)
 
     @property
     def settled(self) -> int:
@@ -344,7 +335,7 @@ PRESETS: dict[str, Config] = {
         clamp_image=True,
         filter_points=False,
         orient_points=False,
-        rates=LearningRates(gammas_boost=1.0, mlp=(1e-3, 1e-3)),
+        rates=LearningRates(mlp=(1e-3, 1e-3)),
         texture=TextureConfig(
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),

@@ -632,7 +632,7 @@ def _make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, sc
         "raw_quats": (rates.quats,) * 2,
         "log_scales": (rates.scales,) * 2,
         "logit_opacities": (rates.opacities,) * 2,
-        "raw_gammas": (config.gamma_rate,) * 2,
+        "raw_gammas": (rates.gammas,) * 2,
         "sh0": (rates.sh0,) * 2,
         "shN": (rates.shN,) * 2,
     }

@@ -71,7 +71,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.scales": ("", "code"),
     "rates.opacities": ("", "code"),
     "rates.gammas": ("", "code"),
-    "rates.gammas_boost": ("", ""),
     "rates.sh0": ("", "code"),
     "rates.shN": ("", "code"),
     "rates.grid": ("", "code"),

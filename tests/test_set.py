@@ -93,7 +93,6 @@ def test_settings_are_checked_together():
         ("rates.means=0.1", "rates.means: expected a list of 2 numbers, got 0.1"),
         ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
         ("rates.quats=-1", "rates.quats: expected rates > 0"),
-        ("rates.gammas_boost=0.5", "rates.gammas_boost: expected at least 1, got 0.5"),
         ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
         ("background=[[0], 0, 0]", "background: expected a number, got [0]"),
         ("densify.every=0", "densify.every: expected at least 1, got 0"),

@@ -15,7 +15,7 @@ from nexwarp import floaters as floaters_module
 from nexwarp import trainer as trainer_module
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset, with_settings
+from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene, View, initial_points
 from nexwarp.densify import DensifyConfig
 from nexwarp.evaluate import evaluate
@@ -409,33 +409,6 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, look,
     assert len(runs[1].surfels) == counts[-1] and (counts[-1] < max(counts)) == look
     images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
-
-
-@pytest.mark.parametrize(
-    ("change", "rate"),
-    [
-        ({"iterations": 30_000}, 1e-3),
-        ({"iterations": 60_000}, 1e-3),
-        ({"iterations": 15_000}, 2e-3),
-        ({"iterations": 6_000}, 5e-3),
-        ({"iterations": 10}, 5e-3),
-        ({"iterations": 10, "rates.gammas_boost": 20.0, "rates.gammas": 1e-4}, 2e-3),
-        ({"iterations": 10, "rates.gammas_boost": 1.0}, 1e-3),
-        ({"iterations": 10, "rates.gammas": 0.0}, 0.0),
-    ],
-)
-def test_gammas_of_short_runs_move_faster(scene, change, rate):
-    config = with_settings(small(), change)
-    assert config.gamma_rate == pytest.approx(rate)
-    trainer = Trainer(scene, config, "cpu")
-    trainer.step()
-    (group,) = (g for g in trainer.optimizer.param_groups if g["params"][0] is trainer.surfels.raw_gammas)
-    assert float(group["lr"]) == pytest.approx(rate)
-    assert torch.equal(trainer.surfels.raw_gammas, torch.full_like(trainer.surfels.raw_gammas, -5.0)) == (rate == 0)
-
-
-def test_gammas_of_the_paper_move_alike_however_long_the_run():
-    assert {dataclasses.replace(preset("paper"), iterations=n).gamma_rate for n in (1, 6_000, 30_000, 90_000)} == {1e-3}
 
 
 def test_surfels_settle_with_two_hits(scene):
