@@ -15,10 +15,10 @@ from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
 LOOKS = 60  # at least so many views between the training views, and one for each
-LAST_LOOKS = 240  # likewise, where there is no next time
+LAST_LOOKS = 240  # the last time
 LEAST_SHARE = 3e-4  # of a picture
-LAST_SHARE = 3e-3  # likewise, where what is behind can no more be learnt
 HEIGHT = 80  # of that, pixels: two or three of them are such a share
+LAST_SHARE = 3e-3  # the last time, when what is behind can no more be learnt
 NEARER = 0.6  # of the depth of the nearest points, which leaves room for what is nearer than these tell
 FEWEST_POINTS = 20  # that tell how near things are to a camera
 
