@@ -147,9 +147,9 @@ def run_job(
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
-        `primitives`, `megabytes` of the model file, `seconds` of training, `peak_mib` of GPU memory (torch's),
-        `train_psnr` and `zoom_psnr` of nexwarp; `together`, the rows and iterations of its beginning, if any; the
-        metrics by view; device, date and commit.
+        `primitives`, `megabytes` of the model file, `seconds` of training, `peak_mib` of GPU memory (torch's); of
+        nexwarp `removed_last`, the floaters that its last look took away, `train_psnr` and `zoom_psnr`; `together`, the
+        rows and iterations of its beginning, if any; the metrics by view; device, date and commit.
     """
     device = _device()
     scene = _scene(data / job.scene, job.variant, job.downscale)
@@ -205,6 +205,9 @@ def _train_nexwarp(
     if beginning is not None:
         _go_on(trainer, beginning.folder)
         shared = {"together": {"rows": beginning.rows, "iterations": beginning.iterations}}
+    # The last look for floaters is part of the last iteration.
+    trainer.run(until=trainer.config.iterations - 1)
+    before = len(trainer.surfels)
     trainer.run()
     model = trainer.finish()
     with tempfile.TemporaryDirectory() as temporary:
@@ -215,6 +218,7 @@ def _train_nexwarp(
         megabytes = save_model(folder, model).stat().st_size / 1e6
     facts = {
         "primitives": len(trainer.surfels),
+        "removed_last": before - len(trainer.surfels),
         "megabytes": megabytes,
         "seconds": trainer.seconds,
         "train_psnr": _train_psnr(trainer),

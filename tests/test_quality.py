@@ -198,6 +198,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(found["views"]) == {view.name for view in nw.load_scene(folder / "tiny").test}
     mean = sum(view["psnr"] for view in found["views"].values()) / len(found["views"])
     assert found["psnr"] == pytest.approx(mean) and found["primitives"] <= 60 and found["flip"] > 0
+    assert found["removed_last"] == 0
     assert len(list((tmp_path / "pictures").iterdir())) == len(found["views"])
     (model,) = (tmp_path / "models").glob("*/model.safetensors")
     assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
