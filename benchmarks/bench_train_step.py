@@ -1,5 +1,9 @@
-"""One default training step, in the middle of a run: degree 3, blended errors watched, all losses, Adam."""
+"""One default training step, in the middle of a run: degree 3, blended errors watched, all losses, Adam.
 
+And one of the looks for floaters, which come every so often once densification is over.
+"""
+
+import math
 import sys
 import time
 
@@ -13,6 +17,7 @@ from benchmarks.timing import Measurement, figure, synchronize
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene as Photos
 from nexwarp.data import View
+from nexwarp.floaters import LOOKS, floaters, nearest_depth
 from nexwarp.metrics import to_uint8
 from nexwarp.trainer import Trainer
 
@@ -43,7 +48,21 @@ def step(scene: Scene, options: Options) -> list[Measurement]:
     rate = count / (time.perf_counter() - start)
     note = f"{count} steps in a row, density control included as it falls due. {scene.note}".strip()
     facts = scene.facts | {"note": note}
-    return [one, figure("training rate", rate, options.device, unit="it/s", **facts)]
+    return [one, figure("training rate", rate, options.device, unit="it/s", **facts), look(scene, trainer, options)]
+
+
+def look(scene: Scene, trainer: Trainer, options: Options) -> Measurement:
+    """Time what the trainer does to find floaters, in all of the training views and as many between or more."""
+    cameras = [view.camera for view in trainer.scene.train]
+    nearest = [nearest_depth(view, trainer.scene.points) for view in trainer.scene.train]
+    render_options = trainer.render_options()
+
+    def find() -> None:
+        floaters(trainer.surfels, cameras, nearest, torch.Generator().manual_seed(0), options=render_options)
+
+    views = len(cameras) * (1 + math.ceil(LOOKS / len(cameras)))
+    facts = scene.facts | {"note": f"{views} small views. {scene.note}".strip()}
+    return options.time("look for floaters", find, **facts)
 
 
 def make_trainer(scene: Scene, options: Options) -> Trainer:
@@ -74,13 +93,14 @@ def photos(scene: Scene, options: Options) -> Photos:
     if not images:
         moved = scene.to(options.device)
         images = [to_uint8(nw.render(moved.surfels, None, camera).image).cpu() for camera in moved.cameras]
-    views = [
-        View(camera.to("cpu"), image, None, f"{i:03d}")
-        for i, (camera, image) in enumerate(zip(cameras, images, strict=True))
-    ]
     generator = torch.Generator().manual_seed(3)
     chosen = torch.randperm(len(scene.surfels), generator=generator)[:POINTS]
     points = scene.surfels.means.detach().cpu()[chosen]
+    # With points of its own a view has depths to compare and an exposure, as photos have.
+    views = [
+        View(camera.to("cpu"), image, None, f"{i:03d}", points=points)
+        for i, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
     centers = torch.stack([camera.position for camera in cameras]).cpu()
     return Photos(
         train=views,
