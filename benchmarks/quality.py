@@ -15,6 +15,8 @@ training count when it ran alone (`--jobs 1`).
 
 import argparse
 import dataclasses
+import gc
+import hashlib
 import json
 import os
 import statistics
@@ -33,10 +35,21 @@ from typing import Any
 import torch
 
 from benchmarks.quality_rows import DEFAULT, ROWS, SCENES, TABLES, Job, Row, config_of, jobs_of, together
-from benchmarks.quality_tables import DIGITS, METRICS, UNITS, curves_of, differences, markdown, read_results, summary
+from benchmarks.quality_tables import (
+    DIGITS,
+    METRICS,
+    UNITS,
+    curves_of,
+    differences,
+    drop_unfinished,
+    markdown,
+    read_results,
+    summary,
+)
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
+from nexwarp.config import Config
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
@@ -147,13 +160,16 @@ def run_job(
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
-        `primitives`, `megabytes` of the model file, `seconds` of training, `peak_mib` of GPU memory (torch's); of
-        nexwarp `removed_last`, the floaters that its last look took away, `train_psnr` and `zoom_psnr`; `together`, the
-        rows and iterations of its beginning, if any; the metrics by view; device, date and commit.
+        `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the trained model, `peak_mib` of
+        GPU memory (torch's); of nexwarp `config`, which tells its settings apart, `removed_last`, the floaters that its
+        last look took away, `train_psnr` and `zoom_psnr`; `together`, the rows and iterations of its beginning, if any;
+        the metrics by view; device, date and commit.
     """
     device = _device()
     scene = _scene(data / job.scene, job.variant, job.downscale)
     if device.type == "cuda":
+        gc.collect()  # what the training before it in this process held
+        torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     if row.preset is None:
         pictured, facts = _train_gsplat(job, scene, device)
@@ -164,11 +180,13 @@ def run_job(
     views = {}
     for view, image in pictured:
         photo = to_uint8(view.image)
+        # FLIP and LPIPS know no masks: what does not count is as it should be.
+        whole = image if view.mask is None else torch.where(view.mask[..., None], image, photo)
         views[view.name] = {
-            "psnr": psnr(image, photo),
-            "ssim": ssim(image, photo),
-            "flip": flip(image, photo),
-            "lpips": lpips_vgg(image.to(device), photo.to(device)),
+            "psnr": psnr(image, photo, view.mask),
+            "ssim": ssim(image, photo, view.mask),
+            "flip": flip(whole, photo),
+            "lpips": lpips_vgg(whole.to(device), photo.to(device)),
         }
         if pictures is not None:
             name = f"{_name(job)}-{Path(view.name).stem}"
@@ -200,15 +218,18 @@ def _name(job: Job) -> str:
 def _train_nexwarp(
     job: Job, row: Row, scene: Scene, device: torch.device, models: Path | None, beginning: Beginning | None
 ) -> tuple[Any, dict]:
+    start = time.perf_counter()
     trainer = Trainer(scene, config_of(job, row), device)
     shared = {}
     if beginning is not None:
         _go_on(trainer, beginning.folder)
         shared = {"together": {"rows": beginning.rows, "iterations": beginning.iterations}}
+    begun = trainer.seconds  # of the beginning
     # The last look for floaters is part of the last iteration.
     trainer.run(until=trainer.config.iterations - 1)
     before = len(trainer.surfels)
     trainer.run()
+    seconds = begun + time.perf_counter() - start
     model = trainer.finish()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -220,7 +241,8 @@ def _train_nexwarp(
         "primitives": len(trainer.surfels),
         "removed_last": before - len(trainer.surfels),
         "megabytes": megabytes,
-        "seconds": trainer.seconds,
+        "seconds": seconds,
+        "config": config_name(trainer.config),
         "train_psnr": _train_psnr(trainer),
         "zoom_psnr": _zoom_psnr(trainer),
         **shared,
@@ -228,6 +250,12 @@ def _train_nexwarp(
     with torch.no_grad():
         pictured = [(view, to_uint8(_image(trainer, view.camera, device)).cpu()) for view in scene.test]
     return pictured, facts
+
+
+def config_name(config: Config) -> str:
+    """The same for the same settings, whatever the seed."""
+    settings = {name: value for name, value in config.as_dict().items() if name != "seed"}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _go_on(trainer: Trainer, folder: Path) -> None:
@@ -321,14 +349,25 @@ def train(given: argparse.Namespace) -> int:
     for text in given.row or ():
         # NAME:PRESET:SETTINGS, for trying things out.
         name, base, settings = text.split(":", 2)
-        rows[name] = Row(name, base or "default", json.loads(settings or "{}")) if base != "gsplat" else Row(name, None)
+        row = Row(name, base or "default", json.loads(settings or "{}")) if base != "gsplat" else Row(name, None)
+        if rows.setdefault(name, row) != row:
+            raise ValueError(f"--row: expected a name that no other row has, got {name}")
         for scene in scenes:
             for seed in seeds:
                 wanted[Job(scene, given.variant, name, given.size, seed, given.iterations, given.downscale)] = None
-    have = read_results([given.out])
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    have = {}
+    if given.out.exists():
+        if drop_unfinished(given.out):
+            print(f"{given.out}: its last line was unfinished and is cut off")
+        have = read_results([given.out])
+    for job in wanted.keys() & have.keys():
+        before, row = have[job].get("config"), rows[job.row]
+        if before and row.preset is not None and before != config_name(config_of(job, row)):
+            told = f"{job.scene} {job.row} {job.size} seed {job.seed} with the settings of today"
+            raise ValueError(f"{given.out}: expected {told}, got others ({have[job]['commit']}): give another --out")
     jobs = [job for job in wanted if job not in have]
     print(f"{len(jobs)} of {len(wanted)} trainings to do")
-    given.out.parent.mkdir(parents=True, exist_ok=True)
     failed = 0
     with tempfile.TemporaryDirectory() as beginnings, ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
         waiting: dict[Future, list[Job]] = {}
@@ -408,7 +447,9 @@ def curve(given: argparse.Namespace) -> int:
         label = "nexwarp" if name == DEFAULT.name else name
         axes.errorbar(sizes, means, yerr=spreads, marker="o", capsize=3, label=label)
     sizes = sorted({size for points in curves.values() for size, _, _ in points})
-    axes.set(xscale="log", xlabel="primitives", ylabel=UNITS[given.metric], title=given.scene)
+    better = "lower is better" if given.metric in ("flip", "lpips") else "higher is better"
+    axes.set(xscale="log", xlabel="primitives", ylabel=f"{UNITS[given.metric]}, {better}")
+    axes.set_title(f"{given.scene}, test views; bars: standard deviation over seeds", fontsize="medium")
     axes.set_xticks(sizes, [f"{size // 1000}K" for size in sizes])
     axes.minorticks_off()
     axes.grid(alpha=0.3)
@@ -430,9 +471,13 @@ def main(arguments: list[str] | None = None) -> int:
     training.add_argument("--only", help="comma-separated rows of the tables; default: all of them")
     training.add_argument("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
     training.add_argument("--variant", default="", choices=("", *VARIANTS), help="of the scene, for --row")
-    training.add_argument("--scenes", default=",".join(SCENES), help="default: %(default)s")
+    training.add_argument(
+        "--scenes", default=",".join(SCENES), help="default: %(default)s; curve, arc and frames are of fox alone"
+    )
     training.add_argument("--seeds", default="0,1", help="default: %(default)s")
-    training.add_argument("--size", type=int, default=40_000, help="budget of primitives (default: %(default)s)")
+    training.add_argument(
+        "--size", type=int, default=40_000, help="budget of primitives (default: %(default)s), but for the curve"
+    )
     training.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
     training.add_argument("--downscale", type=int, default=1, help="reduce photos by (default: %(default)s)")
     training.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")

@@ -17,23 +17,52 @@ DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4}
 
 
 def read_results(paths: Iterable[Path]) -> dict[Job, dict[str, Any]]:
-    """Results by job; of two for one job the later counts."""
+    """Results by job; of two for one job the later counts.
+
+    Raises:
+        FileNotFoundError: a file is not there.
+        ValueError: a line is not the result of a training; the message names file and line.
+    """
     defaults = {f.name: f.default for f in dataclasses.fields(Job)}  # older lines lack what came later
     found = {}
     for path in paths:
-        if path.exists():
-            for line in path.read_text().splitlines():
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            try:
                 result = json.loads(line)
-                found[Job(**{name: result.get(name, default) for name, default in defaults.items()})] = result
+                job = Job(**{name: result.get(name, default) for name, default in defaults.items()})
+                complete = "psnr" in result and all(x is not dataclasses.MISSING for x in vars(job).values())
+            except (ValueError, AttributeError):
+                complete = False
+            if not complete:
+                raise ValueError(f"{path}, line {number}: expected the JSON of a training, got {line[:60]!r}")
+            found[job] = result
     return found
+
+
+def drop_unfinished(path: Path) -> bool:
+    """Cut off a last line that a killed program left unfinished; return whether there was one."""
+    text = path.read_bytes()
+    end = text.rfind(b"\n") + 1
+    if end == len(text):
+        return False
+    try:
+        json.loads(text[end:])
+    except ValueError:
+        with path.open("r+b") as file:
+            file.truncate(end)
+        return True
+    with path.open("ab") as file:  # whole but for its end
+        file.write(b"\n")
+    return False
 
 
 def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
     """Results with seeds together, by scene, variant, downscale, size and length, best PSNR first.
 
     Each has the settings that differ from its preset, the seeds, and, by figure, [mean, standard deviation] over those
-    that have it, None without any: the metrics, `megabytes`, and `seconds`, `rate` (it/s) and `peak_mib` of trainings
-    that ran alone. The standard deviation of one is None.
+    that have it, None without any: the metrics, `train_psnr`, `zoom_psnr`, `megabytes`, and `seconds`, `rate` (it/s)
+    and `peak_mib` of trainings that ran alone. The standard deviation of one is None. `commits` and `configs` are those
+    of its trainings: where there is more than one of the latter, their settings were not the same.
     """
     groups: dict[tuple, list[tuple[Job, dict[str, Any]]]] = {}
     for job, result in results.items():
@@ -44,6 +73,7 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
         each = [result for _, result in found]
         alone = [result for result in each if result.get("jobs") == 1]
         figures = {metric: [r[metric] for r in each] for metric in METRICS}
+        figures |= {name: [r.get(name) for r in each] for name in ("train_psnr", "zoom_psnr")}
         figures["megabytes"] = [r["megabytes"] for r in each]
         figures["seconds"] = [r["seconds"] for r in alone]
         figures["rate"] = [iterations / r["seconds"] for r in alone]
@@ -52,6 +82,7 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
         what |= {"size": size, "iterations": iterations, "row": name}
         known = {"settings": each[0]["settings"], "seeds": sorted(job.seed for job, _ in found)}
         known["commits"] = sorted({r["commit"] for r in each})
+        known["configs"] = sorted({r["config"] for r in each if r.get("config")})
         rows.append(what | known | {figure: _spread(values) for figure, values in figures.items()})
 
     def order(row: dict[str, Any]) -> tuple:
@@ -72,8 +103,18 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     lines = ["# Quality", "", CONVENTION, ""]
     if any(row["lpips"] is None for row in rows):
         lines += ["LPIPS is left out where the weights of VGG could not be had.", ""]
-    columns = [*(UNITS[m] for m in METRICS), "MB", "s", "it/s", "MiB", "seeds"]
-    digits = DIGITS | {"megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
+    if any(row["flip"] is None for row in rows):
+        lines += ["FLIP is left out where flip-evaluator was not installed.", ""]
+    lines += [
+        "Mean +- standard deviation over seeds. FLIP and LPIPS: lower is better. train: PSNR of every 8th training "
+        "view. zoom: the middles of the test views at 4 times the focal length, reduced by 4 again, against the "
+        "rendering itself. s, it/s, MiB: of trainings that ran alone.",
+        "",
+    ]
+    if mixed := [row["row"] for row in rows if len(row["configs"]) > 1]:
+        lines += [f"Trained with more than one set of settings: {', '.join(dict.fromkeys(mixed))}.", ""]
+    columns = [*(UNITS[m] for m in METRICS), "train [dB]", "zoom [dB]", "MB", "s", "it/s", "MiB", "seeds", "commits"]
+    digits = DIGITS | {"train_psnr": 2, "zoom_psnr": 1, "megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
     title = ""
     for row in rows:
         variant = f", {row['variant']}" if row["variant"] else ""
@@ -83,9 +124,11 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
             lines += ["|---" * (len(columns) + 1) + "|"]
             title = here
         cells = [_cell(row[figure], digits[figure]) for figure in digits]
-        lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {len(row['seeds'])} |")
+        last = f"{len(row['seeds'])} | {', '.join(row['commits'])}"
+        lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {last} |")
     for group in differences(results, against):
         lines += ["", f"## Mean of the scenes less that of {against}{_extent(group)}", ""]
+        lines += ["+- is the standard error that follows from the seeds' spread.", ""]
         lines += [f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
         for row in group["rows"]:
             cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]

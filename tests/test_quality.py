@@ -12,7 +12,7 @@ import nexwarp as nw
 from benchmarks import quality
 from benchmarks.quality import ARC, VARIANTS, arc, moved
 from benchmarks.quality_rows import GSPLAT, ROWS, TABLES, Job, Row, jobs_of, together
-from benchmarks.quality_tables import curves_of, differences, markdown, read_results, summary
+from benchmarks.quality_tables import curves_of, differences, drop_unfinished, markdown, read_results, summary
 from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
@@ -86,18 +86,48 @@ def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
     file = tmp_path / "results.jsonl"
     del lines[-1]["downscale"]  # as before there was such a thing
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    results = read_results([file, tmp_path / "absent.jsonl"])
+    results = read_results([file])
     assert len(results) == 3
+    with pytest.raises(FileNotFoundError, match=r"absent\.jsonl"):
+        read_results([file, tmp_path / "absent.jsonl"])
     text = markdown(results)
     rows = [line for line in text.splitlines() if line.startswith(("| default", f"| {GSPLAT}"))]
     assert rows[0].startswith(f"| {GSPLAT} | 33.00 |")
-    assert (
-        rows[1]
-        == "| default | 30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  | 2.0 +- 0.0 | 5 +- 0 | 20.0 +- 0.0 | "
-        "100 +- 0 | 2 |"
-    )
+    figures = "30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  |  |  | 2.0 +- 0.0"
+    assert rows[1] == f"| default | {figures} | 5 +- 0 | 20.0 +- 0.0 | 100 +- 0 | 2 | abc |"
     assert "## fox, 40 primitives, 100 iterations" in text
     assert "LPIPS is left out where the weights of VGG could not be had." in text
+
+
+def test_rows_of_several_settings_are_told() -> None:
+    jobs = [Job("fox", "", "default", 40, seed, 100) for seed in (0, 1)]
+    lines = [result("default", seed, config=f"c{seed}", commit=f"d{seed}", flip=None) for seed in (0, 1)]
+    text = markdown(dict(zip(jobs, lines, strict=True)))
+    assert "Trained with more than one set of settings: default." in text and "| 2 | d0, d1 |" in text
+    assert "FLIP is left out where flip-evaluator was not installed." in text
+    assert "more than one set" not in markdown({jobs[0]: lines[0]})
+
+
+@pytest.mark.parametrize("line", ['{"scene": "fox"', "{}", "[1]", '{"scene": "fox", "psnr": 1.0}', ""])
+def test_a_line_that_is_no_result_is_named(tmp_path: Path, line: str) -> None:
+    file = tmp_path / "results.jsonl"
+    file.write_text(json.dumps(result("default", 0)) + "\n" + line + "\n" + json.dumps(result("default", 1)) + "\n")
+    with pytest.raises(ValueError, match=r"results\.jsonl, line 2: expected the JSON of a training, got"):
+        read_results([file])
+
+
+def test_a_last_line_that_was_not_finished_is_cut_off(tmp_path: Path) -> None:
+    file = tmp_path / "results.jsonl"
+    whole = json.dumps(result("default", 0)) + "\n"
+    for text, dropped, left in (
+        (whole, False, whole),
+        (whole + '{"scene": "fo', True, whole),
+        (whole[:-1], False, whole),  # by hand
+        ("", False, ""),
+        ('{"sc', True, ""),
+    ):
+        file.write_text(text)
+        assert drop_unfinished(file) == dropped and file.read_text() == left
 
 
 def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None:
@@ -198,7 +228,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(found["views"]) == {view.name for view in nw.load_scene(folder / "tiny").test}
     mean = sum(view["psnr"] for view in found["views"].values()) / len(found["views"])
     assert found["psnr"] == pytest.approx(mean) and found["primitives"] <= 60 and found["flip"] > 0
-    assert found["removed_last"] == 0
+    assert found["removed_last"] == 0 and found["config"] != quality.config_name(preset("default"))
     assert len(list((tmp_path / "pictures").iterdir())) == len(found["views"])
     (model,) = (tmp_path / "models").glob("*/model.safetensors")
     assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
@@ -206,6 +236,16 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert quality.main(command) == 0
     assert "0 of 1 trainings to do" in capsys.readouterr().out
     assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 1
+    with (tmp_path / "out.jsonl").open("a") as file:
+        file.write('{"scene": "ti')  # killed
+    assert quality.main(command) == 0
+    assert "out.jsonl: its last line was unfinished and is cut off\n0 of 1" in capsys.readouterr().out
+    changed = [word.replace("1024", "2048") for word in command]
+    expected = r"out\.jsonl: expected tiny mine 60 seed 0 with the settings of today, got others \(.*\): give another"
+    with pytest.raises(ValueError, match=expected):
+        quality.main(changed)
+    with pytest.raises(ValueError, match="--row: expected a name that no other row has, got no gamma"):
+        quality.main([word.replace("mine:", "no gamma:") for word in command])
     assert quality.main(["table", str(tmp_path / "out.jsonl"), "--out", str(tmp_path / "table.md")]) == 0
     text = (tmp_path / "table.md").read_text()
     assert "| mine |" in text and "## tiny, photos reduced by 2, 60 primitives, 4 iterations" in text
@@ -253,7 +293,7 @@ def test_a_training_from_a_common_beginning_is_the_training(
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
-    differ = {"2 hits": {}, "3 hits": {"max_hits": 3}, "floaters left": {"densify.floaters": False}}
+    differ = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
     rows = {name: settings | small for name, settings in differ.items()}
     command = ["train", "--scenes", "tiny", "--seeds", "1", "--size", "60", "--iterations", "12", "--data", str(folder)]
     command += ["--out", str(out), "--models", str(models)]
