@@ -11,7 +11,7 @@ import torch
 import nexwarp as nw
 from benchmarks import quality
 from benchmarks.quality import ARC, VARIANTS, arc, moved
-from benchmarks.quality_rows import GSPLAT, ROWS, TABLES, Job, Row, jobs_of, together
+from benchmarks.quality_rows import GSPLAT, ROWS, SCENES, TABLES, Job, Row, jobs_of, together
 from benchmarks.quality_tables import curves_of, differences, drop_unfinished, markdown, read_results, summary
 from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
@@ -359,23 +359,78 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
     assert not (tmp_path / "no.png").exists()
 
 
+A_MEAN = r"\d+\.\d\d \+- \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
+A_DIFFERENCE = r"[+-]\d+\.\d\d \+- \d\.\d\d, [+-]0\.\d{4} \+- 0\.\d{4}, [+-]0\.\d{4} \+- 0\.\d{4}"
+
+
+def kept(name: str) -> dict[str, set[tuple]]:
+    """Of which trainings a figure of a document is: (scene, variant, size, row), or (row, against) of a difference."""
+    results = read_results([quality.ROOT / "benchmarks" / "results" / f"{name}.jsonl"])
+    found: dict[str, set[tuple]] = {}
+    for row in summary(results):
+        (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
+        if spread is not None:
+            text = f"{figure:.2f} +- {spread:.2f}, {similarity:.4f}, {error:.4f}"
+            found.setdefault(text, set()).add((row["scene"], row["variant"], row["size"], row["row"]))
+    for against in ("default", "floaters left"):
+        for row in (row for group in differences(results, against) for row in group["rows"]):
+            if row["psnr"][1] is not None:
+                each = [(row[metric], digits) for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
+                text = ", ".join(f"{mean:+.{digits}f} +- {error:.{digits}f}" for (mean, error), digits in each)
+                found.setdefault(text, set()).add((row["row"], against))
+    return found
+
+
+def page(name: str) -> str:
+    return (quality.ROOT / name).read_text(encoding="utf-8")
+
+
+def tables_of(text: str) -> list[list[list[str]]]:
+    """Cells of the lines of Markdown's tables, without the line below the header."""
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    return [
+        [[cell.strip() for cell in line.split("|")[1:-1]] for line in t.splitlines() if "|---" not in line]
+        for t in tables
+    ]
+
+
 def test_the_documents_figures_are_those_of_the_kept_trainings() -> None:
     """Means with their spreads, and differences with their errors; a document is not older than its results."""
-    kept = set()
-    for name in ("quality", "quality_small"):
-        results = read_results([quality.ROOT / "benchmarks" / "results" / f"{name}.jsonl"])
-        for row in summary(results):
-            (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
-            if spread is not None:
-                kept.add(f"{figure:.2f} +- {spread:.2f}, {similarity:.4f}, {error:.4f}")
-        for against in ("default", "floaters left"):
-            for row in (row for group in differences(results, against) for row in group["rows"]):
-                if row["psnr"][1] is not None:
-                    each = [(row[metric], digits) for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
-                    kept.add(", ".join(f"{mean:+.{digits}f} +- {error:.{digits}f}" for (mean, error), digits in each))
-    a_mean = r"\d+\.\d\d \+- \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
-    a_difference = r"[+-]\d+\.\d\d \+- \d\.\d\d, [+-]0\.\d{4} \+- 0\.\d{4}, [+-]0\.\d{4} \+- 0\.\d{4}"
-    for page, least in (("README.md", 15), ("docs/quality.md", 35), ("benchmarks/NOTES.md", 50)):
-        shown = re.findall(f"{a_mean}|{a_difference}", (quality.ROOT / page).read_text(encoding="utf-8"))
-        assert len(shown) >= least, f"{page}: the tables' figures are written otherwise"
-        assert not (wrong := [figures for figures in shown if figures not in kept]), f"{page}: {wrong}"
+    known = kept("quality").keys() | kept("quality_tried").keys() | kept("quality_small").keys()
+    for name, least in (("README.md", 15), ("docs/quality.md", 40), ("benchmarks/NOTES.md", 50)):
+        shown = re.findall(f"{A_MEAN}|{A_DIFFERENCE}", page(name))
+        assert len(shown) >= least, f"{name}: the tables' figures are written otherwise"
+        assert not (wrong := [figures for figures in shown if figures not in known]), f"{name}: {wrong}"
+
+
+def test_the_readme_gives_each_scene_its_own_figures() -> None:
+    figures, lines = kept("quality"), 0
+    for cells in (cells for table in tables_of(page("README.md")) for cells in table):
+        if name := re.fullmatch(rf"({'|'.join(SCENES)}), ([\d,]+)", cells[0]):
+            scene, size = name[1], int(name[2].replace(",", ""))
+            for row, cell in (("default", cells[1]), (GSPLAT, cells[3])):
+                assert (scene, "", size, row) in figures[cell], f"{cells[0]}: {row} has not {cell}"
+            lines += 1
+    assert lines >= 9
+
+
+def test_the_tables_of_quality_md_give_each_row_its_own_figures() -> None:
+    figures, checked = kept("quality"), 0
+    for header, *lines in tables_of(page("docs/quality.md")):
+        left = any(cells[0] == "default but floaters left" for cells in lines)
+        names = {"default, K = 2": "default", "default but floaters left": "floaters left"}
+        for cells in lines:
+            row = names.get(cells[0], re.sub(r" \(.*", "", cells[0]) + (", floaters left" if left else ""))
+            for column, cell in zip(header[1:], cells[1:], strict=True):
+                if column in SCENES:
+                    assert (column, "", 10_000, row) in figures[cell], f"{column}: {row} has not {cell}"
+                elif re.fullmatch(A_DIFFERENCE, cell):
+                    against = "floaters left" if left else "default"
+                    assert (row, against) in figures[cell], f"{row} less {against} is not {cell}"
+                elif cells[0] in SCENES and re.fullmatch(A_MEAN, cell):
+                    preset = "paper" if "preset paper" in column else "default"
+                    assert (cells[0], "", 40_000, preset) in figures[cell], f"{cells[0]}: {preset} has not {cell}"
+                else:
+                    continue
+                checked += 1
+    assert checked >= 40
