@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import config
+from nexwarp import config, floaters
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
 from tests import beside as beside_others
@@ -73,7 +73,16 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iterator[None]:
+def few_looks() -> Iterator[None]:
+    """Looks for floaters are few: those at the end of a training take a second, which few tests are about."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(floaters, "LOOKS", 6)
+        patch.setattr(floaters, "LAST_LOOKS", 12)
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_preset(request: pytest.FixtureRequest, one_torch_thread: None, few_looks: None) -> Iterator[None]:
     """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(config.PRESETS, "default", request.module.SMALL)

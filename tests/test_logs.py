@@ -18,7 +18,7 @@ from nexwarp.densify import DensifyConfig
 from nexwarp.logs import LOG_FILE, TENSORBOARD_FOLDER, TrainingLog, keep_lines, peak_memory
 from nexwarp.trainer import Progress, Trainer
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 CONFIG = Config(
     iterations=12,

@@ -14,7 +14,7 @@ from nexwarp.trainer import Trainer
 from nexwarp.training_views import mean_color
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 

@@ -25,7 +25,7 @@ from nexwarp.trainer import Trainer
 from tests.reference.collect import rotations
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 FOX = Path(__file__).parents[2] / "shared" / "data" / "fox"
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)

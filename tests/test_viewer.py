@@ -33,7 +33,7 @@ from nexwarp.viewer.server import may_connect
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene, rigid
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 OPTIONS = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 3, "low_pass": False, "clamp_texture": False}
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
