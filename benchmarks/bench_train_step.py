@@ -3,7 +3,6 @@
 And one of the looks for floaters, which come every so often once densification is over.
 """
 
-import math
 import sys
 import time
 
@@ -17,7 +16,7 @@ from benchmarks.timing import Measurement, figure, synchronize
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene as Photos
 from nexwarp.data import View
-from nexwarp.floaters import LOOKS, floaters, nearest_depth
+from nexwarp.floaters import floaters, nearest_depth
 from nexwarp.metrics import to_uint8
 from nexwarp.trainer import Trainer
 
@@ -60,9 +59,7 @@ def look(scene: Scene, trainer: Trainer, options: Options) -> Measurement:
     def find() -> None:
         floaters(trainer.surfels, cameras, nearest, torch.Generator().manual_seed(0), options=render_options)
 
-    views = len(cameras) * (1 + math.ceil(LOOKS / len(cameras)))
-    facts = scene.facts | {"note": f"{views} small views. {scene.note}".strip()}
-    return options.time("look for floaters", find, **facts)
+    return options.time("look for floaters", find, **scene.facts)
 
 
 def make_trainer(scene: Scene, options: Options) -> Trainer:

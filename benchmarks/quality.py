@@ -51,7 +51,8 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
 from nexwarp.config import Config
 from nexwarp.data import Scene, View, load_scene
-from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
+from nexwarp.evaluate import METRICS as JUDGES
+from nexwarp.metrics import CONVENTION, psnr, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
 from nexwarp.render import render
 from nexwarp.trainer import Trainer
@@ -180,14 +181,7 @@ def run_job(
     views = {}
     for view, image in pictured:
         photo = to_uint8(view.image)
-        # FLIP and LPIPS know no masks: what does not count is as it should be.
-        whole = image if view.mask is None else torch.where(view.mask[..., None], image, photo)
-        views[view.name] = {
-            "psnr": psnr(image, photo, view.mask),
-            "ssim": ssim(image, photo, view.mask),
-            "flip": flip(whole, photo),
-            "lpips": lpips_vgg(whole.to(device), photo.to(device)),
-        }
+        views[view.name] = {name: judge(image, photo, view.mask) for name, judge in JUDGES.items()}
         if pictures is not None:
             name = f"{_name(job)}-{Path(view.name).stem}"
             strip = [photo, image, error_map(image, photo)]

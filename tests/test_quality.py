@@ -289,7 +289,7 @@ def test_a_training_from_a_common_beginning_is_the_training(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit: its surfels, its texture and its figures."""
-    monkeypatch.setattr(quality, "lpips_vgg", lambda *_: None)  # it warns where its weights are not
+    monkeypatch.setitem(quality.JUDGES, "lpips", lambda *_: None)  # it warns where its weights are not
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
