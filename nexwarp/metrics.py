@@ -15,9 +15,8 @@ CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
     "C2 = 0.03^2, mean over all pixels and channels. PSNR and SSIM only over the pixels that count, where there is a "
-    "mask. "
-    "LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the map. "
-    "A set's figure is the mean over its images."
+    "mask. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the "
+    "map. A set's figure is the mean over its images."
 )
 
 
