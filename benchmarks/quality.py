@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -38,6 +38,7 @@ from benchmarks.quality_rows import DEFAULT, ROWS, SCENES, TABLES, Job, Row, con
 from benchmarks.quality_tables import (
     DIGITS,
     METRICS,
+    OTHERS,
     UNITS,
     curves_of,
     differences,
@@ -51,6 +52,7 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
 from nexwarp.config import Config
 from nexwarp.data import Scene, View, load_scene
+from nexwarp.data.images import downscale_image, downscale_mask
 from nexwarp.evaluate import METRICS as JUDGES
 from nexwarp.metrics import CONVENTION, psnr, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
@@ -163,8 +165,8 @@ def run_job(
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the trained model, `peak_mib` of
         GPU memory (torch's); of nexwarp `config`, which tells its settings apart, `removed_last`, the floaters that its
-        last look took away, `train_psnr` and `zoom_psnr`; `together`, the rows and iterations of its beginning, if any;
-        the metrics by view; device, date and commit.
+        last look took away, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its
+        beginning, if any; the metrics by view; device, date and commit.
     """
     device = _device()
     scene = _scene(data / job.scene, job.variant, job.downscale)
@@ -239,6 +241,7 @@ def _train_nexwarp(
         "config": config_name(trainer.config),
         "train_psnr": _train_psnr(trainer),
         "zoom_psnr": _zoom_psnr(trainer),
+        "quarter_psnr": _quarter_psnr(scene, lambda camera: _image(trainer, camera, device)),
         **shared,
     }
     with torch.no_grad():
@@ -292,6 +295,20 @@ def _zoom_psnr(trainer: Trainer) -> float:
     return statistics.fmean(figures)
 
 
+@torch.no_grad()
+def _quarter_psnr(scene: Scene, image: Callable[[Camera], torch.Tensor]) -> float:
+    """Of the test views at a quarter of the size, as from farther away, against their photos reduced by 4."""
+    figures = []
+    for view in scene.test:
+        c, factor = view.camera, 4
+        K = c.K.clone()
+        K[:2] /= factor
+        small = to_uint8(image(Camera(c.viewmat, K, c.width // factor, c.height // factor, c.near))).cpu()
+        mask = None if view.mask is None else downscale_mask(view.mask, factor)
+        figures.append(psnr(small, downscale_image(to_uint8(view.image), factor), mask))
+    return statistics.fmean(figures)
+
+
 def _train_gsplat(job: Job, scene: Scene, device: torch.device) -> tuple[Any, dict]:
     from benchmarks import peer_gsplat
 
@@ -300,10 +317,14 @@ def _train_gsplat(job: Job, scene: Scene, device: torch.device) -> tuple[Any, di
     if device.type == "cuda":
         torch.cuda.synchronize()
     seconds = time.perf_counter() - start
+
+    def image(camera: Camera) -> torch.Tensor:
+        return gaussians.render(camera.to(device))[0]
+
     with torch.no_grad():
-        pictured = [(view, to_uint8(gaussians.render(view.camera.to(device))[0]).cpu()) for view in scene.test]
-    count = len(gaussians.splats["means"])
-    return pictured, {"primitives": count, "megabytes": gaussians.megabytes, "seconds": seconds}
+        pictured = [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
+    facts = {"primitives": len(gaussians.splats["means"]), "megabytes": gaussians.megabytes, "seconds": seconds}
+    return pictured, facts | {"quarter_psnr": _quarter_psnr(scene, image)}
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -400,7 +421,7 @@ def train(given: argparse.Namespace) -> int:
 def _told(job: Job, result: dict[str, Any]) -> str:
     """A training in a line."""
     facts = [f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None]
-    facts += [f"{k[:-5]} {result[k]:.2f} dB" for k in ("train_psnr", "zoom_psnr") if k in result]
+    facts += [f"{k[:-5]} {result[k]:.2f} dB" for k in OTHERS if k in result]
     facts.append(f"{result['seconds']:.0f} s")
     return f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {', '.join(facts)}"
 

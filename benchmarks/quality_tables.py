@@ -12,8 +12,11 @@ from benchmarks.quality_rows import DEFAULT, GSPLAT, Job
 from nexwarp.metrics import CONVENTION
 
 METRICS = ("psnr", "ssim", "flip", "lpips")
+OTHERS = ("train_psnr", "zoom_psnr", "quarter_psnr")
+COMPARED = (*METRICS, "quarter_psnr")
 UNITS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS"}
-DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4}
+UNITS |= {"train_psnr": "train [dB]", "zoom_psnr": "zoom [dB]", "quarter_psnr": "at 1/4 [dB]"}
+DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4, "train_psnr": 2, "zoom_psnr": 1, "quarter_psnr": 2}
 
 
 def read_results(paths: Iterable[Path]) -> dict[Job, dict[str, Any]]:
@@ -60,9 +63,9 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
     """Results with seeds together, by scene, variant, downscale, size and length, best PSNR first.
 
     Each has the settings that differ from its preset, the seeds, and, by figure, [mean, standard deviation] over those
-    that have it, None without any: the metrics, `train_psnr`, `zoom_psnr`, `megabytes`, and `seconds`, `rate` (it/s)
-    and `peak_mib` of trainings that ran alone. The standard deviation of one is None. `commits` and `configs` are those
-    of its trainings: where there is more than one of the latter, their settings were not the same.
+    that have it, None without any: the metrics, `train_psnr`, `zoom_psnr`, `quarter_psnr`, `megabytes`, and `seconds`,
+    `rate` (it/s) and `peak_mib` of trainings that ran alone. The standard deviation of one is None. `commits` and
+    `configs` are those of its trainings: where there is more than one of the latter, their settings were not the same.
     """
     groups: dict[tuple, list[tuple[Job, dict[str, Any]]]] = {}
     for job, result in results.items():
@@ -73,7 +76,7 @@ def summary(results: dict[Job, dict[str, Any]]) -> list[dict[str, Any]]:
         each = [result for _, result in found]
         alone = [result for result in each if result.get("jobs") == 1]
         figures = {metric: [r[metric] for r in each] for metric in METRICS}
-        figures |= {name: [r.get(name) for r in each] for name in ("train_psnr", "zoom_psnr")}
+        figures |= {name: [r.get(name) for r in each] for name in OTHERS}
         figures["megabytes"] = [r["megabytes"] for r in each]
         figures["seconds"] = [r["seconds"] for r in alone]
         figures["rate"] = [iterations / r["seconds"] for r in alone]
@@ -108,13 +111,14 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     lines += [
         "Mean +- standard deviation over seeds. FLIP and LPIPS: lower is better. train: PSNR of every 8th training "
         "view. zoom: the middles of the test views at 4 times the focal length, reduced by 4 again, against the "
-        "rendering itself. s, it/s, MiB: of trainings that ran alone.",
+        "rendering itself. at 1/4: test views rendered at a quarter of the size, against their photos reduced by 4. "
+        "s, it/s, MiB: of trainings that ran alone.",
         "",
     ]
     if mixed := [row["row"] for row in rows if len(row["configs"]) > 1]:
         lines += [f"Trained with more than one set of settings: {', '.join(dict.fromkeys(mixed))}.", ""]
-    columns = [*(UNITS[m] for m in METRICS), "train [dB]", "zoom [dB]", "MB", "s", "it/s", "MiB", "seeds", "commits"]
-    digits = DIGITS | {"train_psnr": 2, "zoom_psnr": 1, "megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
+    columns = [*UNITS.values(), "MB", "s", "it/s", "MiB", "seeds", "commits"]
+    digits = DIGITS | {"megabytes": 1, "seconds": 0, "rate": 1, "peak_mib": 0}
     title = ""
     for row in rows:
         variant = f", {row['variant']}" if row["variant"] else ""
@@ -129,9 +133,9 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     for group in differences(results, against):
         lines += ["", f"## Mean of the scenes less that of {against}{_extent(group)}", ""]
         lines += ["+- is the standard error that follows from the seeds' spread.", ""]
-        lines += [f"| | {' | '.join(UNITS[m] for m in METRICS)} | scenes |", "|---" * (len(METRICS) + 2) + "|"]
+        lines += [f"| | {' | '.join(UNITS[m] for m in COMPARED)} | scenes |", "|---" * (len(COMPARED) + 2) + "|"]
         for row in group["rows"]:
-            cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in METRICS]
+            cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in COMPARED]
             lines.append(f"| {row['row']} | {' | '.join(cells)} | {', '.join(row['scenes'])} |")
     return "\n".join([*lines, ""])
 
@@ -151,9 +155,9 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
 
     Returns:
         By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
-        best PSNR first, each with its `scenes` and, by metric, [difference, its standard error], None where a scene
-        lacks the metric. Each scene counts alike, with the means over its seeds; the error is that of the seeds'
-        spread, of their differences where each pair began together, None where a scene has one seed alone.
+        best PSNR first, each with its `scenes` and, by metric and for `quarter_psnr`, [difference, its standard error],
+        None where a scene lacks it. Each scene counts alike, with the means over its seeds; the error is that of the
+        seeds' spread, of their differences where each pair began together, None where a scene has one seed alone.
     """
     groups: dict[tuple, dict[str, dict[str, list[dict[str, Any]]]]] = {}
     for job, result in results.items():
@@ -168,7 +172,7 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
             both = [scene for scene in scenes if scene in base]
             if len(both) < 2:
                 continue
-            figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in METRICS}
+            figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in COMPARED}
             shown.append({"row": name, "scenes": sorted(both)} | {m: _mean_difference(x) for m, x in figures.items()})
         if shown:
             shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
@@ -180,10 +184,10 @@ def _difference(one: list[dict], two: list[dict], metric: str) -> tuple[float, f
     """Of two means over seeds, and its variance."""
     pairs = {result["seed"]: result for result in two}
     if all(_began_together(result, pairs.get(result["seed"])) for result in one):
-        values = [(result[metric], pairs[result["seed"]][metric]) for result in one]
+        values = [(result.get(metric), pairs[result["seed"]].get(metric)) for result in one]
         spread = None if any(None in x for x in values) else _spread(a - b for a, b in values)
         return spread and (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
-    spreads = [_spread(result[metric] for result in each) for each in (one, two)]
+    spreads = [_spread(result.get(metric) for result in each) for each in (one, two)]
     if None in spreads:
         return None
     (a, s), (b, t) = spreads
