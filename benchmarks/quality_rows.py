@@ -70,6 +70,7 @@ CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
     Row("texture from closer than seen", settings={"footprints": False}),
     Row("each photo's own exposure", settings={"exposures": False}),
+    Row("exposures by poses alone", settings={"metering": False}),
     Row("the lens's dark corners", settings={"vignetting": False}),
     Row("no look beyond the frame", settings={"border": 0.0}),
     Row("no depths of points", settings={"losses.depth": 0.0}),

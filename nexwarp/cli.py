@@ -543,7 +543,7 @@ def _exposures(model: Model) -> str:
         return "one for all photos"
     exposures = model.surfels.exposures
     gains, edge = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
-    told = f"of {len(gains):,} photos, {gains.min():.2f} to {gains.max():.2f} times the mean"
+    told = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean"
     return f"{told}; light at the edge: {edge:.0%}"
 
 

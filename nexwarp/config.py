@@ -106,6 +106,8 @@ class Config:
     """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
     exposures: bool = True
     """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
+    metering: bool = True
+    """With them, where the photos' cameras set their exposure by what they saw, renderings get what theirs would set."""
     vignetting: bool = True
     """With them, take the darkening of the lens towards the corners out, too."""
     mask_mode: str = "ignore"
@@ -331,6 +333,7 @@ PRESETS: dict[str, Config] = {
         depth_jitter=0.0,
         footprints=False,
         exposures=False,
+        metering=False,
         vignetting=False,
         clamp_image=True,
         filter_points=False,

@@ -6,7 +6,8 @@ learns the scene as at the mean exposure and through an even lens, and a renderi
 it and the falloff of the lens.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without any
 LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # of the kernel, over the spread of the cameras
 MOST_FALLOFFS = 16  # of different cameras, to be kept
 NOISES = (1e-3, 1e-2, 1e-1)  # variance of a photo's own deviation, over that of the process
+TINY = 1e-9  # squared error that is none
 
 
 class Exposures(nn.Module):
@@ -85,9 +87,9 @@ class Exposures(nn.Module):
         every = -(-len(cameras) // MOST_PHOTOS)
         positions, directions = (x[::every] for x in _poses(viewmats))
         gains = log_gains.double()[::every]
-        size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
-        squares = torch.cdist(*[torch.cat([positions, size * directions], 1)] * 2).square()
-        fits = [(*_fit(squares, gains, length * size, noise), length * size) for length in LENGTHS for noise in NOISES]
+        size, squares = _apart(positions, directions)
+        kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
+        fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
         _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
         return cls(*(x.float() for x in tensors), torch.tensor([float(x) for x in falloff or EVEN]))
@@ -136,15 +138,56 @@ def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
     return (1 + r) * torch.exp(-r)
 
 
-def _fit(
-    squares: torch.Tensor, values: torch.Tensor, length: torch.Tensor, noise: float
-) -> tuple[float, torch.Tensor, torch.Tensor]:
+def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Spread of cameras' positions (V, 3), and squares (V, V) of how far poses are apart."""
+    size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
+    return size, torch.cdist(*[torch.cat([positions, size * directions], 1)] * 2).square()
+
+
+def _fit(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[float, torch.Tensor, torch.Tensor]:
     """Fit a process to values (V, 3): its squared error on each from the others; coefficients (V, 3); mean (3,)."""
-    inverse = torch.linalg.inv(_matern(squares, length) + noise * torch.eye(len(values), dtype=values.dtype))
+    inverse = torch.linalg.inv(kernel + noise * torch.eye(len(values), dtype=values.dtype))
     mean = inverse.sum(0) @ values / inverse.sum()
     coefficients = inverse @ (values - mean)
     error = (coefficients / inverse.diagonal()[:, None]).square().sum().item()
     return round(error, 9), coefficients, mean
+
+
+def foretold(
+    log_gains: torch.Tensor,
+    cameras: Sequence[Camera],
+    brightness: torch.Tensor,
+    others: Sequence[Camera],
+    others_brightness: Callable[[], torch.Tensor],
+) -> torch.Tensor | None:
+    """Foretell other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
+
+    A process of the pose, as `Exposures`, and beside it linear in the brightness. None where that foretells each photo
+    from the others no better, by Akaike's criterion, than the pose alone.
+
+    Args:
+        log_gains: (V, 3) of photos.
+        cameras: of those.
+        brightness: (V, 3), logarithms, of what is before them.
+        others: M cameras.
+        others_brightness: gives (M, 3), likewise; not called where there is nothing to foretell.
+    """
+    values = log_gains.cpu().double()
+    here, there = (_poses(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))
+    size, squares = _apart(*here)
+    seen = brightness - brightness.mean(0)
+    poses = [(_matern(squares, length * size), length * size) for length in LENGTHS]
+    alone = min(_fit(kernel, values, noise)[0] for kernel, _ in poses for noise in NOISES)
+    # Slopes as large as the process is, a priori.
+    fits = [(*_fit(kernel + seen @ seen.T, values, noise), length) for kernel, length in poses for noise in NOISES]
+    error, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+    slopes = 3 * seen.shape[1]
+    if not values.numel() * math.log(max(alone, TINY) / max(error, TINY)) > 2 * slopes:
+        return None
+    points, more = (torch.cat([position, size * direction], 1) for position, direction in (here, there))
+    kernel = _matern(torch.cdist(more, points).square(), length)
+    found = mean + (kernel + (others_brightness() - brightness.mean(0)) @ seen.T) @ coefficients
+    return found.clamp(values.amin(0), values.amax(0)).round(decimals=DECIMALS)
 
 
 def photo_gains(

@@ -27,6 +27,7 @@ from nexwarp.exposures import Exposures, photo_gains
 from nexwarp.floaters import floaters, nearest_depth
 from nexwarp.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
+from nexwarp.metering import metered
 from nexwarp.render import Rendering, jitter_factors, render
 from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
@@ -383,10 +384,16 @@ class Trainer:
 
     def finish(self) -> Model:
         """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
-        self.surfels.exposures = None if self.exposures is None else self.exposures.to(self.device)
+        cameras, options = self.views.cameras, self.render_options()
+        self.surfels.exposures = self.surfels.footprints = None
         if self.config.footprints and self.config.max_hits:
-            cameras, options = self.views.cameras, self.render_options()
             self.surfels.footprints = seen_footprints(self.surfels, cameras, options=options)
+        if self.exposures is not None:
+            found = self.exposures
+            if self.config.metering:
+                texture = self.texture if self.config.max_hits else None
+                found = metered(found, self.surfels, texture, cameras, options=options)
+            self.surfels.exposures = found.to(self.device)
         return self.model()
 
     def model(self) -> Model:

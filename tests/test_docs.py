@@ -44,6 +44,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "background": ("", "code"),
     "footprints": ("", ""),
     "exposures": ("", ""),
+    "metering": ("", ""),
     "vignetting": ("", ""),
     "mask_mode": ("", ""),
     "border": ("", ""),

@@ -1,0 +1,78 @@
+"""Automatic exposure: what a camera elsewhere would have set, looking at the trained scene.
+
+A camera with automatic exposure sets its gains by how bright what it sees is. Where the training photos' gains follow
+the brightness that the trained scene has before their cameras, they tell those of other cameras better than the photos
+around do, most where photos are far: there are renderings to meter.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.exposures import MOST_PHOTOS, Exposures, foretold
+from nexwarp.paths import between, resized
+from nexwarp.render import render
+from nexwarp.surfels import Surfels
+from nexwarp.texture import NeuralTexture
+
+PLACES = 240  # between the cameras, that are metered, and as many as the photos at least; 1,000 in all at most
+HEIGHT = 64  # of the renderings that tell brightness, pixels
+LINEAR = 2.2  # sRGB to light, as an exponent
+DARKEST = 1e-3  # mean colour that is told from darker ones
+
+
+@torch.no_grad()
+def metered(
+    exposures: Exposures,
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    cameras: Sequence[Camera],
+    *,
+    options: dict[str, Any],
+) -> Exposures:
+    """Return exposures that know, beside the photos', the gains of places between them.
+
+    Those that were given come back where the scene's brightness tells the photos' gains no better than poses do, where
+    photos are few, and where they are so many that there is no room for more (1,000).
+
+    Args:
+        exposures: of the photos.
+        surfels: the trained ones.
+        texture: their texture, or None.
+        cameras: of all training views, on any device.
+        options: keyword arguments of `nexwarp.render`.
+    """
+    cameras = cameras[:: -(-len(cameras) // MOST_PHOTOS)]
+    if len(cameras) == MOST_PHOTOS:
+        return exposures
+    found = brightness(surfels, texture, cameras, options=options)
+    generator, places = torch.Generator().manual_seed(0), []
+    for _ in range(math.ceil(PLACES / len(cameras))):
+        places += between(cameras, [math.inf] * len(cameras), generator)
+    places = places[: MOST_PHOTOS - len(cameras)]
+    gains = exposures.log_gains
+    there = foretold(gains, cameras, found, places, lambda: brightness(surfels, texture, places, options=options))
+    if there is None:
+        return exposures
+    return Exposures.of(torch.cat([gains.cpu().double(), there]), [*cameras, *places], exposures.falloff.tolist())
+
+
+@torch.no_grad()
+def brightness(
+    surfels: Surfels, texture: NeuralTexture | None, cameras: Sequence[Camera], *, options: dict[str, Any]
+) -> torch.Tensor:
+    """Log mean colours (M, 3) float64, of light, that cameras see at the photos' mean exposure, on the CPU."""
+    kept, surfels.exposures = surfels.exposures, None
+    try:
+        found = []
+        for camera in cameras:
+            if camera.height > HEIGHT:
+                camera = resized(camera, max(round(camera.width * HEIGHT / camera.height), 1), HEIGHT)
+            image = render(surfels, texture, camera.to(surfels.device), **options).image
+            found.append(image.clamp(0, 1).double().pow(LINEAR).mean((0, 1)).pow(1 / LINEAR))
+    finally:
+        surfels.exposures = kept
+    return torch.stack(found).clamp_min(DARKEST).log().cpu()
