@@ -208,7 +208,7 @@ def _model(folder: Path) -> list[Files]:
     meta = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 1, "low_pass": False, "clamp_texture": False}
     surfels = _surfels()
     save_model(folder / "a", Model(surfels, texture, {**meta, "near": 0.01, "scene_scale": 1.5, "preset": "default"}))
-    surfels.footprints = torch.ones(5)
+    surfels.footprints, surfels.far_footprints = torch.ones(5), torch.full((5,), 2.0)
     save_model(folder / "b", Model(surfels, texture, meta))
     return [_files(folder / "a"), _files(folder / "b")]
 

@@ -32,6 +32,7 @@ READ_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, Recursi
 DTYPES = ("F16", "F32")
 LARGEST_COLOR, LARGEST_LENGTH = 1e6, 1e15
 ROUNDING = 1 + 1e-6
+FOOTPRINTS = ("footprints", "far_footprints")
 RENDER_OPTIONS = ("max_hits", "background", "sh_degree", "low_pass", "clamp_texture")
 
 
@@ -69,8 +70,9 @@ def save_model(folder: str | os.PathLike[str], model: Model) -> Path:
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     for name, x in model.texture.state_dict().items():
         tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
-    if model.surfels.footprints is not None:
-        tensors["footprints"] = model.surfels.footprints
+    for name in FOOTPRINTS:
+        if (values := getattr(model.surfels, name)) is not None:
+            tensors[name] = values
     if model.surfels.exposures is not None:
         tensors |= {f"exposures.{name}": x for name, x in model.surfels.exposures.tensors().items()}
     tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
@@ -109,9 +111,10 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     try:
         surfels = Surfels({name[8:]: x.float() for name, x in tensors.items() if name.startswith("surfels.")})
-        if "footprints" in tensors:
-            check_tensors({"footprints": (tensors["footprints"], (len(surfels),))}, dtype=torch.float32)
-            surfels.footprints = tensors["footprints"]
+        for name in FOOTPRINTS:
+            if name in tensors:
+                check_tensors({name: (tensors[name], (len(surfels),))}, dtype=torch.float32)
+                setattr(surfels, name, tensors[name])
         if exposures := {name[10:]: x.float() for name, x in tensors.items() if name.startswith("exposures.")}:
             surfels.exposures = Exposures(**exposures)
         for name, x in tensors.items():

@@ -103,11 +103,12 @@ class Config:
     background: tuple[float, float, float] | None = None
     """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
     footprints: bool = True
-    """Show what is looked at from closer than in training with the detail of then, and what was not seen without."""
+    """Show what is looked at from closer or farther than in training with the detail of then and without aliasing, and
+    what was not seen without detail."""
     exposures: bool = True
     """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
     metering: bool = True
-    """With them, where the photos' cameras set their exposure by what they saw, renderings get what theirs would set."""
+    """With them, where cameras set their exposure by what they saw, renderings get what theirs would set."""
     vignetting: bool = True
     """With them, take the darkening of the lens towards the corners out, too."""
     mask_mode: str = "ignore"

@@ -20,21 +20,34 @@ ALPHA_MIN = 1.0 / 255.0  # weights below this are not seen in 8 bits
 
 
 @torch.no_grad()
-def seen_footprints(surfels: Surfels, cameras: Iterable[Camera], *, options: dict[str, Any]) -> torch.Tensor:
-    """Return each surfel's `footprints` (N,): depth / focal of the closest textured hit of some views.
+def seen_footprints(
+    surfels: Surfels, cameras: Iterable[Camera], *, options: dict[str, Any]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return each surfel's `footprints` and `far_footprints`: depth / focal of some views' looks at its texture.
 
     Args:
-        surfels: the surfels.
+        surfels: the surfels, without footprints of their own.
         cameras: of the training views.
-        options: keyword arguments of `nexwarp.render`.
+        options: keyword arguments of `nexwarp.render`; a K of 0 counts as 1.
+
+    Returns:
+        (N,) of the closest textured hit, NEVER without any; (N,) of the farthest one, or of the centre in those views;
+        without any hit, of the centre in all views that it is in front of, NEVER without those either.
     """
-    found = surfels.means.new_full((len(surfels),), NEVER)
+    options = options | {"max_hits": max(options["max_hits"], 1)}
+    closest = surfels.means.new_full((len(surfels),), NEVER)
+    farthest, front = torch.zeros_like(closest), torch.zeros_like(closest)
     for camera in cameras:
-        out = render(surfels, None, camera.to(surfels.device), **options)
-        seen = out.weights >= ALPHA_MIN
-        pixels = torch.where(seen, out.depths / camera.focal, NEVER)
-        found.scatter_reduce_(0, out.ids.clamp_min(0).long().flatten(), pixels.flatten(), "amin")
-    return found
+        camera = camera.to(surfels.device)
+        out = render(surfels, None, camera, **options)
+        seen, ids = out.weights >= ALPHA_MIN, out.ids.clamp_min(0).long()
+        centres = camera.project(surfels.means)[1]
+        front = torch.maximum(front, centres.where(centres > camera.near, 0.0) / camera.focal)
+        near, far = out.depths, torch.maximum(out.depths, centres[ids]) if len(surfels) else out.depths
+        for found, depths, none, how in ((closest, near, NEVER, "amin"), (farthest, far, 0.0, "amax")):
+            found.scatter_reduce_(0, ids.flatten(), (depths / camera.focal).where(seen, none).flatten(), how)
+    farthest = farthest.where(farthest > 0, front)
+    return closest, farthest.where(farthest > 0, NEVER)
 
 
 @torch.no_grad()

@@ -183,7 +183,7 @@ def _slot_colors(
         return colors
     if texture is not None:
         positions, rays = _unproject(depths, camera)
-        depths = seen_depths(ids, depths, surfels.footprints, camera.focal)
+        depths = seen_depths(ids, depths, surfels, camera.focal)
         colors = texture.colors(positions, depths, rays, camera.focal, sh_degree=sh_degree, clamp=clamp)
     if texture is None or texture.residual:
         plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)

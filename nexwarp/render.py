@@ -10,7 +10,7 @@ from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.checks import check_range, check_tensors
-from nexwarp.surfels import Surfels
+from nexwarp.surfels import Activated, Surfels
 from nexwarp.texture import NeuralTexture
 
 MAX_JITTER = 1000.0  # pixels
@@ -112,7 +112,7 @@ def render(
     background = _check(
         surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter
     )
-    shape = surfels.activated()
+    shape = seen_from(surfels, camera)
     pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
@@ -128,7 +128,7 @@ def render(
         if isinstance(depth_jitter, torch.Tensor):
             looked_up = looked_up * depth_jitter
         positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
-        depths = seen_depths(hits.ids, hits.depths, surfels.footprints, camera.focal)
+        depths = seen_depths(hits.ids, hits.depths, surfels, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     base = hits.base if texture is None or texture.residual else None
     plain = hits.plain
@@ -164,19 +164,37 @@ def jitter_factors(
     return noise.mul_(jitter / camera.focal).add_(1)
 
 
-def seen_depths(ids: torch.Tensor, depths: torch.Tensor, footprints: torch.Tensor | None, focal: float) -> torch.Tensor:
-    """Return depths for the texture's down-weighting: those of the hits, none closer than training saw the surfel.
+def seen_from(surfels: Surfels, camera: Camera) -> Activated:
+    """Return the surfels' geometry as a camera's pixels show it: wider where they cover more than in training.
+
+    Args:
+        surfels: the surfels, with `far_footprints` or without.
+        camera: the camera.
+    """
+    shape = surfels.activated()
+    if surfels.far_footprints is None:
+        return shape
+    row = camera.viewmat[2].to(shape.means)
+    depths = torch.addmv(row[3], shape.means, row[:3])
+    wide = ops.widen(depths, shape.scales, shape.opacities, shape.gammas, surfels.far_footprints, camera.focal)
+    return Activated(shape.means, shape.quats, *wide)
+
+
+def seen_depths(ids: torch.Tensor, depths: torch.Tensor, surfels: Surfels, focal: float) -> torch.Tensor:
+    """Return depths for the texture's down-weighting: those of the hits, within those that training saw the surfels at.
 
     Args:
         ids: (H, W, K) surfels, -1 in empty slots.
         depths: (H, W, K) their z-depths.
-        footprints: (N,), of `Surfels`.
+        surfels: the surfels, with footprints or without.
         focal: of the camera, in pixels.
     """
-    if footprints is None or len(footprints) == 0:
-        return depths
-    closest = focal * footprints[ids.clamp_min(0).long()]
-    return torch.where(ids >= 0, torch.maximum(depths, closest), depths)
+    seen, indices = depths, ids.clamp_min(0).long()
+    if len(surfels) and surfels.far_footprints is not None:
+        seen = torch.minimum(seen, focal * surfels.far_footprints[indices])
+    if len(surfels) and surfels.footprints is not None:  # after that: where training had no look, there is no texture
+        seen = torch.maximum(seen, focal * surfels.footprints[indices])
+    return seen if seen is depths else torch.where(ids >= 0, seen, depths)
 
 
 def _background(background: float | Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:

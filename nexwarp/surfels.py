@@ -40,15 +40,19 @@ class Surfels(nn.Module):
     Activated properties, which carry the graph to them: `means`, `quats` (N, 4) wxyz unit, surfel to world, `normals`
     (N, 3) their z axes, `scales` (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
 
-    Buffer: `footprints` (N,) world units, depth / focal of the closest look that a training view had at each surfel's
+    Buffers: `footprints` (N,) world units, depth / focal of the closest look that a training view had at each surfel's
     texture, huge where none had any; None until that is known. A rendering from closer gets the detail of that look:
-    else texture levels which no photo resolved come out stronger than training ever saw them.
+    else texture levels which no photo resolved come out stronger than training ever saw them. `far_footprints` (N,),
+    likewise, of the farthest look, or that at the centre of surfels whose texture none had a look at. A rendering from
+    farther keeps the detail of that look, which the MLP knows, and blurs the surfel by what its pixels are larger:
+    else surfels smaller than a pixel alias.
 
     Child: `exposures`, the gains of the training photos, which renderings take theirs from; None gives the mean
     exposure, that which the colours are learned at.
     """
 
     footprints: torch.Tensor | None
+    far_footprints: torch.Tensor | None
     exposures: Exposures | None
 
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
@@ -70,6 +74,7 @@ class Surfels(nn.Module):
         for name in shapes:
             self.register_parameter(name, nn.Parameter(raw[name]))
         self.register_buffer("footprints", None, persistent=False)
+        self.register_buffer("far_footprints", None, persistent=False)
         self.register_module("exposures", None)
 
     @classmethod

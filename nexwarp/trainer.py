@@ -229,7 +229,7 @@ class Trainer:
 
     def _step(self) -> Progress:
         self.iteration += 1
-        self.surfels.footprints = None  # of surfels that are about to change
+        self.surfels.footprints = self.surfels.far_footprints = None  # of surfels that are about to change
         self.surfels.exposures = None  # the photos are all brought to one
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
@@ -385,9 +385,10 @@ class Trainer:
     def finish(self) -> Model:
         """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
         cameras, options = self.views.cameras, self.render_options()
-        self.surfels.exposures = self.surfels.footprints = None
-        if self.config.footprints and self.config.max_hits:
-            self.surfels.footprints = seen_footprints(self.surfels, cameras, options=options)
+        self.surfels.exposures = self.surfels.footprints = self.surfels.far_footprints = None
+        if self.config.footprints:
+            closest, farthest = seen_footprints(self.surfels, cameras, options=options)
+            self.surfels.footprints, self.surfels.far_footprints = closest, farthest
         if self.exposures is not None:
             found = self.exposures
             if self.config.metering:

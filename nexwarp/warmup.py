@@ -96,6 +96,7 @@ def rehearse(config: Config, device: torch.device) -> None:
     options = trainer.render_options()
     if config.densify.floaters:
         floaters(trainer.surfels, trainer.views.cameras, [1.0], torch.Generator(), options=options)
+    trainer.finish()
     evaluate(trainer.surfels, trainer.texture, scene.test, options=options)
     with torch.no_grad():
         out = render(trainer.surfels, trainer.texture, scene.test[0].camera.to(device), **options)

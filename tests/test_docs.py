@@ -321,6 +321,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         model.texture.grid.normal_(0, 2)
         model.surfels.log_scales += 0.7
         model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
+        model.surfels.far_footprints = torch.rand(len(model.surfels)) * 0.4
         model.surfels.exposures = Exposures.of(
             torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others, (-0.3, -0.4, 0.15)
         )

@@ -7,8 +7,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import ops
-from nexwarp.evaluate import NEVER, seen_footprints
 from nexwarp.render import jitter_factors
 from tests.reference import render as reference
 from tests.scenes import (
@@ -584,54 +582,3 @@ def test_quaternions_of_any_length_are_rotations(length: float, device: torch.de
     unit = torch.nn.functional.normalize(scene["quats"], dim=-1)
     surfels = make_surfels(scene | {"quats": unit * length})
     assert_close(surfels.quats, unit, kind="value", name="quats")
-
-
-# Closer than training looked
-
-
-def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> None:
-    """A hit closer than the surfel's footprint is textured as from there; one further away as ever."""
-    scene = random_scene(device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
-    texture.half_precision = False
-    plain = nw.render(surfels, texture, camera, max_hits=3)
-    surfels.footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
-    out = nw.render(surfels, texture, camera, max_hits=3)
-    assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
-    filled = out.ids >= 0
-    assert (out.depths[filled] < 3.4).any() and (out.depths[filled] > 3.6).any()
-    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    positions, directions = ops.unproject(out.depths, camera.viewmat, pinhole)
-    depths = torch.where(filled, out.depths.clamp_min(3.5), 0.0)
-    colors = texture.colors(positions, depths, directions, camera.focal)
-    assert_close(out.textured, (out.weights[..., None] * colors).sum(2), kind="value", name="textured")
-    far = filled.logical_not() | (out.depths > 3.5)
-    assert_close(out.textured[far.all(-1)], plain.textured[far.all(-1)], kind="value", name="far")
-
-
-def test_what_training_never_textured_keeps_its_plain_colour(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
-    surfels.footprints = torch.full((len(surfels),), NEVER, device=device)
-    out = nw.render(surfels, texture, camera, background=BACKGROUND)
-    assert_alike(out, draw(scene))
-    out.image.sum().backward()
-    for name, parameter in surfels.named_parameters():
-        assert_finite(parameter.grad, name)
-
-
-def test_footprints_are_those_of_the_closest_look(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    window = nw.Camera(camera.viewmat.detach(), 2 * camera.K - torch.diag(camera.K.new_tensor([0.0, 0.0, 1.0])), 23, 18)
-    cameras = [camera, window]
-    expected = torch.full((len(surfels),), NEVER)
-    for c in cameras:
-        with torch.no_grad():
-            out = nw.render(surfels, None, c, max_hits=2)
-        for i, depth, weight in zip(out.ids.flatten(), out.depths.flatten(), out.weights.flatten(), strict=True):
-            if weight >= 1 / 255:
-                expected[i] = min(expected[i].item(), depth.item() / c.focal)
-    found = seen_footprints(surfels, cameras, options={"max_hits": 2})
-    assert (expected < NEVER).any() and (expected == NEVER).any()
-    assert_close(found.cpu(), expected, kind="value", name="footprints")

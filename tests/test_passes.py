@@ -23,6 +23,7 @@ def make(count: int = 24, max_hits: int = 2, textured: bool = True, device: torc
     surfels, camera = make_surfels(scene), make_camera(scene)
     if textured == "residual":
         surfels.footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
+        surfels.far_footprints = torch.full((len(surfels),), 4.0 / camera.focal, device=device)
     return render_buffers(surfels, texture, camera, max_hits, BACKGROUND)
 
 

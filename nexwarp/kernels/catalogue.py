@@ -28,6 +28,7 @@ from nexwarp.kernels.tiles import (
 )
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.unproject import unproject_kernel
+from nexwarp.kernels.widen import widen_kernels
 
 
 def all_kernels(
@@ -40,6 +41,7 @@ def all_kernels(
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     yield from thread_kernels(real, storage, tile_size, ssim_lanes=(1, LANES) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
+    yield widen_kernels(real).backward  # of trained surfels, which training itself has no use for
 
 
 def thread_kernels(
@@ -58,6 +60,7 @@ def thread_kernels(
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
+    yield widen_kernels(real).forward
     yield from (surfel_ids_kernel, tile_offsets_kernel)
     yield from (reduce_rows_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)

@@ -10,6 +10,7 @@ from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.texture import texture
 from nexwarp.ops.tiles import Room, Tiles, intersect_tiles, roomy
 from nexwarp.ops.unproject import unproject
+from nexwarp.ops.widen import widen
 
 __all__ = [
     "ErrorWatch",
@@ -29,4 +30,5 @@ __all__ = [
     "splat_error",
     "texture",
     "unproject",
+    "widen",
 ]

@@ -1,0 +1,219 @@
+"""Looks from closer and from farther than training had: the detail is training's, and surfels do not alias."""
+
+import dataclasses
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.evaluate import NEVER, seen_footprints
+from nexwarp.kernels.widen import FILTER
+from nexwarp.render import seen_from
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.test_laws import BACKGROUND, assert_alike, assert_same, draw
+from tests.tolerances import assert_close, assert_finite
+
+
+def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> None:
+    """A hit closer than the surfel's footprint is textured as from there; one further away as ever."""
+    scene = random_scene(device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+    texture.half_precision = False
+    plain = nw.render(surfels, texture, camera, max_hits=3)
+    surfels.footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
+    out = nw.render(surfels, texture, camera, max_hits=3)
+    assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
+    filled = out.ids >= 0
+    assert (out.depths[filled] < 3.4).any() and (out.depths[filled] > 3.6).any()
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+    positions, directions = ops.unproject(out.depths, camera.viewmat, pinhole)
+    depths = torch.where(filled, out.depths.clamp_min(3.5), 0.0)
+    colors = texture.colors(positions, depths, directions, camera.focal)
+    assert_close(out.textured, (out.weights[..., None] * colors).sum(2), kind="value", name="textured")
+    far = filled.logical_not() | (out.depths > 3.5)
+    assert_close(out.textured[far.all(-1)], plain.textured[far.all(-1)], kind="value", name="far")
+
+
+def test_what_training_never_textured_keeps_its_plain_colour(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
+    surfels.footprints = torch.full((len(surfels),), NEVER, device=device)
+    out = nw.render(surfels, texture, camera, background=BACKGROUND)
+    assert_alike(out, draw(scene))
+    out.image.sum().backward()
+    for name, parameter in surfels.named_parameters():
+        assert_finite(parameter.grad, name)
+
+
+def test_a_farther_look_keeps_the_detail_of_training(device: torch.device) -> None:
+    """A hit farther than the surfel's footprint is textured as from there; one that training never had, not at all."""
+    scene = random_scene(device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+    texture.half_precision = False
+    surfels.far_footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
+    out = nw.render(surfels, texture, camera, max_hits=3)
+    filled = out.ids >= 0
+    assert (out.depths[filled] < 3.4).any() and (out.depths[filled] > 3.6).any()
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+    positions, directions = ops.unproject(out.depths, camera.viewmat, pinhole)
+    depths = torch.where(filled, out.depths.clamp_max(3.5), 0.0)
+    colors = texture.colors(positions, depths, directions, camera.focal)
+    assert_close(out.textured, (out.weights[..., None] * colors).sum(2), kind="value", name="textured")
+    surfels.footprints = torch.full((len(surfels),), NEVER, device=device)
+    texture.residual = True
+    never, plain = nw.render(surfels, texture, camera), nw.render(surfels, None, camera)
+    assert_close(never.image, plain.image, kind="value", name="never textured")
+
+
+def test_looks_as_far_as_training_had_are_its_own(device: torch.device) -> None:
+    """To the bit, with footprints that hold all hits and centres; and with those that nothing was ever farther than."""
+    scene = random_scene(device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+    before = nw.render(surfels, texture, camera)
+    for farthest in (1.01 * before.depths.max().item() + 3.0, NEVER):
+        surfels.footprints = torch.full((len(surfels),), 1e-6, device=device)
+        surfels.far_footprints = torch.full((len(surfels),), farthest / camera.focal, device=device)
+        after = nw.render(surfels, texture, camera)
+        for name in ("image", "textured", "weights", "depths", "ids", "alpha"):
+            assert torch.equal(getattr(after, name), getattr(before, name)), name
+
+
+def test_a_far_surfel_covers_what_it_covers_wherever_pixels_fall(device: torch.device) -> None:
+    """The sum of a small Gaussian's alphas is its opacity times its area in pixels, wherever it lies among them."""
+    scale, opacity = 0.004, 0.5
+    shape = (torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([[scale, 2 * scale]]))
+    surfels = nw.Surfels.from_activated(*shape, torch.tensor([opacity]), torch.ones(1, 2), torch.zeros(1, 1, 3))
+    surfels = surfels.to(device)
+    focal = 60.0  # so that a pixel is 0.033 wide there
+    generator = torch.Generator().manual_seed(0)
+
+    def sums() -> torch.Tensor:
+        found = []
+        for x, y in torch.rand(40, 2, generator=generator).tolist():
+            K = torch.tensor([[focal, 0.0, 8 + x], [0.0, focal, 8 + y], [0.0, 0.0, 1.0]])
+            out = nw.render(surfels, None, nw.Camera(torch.eye(4), K, 16, 16).to(device))
+            found.append(out.alpha.detach().sum().item())
+        return torch.tensor(found)
+
+    area = opacity * 2 * torch.pi * scale * (2 * scale) * (focal / 2) ** 2
+    aliased = sums()
+    surfels.far_footprints = torch.full((1,), 0.1 / focal, device=device)  # training was 20 times as close
+    filtered = sums()
+    assert aliased.std() > area
+    assert (filtered.mean() - area).abs() < 0.1 * area and filtered.std() < 0.2 * area
+
+
+def test_far_looks_are_differentiable_in_the_camera(device: torch.device) -> None:
+    scene = random_scene(12, dtype=torch.float64, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    surfels.far_footprints = torch.linspace(1.0, 6.0, len(surfels), dtype=torch.float64, device=device) / camera.focal
+
+    def shape(viewmat: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return seen_from(surfels, dataclasses.replace(camera, viewmat=viewmat))[2:]
+
+    viewmat = camera.viewmat.detach().clone().requires_grad_()
+    (wide, *_), (narrow, *_) = shape(viewmat), surfels.activated()[2:]
+    assert 0.3 < (wide > narrow).double().mean() < 1
+    assert torch.autograd.gradcheck(shape, viewmat)
+
+
+def test_footprints_are_those_of_the_closest_and_the_farthest_look(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    window = nw.Camera(camera.viewmat.detach(), 2 * camera.K - torch.diag(camera.K.new_tensor([0.0, 0.0, 1.0])), 23, 18)
+    cameras = [camera, window]
+    closest = torch.full((len(surfels),), NEVER)
+    farthest, front = torch.zeros(len(surfels)), torch.zeros(len(surfels))
+    for c in cameras:
+        with torch.no_grad():
+            out = nw.render(surfels, None, c, max_hits=2)
+            centres = c.project(surfels.means)[1]
+        front = torch.maximum(front, centres.cpu().where(centres.cpu() > c.near, 0) / c.focal)
+        for i, depth, weight in zip(out.ids.flatten(), out.depths.flatten(), out.weights.flatten(), strict=True):
+            if weight >= 1 / 255:
+                closest[i] = min(closest[i].item(), depth.item() / c.focal)
+                farthest[i] = max(farthest[i].item(), depth.item() / c.focal, centres[i].item() / c.focal)
+    farthest = farthest.where(farthest > 0, front)
+    farthest = farthest.where(farthest > 0, NEVER)
+    found = seen_footprints(surfels, cameras, options={"max_hits": 2})
+    assert (closest < NEVER).any() and (closest == NEVER).any() and (farthest > 1.5 * closest).any()
+    for mine, expected, name in zip(found, (closest, farthest), ("closest", "farthest"), strict=True):
+        assert_close(mine.cpu(), expected, kind="value", name=name)
+        assert ((mine.cpu() - expected).abs() <= 2e-5 * expected).all(), name
+
+
+# Widening alone
+
+
+def widened(
+    depths: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    farthest: torch.Tensor,
+    focal: float,
+) -> tuple[torch.Tensor, ...]:
+    """As torch has it."""
+    variance = FILTER * ((depths / focal).square() - farthest.square()).clamp_min(0)
+    wide = (scales.square() + torch.where(depths > 0, variance, 0)[:, None]).sqrt()
+    share = scales / wide
+    return wide, opacities * share.prod(1), 1 + (gammas - 1) * share.square()
+
+
+def arguments(count: int, dtype: torch.dtype, device: torch.device) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    shapes = ((count,), (count, 2), (count,), (count, 2), (count,))
+    depths, scales, opacities, gammas, farthest = (
+        torch.rand(shape, generator=generator, dtype=torch.float64) for shape in shapes
+    )
+    # Pixels of 0.006 to 0.05 units, a few behind the camera.
+    values = [5 * depths - 0.4, 0.001 + 0.1 * scales, opacities, 1 + 9 * gammas, 0.002 + 0.03 * farthest]
+    return [x.to(dtype=dtype, device=device) for x in values]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) -> None:
+    *shape, farthest = arguments(500, dtype, device)
+    shape = [x.requires_grad_() for x in shape]
+    signals = [torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(x) for x in shape[1:]]
+    found, expected = ops.widen(*shape, farthest, 90.0), widened(*shape, farthest, 90.0)
+    far = shape[0].detach() / 90.0 > farthest
+    assert 0.3 < far.double().mean() < 0.9 and (shape[0] < 0).any()
+    grads, wanted = (torch.autograd.grad(x, shape, signals, retain_graph=True) for x in (found, expected))
+    for name, mine, torchs in zip(("scales", "opacities", "gammas"), found, expected, strict=True):
+        assert_close(mine, torchs, kind="value", name=name)
+    for name, mine, torchs in zip(("depths", "scales", "opacities", "gammas"), grads, wanted, strict=True):
+        assert_close(mine, torchs, kind="gradient", name=name)
+    for mine, given in zip(found, shape[1:], strict=True):
+        assert torch.equal(mine[~far], given[~far])
+
+
+def test_widening_gradcheck(device: torch.device) -> None:
+    *shape, farthest = arguments(9, torch.float64, device)
+    assert torch.autograd.gradcheck(lambda *x: ops.widen(*x, farthest, 90.0), [x.requires_grad_() for x in shape])
+
+
+def test_widening_of_extremes_is_finite(device: torch.device) -> None:
+    *shape, farthest = arguments(6, torch.float32, device)
+    with torch.no_grad():
+        shape[0].fill_(1e4)
+        shape[1][:, 0] = torch.tensor([1e-30, 1e-20, 1e-10, 1e10, 1e18, 1.0])
+        shape[3][:, 1] = torch.tensor([1e30, 1e10, 1.0, 1.0, 1e3, 1.0])
+        farthest.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, NEVER]))
+    shape = [x.requires_grad_() for x in shape]
+    found = ops.widen(*shape, farthest, 1.0)
+    for name, values in zip(("scales", "opacities", "gammas"), found, strict=True):
+        assert_finite(values, name)
+    assert found[0][0, 0].item() == pytest.approx(FILTER**0.5 * 1e4)
+    grads = torch.autograd.grad([x.sum() for x in found], shape)
+    for name, grad in zip(("depths", "scales", "opacities", "gammas"), grads, strict=True):
+        assert_finite(grad, name)
+
+
+def test_bad_arguments_are_named() -> None:
+    *shape, farthest = arguments(6, torch.float32, torch.device("cpu"))
+    with pytest.raises(ValueError, match="farthest"):
+        ops.widen(*shape, farthest[:4], 90.0)
+    with pytest.raises(TypeError, match="gammas"):
+        ops.widen(*shape[:3], shape[3].double(), farthest, 90.0)
