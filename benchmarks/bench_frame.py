@@ -13,6 +13,7 @@ from benchmarks import suite
 from benchmarks.scenes import Scene, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import MIB, Measurement, figure, process_memory, synchronize
+from nexwarp.evaluate import seen_footprints
 
 STEADY_FRAMES = 50
 
@@ -23,6 +24,9 @@ def run(options: Options) -> list[Measurement]:
 
 def frame(scene: Scene, options: Options) -> list[Measurement]:
     field = texture(scene)
+    scene.surfels.footprints, scene.surfels.far_footprints = seen_footprints(
+        scene.surfels, [scene.camera], options=scene.options
+    )  # as a trained model has them
 
     @torch.no_grad()
     def render() -> torch.Tensor:

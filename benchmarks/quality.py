@@ -225,8 +225,8 @@ def _train_nexwarp(
     trainer.run(until=trainer.config.iterations - 1)
     before = len(trainer.surfels)
     trainer.run()
-    seconds = begun + time.perf_counter() - start
     model = trainer.finish()
+    seconds = begun + time.perf_counter() - start
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         if models is not None:

@@ -68,7 +68,7 @@ HITS = (
 # Each undoes one change of the default preset against the paper.
 CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
-    Row("texture from closer than seen", settings={"footprints": False}),
+    Row("looks from elsewhere as they come", settings={"footprints": False}),
     Row("each photo's own exposure", settings={"exposures": False}),
     Row("exposures by poses alone", settings={"metering": False}),
     Row("the lens's dark corners", settings={"vignetting": False}),
@@ -132,8 +132,8 @@ def config_of(job: Job, row: Row) -> Config:
 def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Job], int]]:
     """Trainings that begin as one, because what differs does not count at first; and for how many iterations.
 
-    That is K, where it is 2 or more, and whether floaters are removed. Those that begin alone come alone, with 0. All
-    are in the order of their first.
+    That is K, where it is 2 or more, whether floaters are removed, and what only a finished model has. Those that begin
+    alone come alone, with 0. All are in the order of their first.
     """
     groups: dict[Any, tuple[list[Job], int]] = {}
     for job in jobs:
@@ -144,7 +144,9 @@ def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Jo
             alike = min(config.settled - 1, looked - 1, job.iterations)
             if alike > 0:
                 densify = dataclasses.replace(config.densify, floaters=False)
-                begun = dataclasses.replace(config, max_hits=min(config.max_hits, 2), densify=densify)
+                begun = dataclasses.replace(
+                    config, max_hits=min(config.max_hits, 2), densify=densify, metering=False, footprints=False
+                )
                 key = (dataclasses.replace(job, row=""), json.dumps(begun.as_dict()))
         groups.setdefault(key, ([], alike))[0].append(job)
     return [(found, alike if len(found) > 1 else 0) for found, alike in groups.values()]

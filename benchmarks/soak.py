@@ -145,7 +145,7 @@ def cycle(scene: Scene, device: torch.device, seed: int) -> list[nw.Camera]:
 
 def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, look: Callable[[int], None]) -> None:
     """Render what the trainer has, over and over, as the viewer does."""
-    model = trainer.model()
+    model = trainer.finish()
     for i in range(count):
         with torch.no_grad():
             out = nw.render(model.surfels, model.texture, cameras[i % len(cameras)], **model.render_options)

@@ -62,7 +62,7 @@ def draw(path: Path, camera: nw.Camera, background: tuple[float, float, float]) 
 
 def untextured(surfels: nw.Surfels) -> nw.Surfels:
     """The same surfels with gamma = 1, as Gaussians can show them."""
-    raw = {name: x.clone() for name, x in surfels.state_dict().items() if name != "footprints"}
+    raw = {name: x.clone() for name, x in surfels.state_dict().items()}
     raw["raw_gammas"].fill_(UNIT_GAMMA)
     return nw.Surfels(raw)
 

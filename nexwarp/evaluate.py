@@ -26,7 +26,7 @@ def seen_footprints(
     """Return each surfel's `footprints` and `far_footprints`: depth / focal of some views' looks at its texture.
 
     Args:
-        surfels: the surfels, without footprints of their own.
+        surfels: the surfels; footprints that they have would count: None is expected.
         cameras: of the training views.
         options: keyword arguments of `nexwarp.render`; a K of 0 counts as 1.
 
@@ -36,6 +36,8 @@ def seen_footprints(
     """
     options = options | {"max_hits": max(options["max_hits"], 1)}
     closest = surfels.means.new_full((len(surfels),), NEVER)
+    if not len(surfels):
+        return closest, closest.clone()
     farthest, front = torch.zeros_like(closest), torch.zeros_like(closest)
     for camera in cameras:
         camera = camera.to(surfels.device)
@@ -43,8 +45,8 @@ def seen_footprints(
         seen, ids = out.weights >= ALPHA_MIN, out.ids.clamp_min(0).long()
         centres = camera.project(surfels.means)[1]
         front = torch.maximum(front, centres.where(centres > camera.near, 0.0) / camera.focal)
-        near, far = out.depths, torch.maximum(out.depths, centres[ids]) if len(surfels) else out.depths
-        for found, depths, none, how in ((closest, near, NEVER, "amin"), (farthest, far, 0.0, "amax")):
+        hits = (out.depths, torch.maximum(out.depths, centres[ids]))
+        for found, depths, none, how in ((closest, hits[0], NEVER, "amin"), (farthest, hits[1], 0.0, "amax")):
             found.scatter_reduce_(0, ids.flatten(), (depths / camera.focal).where(seen, none).flatten(), how)
     farthest = farthest.where(farthest > 0, front)
     return closest, farthest.where(farthest > 0, NEVER)

@@ -1,4 +1,4 @@
-"""Surfels as PLY files: all that they are, for programs; and as Gaussians, for the viewers of 3D Gaussian splatting.
+"""Surfels as PLY files: all their parameters, for programs; and as Gaussians, for the viewers of 3D Gaussian splatting.
 
 Both list one vertex a surfel, little-endian, every property of one floating type. Names and activations are those of
 3DGS's files: `opacity` is a logit, `scale_*` are logarithms, `rot_*` a quaternion wxyz, surfel to world, `f_dc_*` the

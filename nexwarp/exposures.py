@@ -7,7 +7,8 @@ it and the falloff of the lens.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -34,6 +35,8 @@ TINY = 1e-9  # squared error that is none
 
 class Exposures(nn.Module):
     """Gains of photos by the pose of their cameras: a Gaussian process with the Matern 3/2 kernel.
+
+    Places between the photos, whose gains were foretold (`nexwarp.metering`), count as photos do.
 
     Buffers: `log_gains` (V, 3); `positions` (V, 3) of the cameras, world units; `directions` (V, 3) unit, where they
     look; `coefficients` (V, 3) and `mean` (3,) of the process; `lengths` (2,) world units: what a direction's change by
@@ -87,10 +90,11 @@ class Exposures(nn.Module):
         every = -(-len(cameras) // MOST_PHOTOS)
         positions, directions = (x[::every] for x in _poses(viewmats))
         gains = log_gains.double()[::every]
-        size, squares = _apart(positions, directions)
-        kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
-        fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
-        _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+        with _one_thread():
+            size, squares = _apart(positions, directions)
+            kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
+            fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
+            _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
         return cls(*(x.float() for x in tensors), torch.tensor([float(x) for x in falloff or EVEN]))
 
@@ -132,6 +136,17 @@ class Exposures(nn.Module):
         return found
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums of several threads are other sums, and a rounding's other side can be another file."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
     """Matern 3/2 kernel of squared distances."""
     r = (3 * squares).sqrt() / length
@@ -153,7 +168,7 @@ def _fit(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[floa
     return round(error, 9), coefficients, mean
 
 
-def foretold(
+def foretell(
     log_gains: torch.Tensor,
     cameras: Sequence[Camera],
     brightness: torch.Tensor,
@@ -163,16 +178,27 @@ def foretold(
     """Foretell other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
 
     A process of the pose, as `Exposures`, and beside it linear in the brightness. None where that foretells each photo
-    from the others no better, by Akaike's criterion, than the pose alone.
+    from the others no better, by Akaike's criterion, than the pose alone; channels count as independent, which they are
+    not where a camera has one exposure for all and no white balance: so slopes of all three are asked of each.
 
     Args:
         log_gains: (V, 3) of photos.
         cameras: of those.
-        brightness: (V, 3), logarithms, of what is before them.
+        brightness: (V, 3) float64 on the CPU, logarithms, of what is before them (`nexwarp.metering.brightness`).
         others: M cameras.
         others_brightness: gives (M, 3), likewise; not called where there is nothing to foretell.
     """
-    values = log_gains.cpu().double()
+    with _one_thread():
+        return _foretell(log_gains.cpu().double(), cameras, brightness, others, others_brightness)
+
+
+def _foretell(
+    values: torch.Tensor,
+    cameras: Sequence[Camera],
+    brightness: torch.Tensor,
+    others: Sequence[Camera],
+    others_brightness: Callable[[], torch.Tensor],
+) -> torch.Tensor | None:
     here, there = (_poses(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))
     size, squares = _apart(*here)
     seen = brightness - brightness.mean(0)

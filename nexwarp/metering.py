@@ -12,13 +12,13 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.exposures import MOST_PHOTOS, Exposures, foretold
+from nexwarp.exposures import MOST_PHOTOS, Exposures, foretell
 from nexwarp.paths import between, resized
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
-PLACES = 240  # between the cameras, that are metered, and as many as the photos at least; 1,000 in all at most
+PLACES = 240  # between the cameras, that are metered, at least
 HEIGHT = 64  # of the renderings that tell brightness, pixels
 LINEAR = 2.2  # sRGB to light, as an exponent
 DARKEST = 1e-3  # mean colour that is told from darker ones
@@ -36,27 +36,29 @@ def metered(
     """Return exposures that know, beside the photos', the gains of places between them.
 
     Those that were given come back where the scene's brightness tells the photos' gains no better than poses do, where
-    photos are few, and where they are so many that there is no room for more (1,000).
+    photos are few, and where so many count already that other places do not fit (1,000 in all).
 
     Args:
-        exposures: of the photos.
+        exposures: of the photos alone.
         surfels: the trained ones.
         texture: their texture, or None.
         cameras: of all training views, on any device.
         options: keyword arguments of `nexwarp.render`.
     """
     cameras = cameras[:: -(-len(cameras) // MOST_PHOTOS)]
-    if len(cameras) == MOST_PHOTOS:
+    room = MOST_PHOTOS - len(cameras)
+    if room < PLACES:
         return exposures
-    found = brightness(surfels, texture, cameras, options=options)
     generator, places = torch.Generator().manual_seed(0), []
     for _ in range(math.ceil(PLACES / len(cameras))):
         places += between(cameras, [math.inf] * len(cameras), generator)
-    places = places[: MOST_PHOTOS - len(cameras)]
+    places = places[:: -(-len(places) // room)]
+    found = brightness(surfels, texture, cameras, options=options)
     gains = exposures.log_gains
-    there = foretold(gains, cameras, found, places, lambda: brightness(surfels, texture, places, options=options))
+    there = foretell(gains, cameras, found, places, lambda: brightness(surfels, texture, places, options=options))
     if there is None:
         return exposures
+    # As exact as the photos' own, though they are not: what the process makes of both varies as smoothly as they do.
     return Exposures.of(torch.cat([gains.cpu().double(), there]), [*cameras, *places], exposures.falloff.tolist())
 
 

@@ -1,4 +1,4 @@
-"""Rendering: project -> tiles -> collect -> texture -> compose (paper Sec. 3.2)."""
+"""Rendering: (widen ->) project -> tiles -> collect -> texture -> compose (paper Sec. 3.2)."""
 
 import numbers
 from collections.abc import Iterable, Sequence
@@ -165,18 +165,21 @@ def jitter_factors(
 
 
 def seen_from(surfels: Surfels, camera: Camera) -> Activated:
-    """Return the surfels' geometry as a camera's pixels show it: wider where they cover more than in training.
+    """Return the N surfels' geometry as a camera's pixels show it: wider where they cover more than in training.
+
+    Differentiable with respect to the surfels and `camera.viewmat`.
 
     Args:
         surfels: the surfels, with `far_footprints` or without.
         camera: the camera.
     """
     shape = surfels.activated()
-    if surfels.far_footprints is None:
+    if surfels.far_footprints is None or not len(surfels):
         return shape
     row = camera.viewmat[2].to(shape.means)
     depths = torch.addmv(row[3], shape.means, row[:3])
-    wide = ops.widen(depths, shape.scales, shape.opacities, shape.gammas, surfels.far_footprints, camera.focal)
+    focal = (camera.fx * camera.fy) ** 0.5  # the pixels' own: `camera.focal` may be limited for the texture's sake
+    wide = ops.widen(depths, shape.scales, shape.opacities, shape.gammas, surfels.far_footprints, focal)
     return Activated(shape.means, shape.quats, *wide)
 
 
@@ -252,5 +255,8 @@ def _check(
         others["depth_jitter"] = (depth_jitter, (camera.height, camera.width, max_hits))
     if texture is not None:
         others["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
+    for name in ("footprints", "far_footprints"):
+        if (seen := getattr(surfels, name)) is not None:
+            others[f"surfels.{name}"] = (seen, (len(surfels),))
     check_tensors(others, dtype=means.dtype, device=means.device)
     return background

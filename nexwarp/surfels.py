@@ -41,11 +41,11 @@ class Surfels(nn.Module):
     (N, 3) their z axes, `scales` (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
 
     Buffers: `footprints` (N,) world units, depth / focal of the closest look that a training view had at each surfel's
-    texture, huge where none had any; None until that is known. A rendering from closer gets the detail of that look:
+    texture, 1e30 where none had any; None until that is known. A rendering from closer gets the detail of that look:
     else texture levels which no photo resolved come out stronger than training ever saw them. `far_footprints` (N,),
-    likewise, of the farthest look, or that at the centre of surfels whose texture none had a look at. A rendering from
+    likewise, of the farthest look at it, or at the centre of surfels at whose texture there was none. A rendering from
     farther keeps the detail of that look, which the MLP knows, and blurs the surfel by what its pixels are larger:
-    else surfels smaller than a pixel alias.
+    else surfels smaller than a pixel alias. Training goes without both.
 
     Child: `exposures`, the gains of the training photos, which renderings take theirs from; None gives the mean
     exposure, that which the colours are learned at.

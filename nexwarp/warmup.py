@@ -55,8 +55,8 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     )
     low_passes = (config.low_pass,)
     hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
-    if config.densify.floaters:
-        hits.add(max(config.max_hits, 1))  # which a look for them tells by
+    if config.densify.floaters or config.footprints:
+        hits.add(max(config.max_hits, 1))  # which a look for them tells by, and one at the end for footprints
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed=fixed)
     return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 

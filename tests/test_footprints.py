@@ -11,7 +11,7 @@ from nexwarp.evaluate import NEVER, seen_footprints
 from nexwarp.kernels.widen import FILTER
 from nexwarp.render import seen_from
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.test_laws import BACKGROUND, assert_alike, assert_same, draw
+from tests.test_laws import BACKGROUND, MAX_HITS, assert_alike, assert_same, draw
 from tests.tolerances import assert_close, assert_finite
 
 
@@ -143,6 +143,46 @@ def test_footprints_are_those_of_the_closest_and_the_farthest_look(device: torch
         assert ((mine.cpu() - expected).abs() <= 2e-5 * expected).all(), name
 
 
+def test_training_views_are_as_training_made_them(device: torch.device) -> None:
+    """In 8 bits: looks at hits of lower weights, or beyond the K heaviest of a pixel, do not count."""
+    scene = random_scene(60, device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
+    texture.half_precision = False
+    moved = camera.viewmat.detach() + torch.tensor([[0.0] * 4, [0.0] * 4, [0.0] * 3 + [1.5], [0.0] * 4], device=device)
+    cameras = [camera, dataclasses.replace(camera, viewmat=moved)]
+    options = {"max_hits": MAX_HITS, "background": BACKGROUND}
+    before = [nw.render(surfels, texture, c, **options).image for c in cameras]
+    surfels.footprints, surfels.far_footprints = seen_footprints(surfels, cameras, options=options)
+    for c, image in zip(cameras, before, strict=True):
+        after = nw.render(surfels, texture, c, **options).image
+        assert (after - image).abs().max() < 1 / 255
+    far = dataclasses.replace(camera, viewmat=2 * moved - camera.viewmat.detach())
+    wide = seen_from(surfels, far).scales > 1.001 * surfels.scales
+    assert wide.any()
+
+
+def test_no_surfels_have_no_footprints(device: torch.device) -> None:
+    empty = {name: x[:0] for name, x in make_surfels(random_scene(3)).state_dict().items()}
+    surfels = nw.Surfels(empty).to(device)
+    camera = make_camera(random_scene(3, device=device))
+    surfels.footprints, surfels.far_footprints = seen_footprints(surfels, [camera], options={"max_hits": 0})
+    assert surfels.footprints.shape == surfels.far_footprints.shape == (0,)
+    out = nw.render(surfels, make_texture(device=device), camera, background=BACKGROUND)
+    assert (out.image - torch.tensor(BACKGROUND, device=device)).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["footprints", "far_footprints"])
+def test_footprints_of_other_surfels_are_named(name: str) -> None:
+    scene = random_scene(5)
+    surfels = make_surfels(scene)
+    setattr(surfels, name, torch.ones(4))
+    with pytest.raises(ValueError, match=rf"^surfels\.{name}: expected shape \(5,?\), got \(4,\)$"):
+        nw.render(surfels, None, make_camera(scene))
+    setattr(surfels, name, torch.ones(5, dtype=torch.float64))
+    with pytest.raises(TypeError, match=rf"^surfels\.{name}: expected dtype torch.float32, got torch.float64$"):
+        nw.render(surfels, None, make_camera(scene))
+
+
 # Widening alone
 
 
@@ -195,16 +235,19 @@ def test_widening_gradcheck(device: torch.device) -> None:
 
 
 def test_widening_of_extremes_is_finite(device: torch.device) -> None:
-    *shape, farthest = arguments(6, torch.float32, device)
+    """And what is far larger than a pixel stays as it is."""
+    *shape, farthest = arguments(8, torch.float32, device)
     with torch.no_grad():
         shape[0].fill_(1e4)
-        shape[1][:, 0] = torch.tensor([1e-30, 1e-20, 1e-10, 1e10, 1e18, 1.0])
-        shape[3][:, 1] = torch.tensor([1e30, 1e10, 1.0, 1.0, 1e3, 1.0])
-        farthest.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, NEVER]))
+        shape[1][:, 0] = torch.tensor([1e-38, 1e-30, 1e-20, 1e10, 1e18, 1e25, 1e38, 1.0])
+        shape[1][:, 1] = shape[1][:, 0]
+        shape[3][:, 1] = torch.tensor([1e30, 1e10, 1.0, 1.0, 1e3, 1.0, 1.0, 1.0])
+        farthest.copy_(torch.tensor([0.0] * 7 + [NEVER]))
     shape = [x.requires_grad_() for x in shape]
     found = ops.widen(*shape, farthest, 1.0)
-    for name, values in zip(("scales", "opacities", "gammas"), found, strict=True):
+    for name, values, given in zip(("scales", "opacities", "gammas"), found, shape[1:], strict=True):
         assert_finite(values, name)
+        assert torch.equal(values[3:], given[3:])
     assert found[0][0, 0].item() == pytest.approx(FILTER**0.5 * 1e4)
     grads = torch.autograd.grad([x.sum() for x in found], shape)
     for name, grad in zip(("depths", "scales", "opacities", "gammas"), grads, strict=True):

@@ -1,16 +1,20 @@
 """Automatic exposure: gains that follow what cameras see are foretold by it, others are left to the poses."""
 
-import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp import exposures as exposures_module
 from nexwarp import metering
 from nexwarp.camera import Camera
-from nexwarp.exposures import Exposures, foretold
+from nexwarp.config import Config, TextureConfig
+from nexwarp.data import write_demo
+from nexwarp.exposures import Exposures, foretell
 from nexwarp.metering import PLACES, brightness, metered
+from nexwarp.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
@@ -35,7 +39,7 @@ def test_gains_that_follow_the_brightness_are_foretold(slopes: torch.Tensor) -> 
     seen, there = 0.2 * random(40, 3), 0.2 * random(25, 3, seed=1)
     gains = (seen - seen.mean(0)) @ slopes + 0.002 * random(40, 3, seed=2)
     expected = (there - seen.mean(0)) @ slopes
-    found = foretold(gains, cameras, seen, others, lambda: there)
+    found = foretell(gains, cameras, seen, others, lambda: there)
     assert found is not None and found.shape == (25, 3)
     inside = (expected > gains.amin(0)) & (expected < gains.amax(0))
     assert inside.double().mean() > 0.8
@@ -54,15 +58,15 @@ def test_gains_that_do_not_are_left_to_the_poses() -> None:
 
     cameras = [looking(x) for x in np.linspace(0, 4, 40)]
     course = 0.2 * torch.linspace(0, 6, 40).double().sin()[:, None].expand(40, 3)
-    assert foretold(course, cameras, 0.2 * random(40, 3), cameras[:2], never) is None
+    assert foretell(course, cameras, 0.2 * random(40, 3), cameras[:2], never) is None
     for seed in range(8):
         assert (
-            foretold(0.1 * random(40, 3, seed=seed), cameras, 0.2 * random(40, 3, seed=99), cameras[:2], never) is None
+            foretell(0.1 * random(40, 3, seed=seed), cameras, 0.2 * random(40, 3, seed=99), cameras[:2], never) is None
         )
     for count in (1, 2, 3, 4):
         seen = 0.2 * random(count, 3)
-        assert foretold(0.1 * random(count, 3, seed=5), cameras[:count], seen, cameras[:2], never) is None
-    assert foretold(torch.zeros(40, 3), cameras, 0.2 * random(40, 3), cameras[:2], never) is None
+        assert foretell(0.1 * random(count, 3, seed=5), cameras[:count], seen, cameras[:2], never) is None
+    assert foretell(torch.zeros(40, 3), cameras, 0.2 * random(40, 3), cameras[:2], never) is None
 
 
 def test_brightness_is_that_of_light(device: torch.device) -> None:
@@ -144,11 +148,53 @@ def test_exposures_that_brightness_does_not_tell_stay(walls: tuple[nw.Surfels, l
 def test_many_photos_leave_room_for_few_places(
     walls: tuple[nw.Surfels, list[Camera]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """No more than 1,000 count in all; places are spread over the capture, or there are none."""
     surfels, cameras = walls
-    monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + 7)
     seen = brightness(surfels, None, cameras, options=OPTIONS)
-    exposures = Exposures.of(-0.7 * (seen - seen.mean(0)), cameras)
-    assert len(metered(exposures, surfels, None, cameras, options=OPTIONS).log_gains) == len(cameras) + 7
-    monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras))
+    gains = -0.7 * (seen - seen.mean(0))
+    monkeypatch.setattr(metering, "PLACES", 15)
+    for room, count in ((16, 16), (20, 16), (31, 31), (15, 11)):
+        monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + room)
+        found = metered(Exposures.of(gains, cameras), surfels, None, cameras, options=OPTIONS)
+        places = found.positions[len(cameras) :, 0]
+        assert len(places) == count
+        assert places.min() < 1 and places.max() > 7 and places.sort().values.diff().max() < 2
+    monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + 14)
+    exposures = Exposures.of(gains, cameras)
     assert metered(exposures, surfels, None, cameras, options=OPTIONS) is exposures
-    assert math.isfinite(seen.sum().item())
+
+
+def test_of_very_many_photos_each_keeps_its_own_gains(
+    walls: tuple[nw.Surfels, list[Camera]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras are thinned as their gains were."""
+    surfels, cameras = walls
+    seen = brightness(surfels, None, cameras, options=OPTIONS)
+    gains = -0.7 * (seen - seen.mean(0))
+    for module in (metering, exposures_module):
+        monkeypatch.setattr(module, "MOST_PHOTOS", 26)
+    monkeypatch.setattr(metering, "PLACES", 5)
+    exposures = Exposures.of(gains, cameras)
+    assert len(exposures.log_gains) == 16
+    found = metered(exposures, surfels, None, cameras, options=OPTIONS)
+    assert 16 < len(found.log_gains) <= 26
+    torch.testing.assert_close(found.log_gains[:16].double(), gains[::2], atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.positions[:16], exposures.positions)
+
+
+def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
+    """Footprints and metered exposures are a rendering's: steps are those of a training that was never looked at."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60))
+    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
+    config = Config(iterations=20, max_surfels=40, texture=texture)
+    one, other = (Trainer(scene, config, "cpu") for _ in range(2))
+    for trainer in (one, other):
+        trainer.run(until=10)
+    model = one.finish()
+    assert model.surfels.footprints is not None and model.surfels.far_footprints is not None
+    assert model.surfels.exposures is not None
+    for trainer in (one, other):
+        trainer.run()
+    assert one.surfels.footprints is one.surfels.far_footprints is one.surfels.exposures is None
+    for (name, mine), theirs in zip(one.surfels.named_parameters(), other.surfels.parameters(), strict=True):
+        assert torch.equal(mine, theirs), name

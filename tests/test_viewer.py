@@ -1,5 +1,6 @@
 """The viewer: its pictures, its pace, its paths, what it refuses, what it costs a training, and a browser's view."""
 
+import copy
 import io
 import json
 import math
@@ -166,6 +167,10 @@ def test_a_stale_picture_is_given_up(model, camera):
 
 
 def test_photo_detail_limits_the_texture_alone(model, camera):
+    """Not the surfels, which are as wide as the picture's own pixels show them."""
+    surfels, texture = copy.deepcopy(model[0]), model[1]
+    surfels.far_footprints = torch.full((len(surfels),), 3.5 / (3 * camera.focal))
+    model = surfels, texture
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 256, 192)
     free, limited = (here.bands(1.0, 0.01, model[0].means, focal_limit=f) for f in (math.inf, camera.focal))
     assert limited[0].focal == pytest.approx(camera.focal) and free[0].focal == pytest.approx(4 * camera.focal)

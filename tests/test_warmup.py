@@ -16,7 +16,7 @@ import warp as wp
 from nexwarp import cli, warmup
 from nexwarp.config import PRESETS, Config, TextureConfig
 from nexwarp.data import write_demo
-from nexwarp.densify import Densifier
+from nexwarp.densify import Densifier, DensifyConfig
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels
 from nexwarp.trainer import Trainer
@@ -113,6 +113,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
 SETTINGS = {
     **PRESETS,
     "no texture": Config(max_hits=0),
+    "no texture, floaters left": Config(max_hits=0, densify=DensifyConfig(floaters=False)),
     "K = 3": Config(max_hits=3),
     "deterministic": Config(deterministic=True),
     "options": Config(low_pass=True, clamp_texture=True, sh_degree=1, texture=TextureConfig(residual=False)),

@@ -32,7 +32,11 @@ def widen_kernels(real: type) -> SimpleNamespace:
 
     @wp.func
     def wide(scale: real, variance: real):
-        return wp.sqrt(scale * scale + variance)
+        """Hypotenuse of the scale and the blur's; squares of scales may overflow, or vanish."""
+        blurred = wp.sqrt(variance)
+        high = wp.max(scale, blurred)
+        ratio = wp.min(scale, blurred) / high
+        return high * wp.sqrt(ONE + ratio * ratio)
 
     @wp.func
     def share(scale: real, variance: real):
