@@ -2,8 +2,9 @@
 
 A test marked `beside(work, *arguments)` gets what `work(folder, *arguments)` gave, or raises what it raised, as the
 fixture `beside`. Such tests come last in a run of many. The work should be done in a process of its own: beside others
-it is called in a thread. `folder` is empty and its own. Tests with the same mark share one call. Work without arguments
-is marked `beside.with_args(work)`, for pytest takes a mark called with one function for that function's own mark.
+it is called in a thread, and had better not touch files there, for tests may have them fail. `folder` is empty and its
+own. Tests with the same mark share one call. Work without arguments is marked `beside.with_args(work)`, for pytest
+takes a mark called with one function for that function's own mark.
 """
 
 import subprocess
@@ -38,10 +39,13 @@ class Beside:
         self._begun: dict[tuple, Future] = {}
 
     def begin(self, works: Iterable[tuple]) -> None:
-        """Put work in line."""
+        """Put work in line.
+
+        Folders are made at once, in this thread: later ones may meet what a test has done to the file system's calls.
+        """
         for work in works:
             if work not in self._begun:
-                self._begun[work] = self.pool.submit(self._do, work)
+                self._begun[work] = self.pool.submit(self._do, work, self.folder(work[0].__name__))
 
     def result(self, work: tuple) -> Any:
         """Wait for work; what is still in line, or never was, is done here and now."""
@@ -49,14 +53,14 @@ class Beside:
         if future is None or future.cancel():
             future = self._begun[work] = Future()
             try:
-                future.set_result(self._do(work))
+                future.set_result(self._do(work, self.folder(work[0].__name__)))
             except BaseException as error:
                 future.set_exception(error)
         return future.result()
 
-    def _do(self, work: tuple) -> Any:
+    def _do(self, work: tuple, folder: Path) -> Any:
         function, *arguments = work
-        return function(self.folder(function.__name__), *arguments)
+        return function(folder, *arguments)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import os
 import pickle
 import random
 import shutil
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -375,9 +376,12 @@ class Killed(BaseException):
 def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
     """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
     calls: list[str] = []
+    mine = threading.get_ident()  # other threads, with work for other tests, live on
 
     def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != mine:
+                return original(*args, **kwargs)
             calls.append(name)
             if len(calls) > moment:  # what is dead does nothing any more, not even clean up
                 if len(calls) == moment + 1 and name == "write_bytes":
@@ -391,7 +395,12 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
     for owner, name in SYSTEM_CALLS:
         patch.setattr(owner, name, dying(name, getattr(owner, name)))
     unlink = Path.unlink
-    patch.setattr(Path, "unlink", lambda *args, **kw: None if len(calls) > moment else unlink(*args, **kw))
+
+    def gone(*args: Any, **kwargs: Any) -> None:
+        if len(calls) <= moment or threading.get_ident() != mine:
+            unlink(*args, **kwargs)
+
+    patch.setattr(Path, "unlink", gone)
     return calls
 
 

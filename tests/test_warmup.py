@@ -15,7 +15,6 @@ import warp as wp
 
 from nexwarp import cli, warmup
 from nexwarp.config import PRESETS, Config, TextureConfig
-from nexwarp.data import write_demo
 from nexwarp.densify import Densifier, DensifyConfig
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels
@@ -41,7 +40,9 @@ USE = """
 import json, sys, torch
 from dataclasses import replace
 from nexwarp import cli, config, warmup
+from nexwarp.data import write_demo
 scene, run, device = sys.argv[1:]
+write_demo(scene, width=48, height=36, views=10, points=200)
 base = config.PRESETS["default"]
 config.PRESETS["default"] = replace(base, texture=replace(base.texture, table_size=2**10))
 before = warmup.cached_binaries()
@@ -69,9 +70,8 @@ def fresh_process(program: str, *arguments: str, cache: Path) -> list[str]:
 
 def warmed(folder: Path, device: str) -> tuple[list[str], list[str]]:
     """What both print."""
-    scene = write_demo(folder / "tiny", width=48, height=36, views=10, points=200)
     warm = fresh_process(WARM, device, cache=folder)
-    return warm, fresh_process(USE, str(scene), str(folder / "run"), device, cache=folder)
+    return warm, fresh_process(USE, str(folder / "tiny"), str(folder / "run"), device, cache=folder)
 
 
 @pytest.mark.parametrize(
