@@ -24,9 +24,10 @@ def run(options: Options) -> list[Measurement]:
 
 def frame(scene: Scene, options: Options) -> list[Measurement]:
     field = texture(scene)
-    scene.surfels.footprints, scene.surfels.far_footprints = seen_footprints(
-        scene.surfels, [scene.camera], options=scene.options
-    )  # as a trained model has them
+    surfels = scene.surfels
+    if surfels.far_footprints is None:  # a trained model has both
+        surfels.footprints = None
+        surfels.footprints, surfels.far_footprints = seen_footprints(surfels, [scene.camera], options=scene.options)
 
     @torch.no_grad()
     def render() -> torch.Tensor:

@@ -295,17 +295,21 @@ def _zoom_psnr(trainer: Trainer) -> float:
     return statistics.fmean(figures)
 
 
+def smaller(camera: Camera, factor: int) -> Camera:
+    """A camera whose pixels are blocks of pixels, as `downscale_image` makes them."""
+    K = camera.K.clone()
+    K[:2] /= factor
+    return Camera(camera.viewmat, K, camera.width // factor, camera.height // factor, camera.near)
+
+
 @torch.no_grad()
 def _quarter_psnr(scene: Scene, image: Callable[[Camera], torch.Tensor]) -> float:
     """Of the test views at a quarter of the size, as from farther away, against their photos reduced by 4."""
     figures = []
     for view in scene.test:
-        c, factor = view.camera, 4
-        K = c.K.clone()
-        K[:2] /= factor
-        small = to_uint8(image(Camera(c.viewmat, K, c.width // factor, c.height // factor, c.near))).cpu()
-        mask = None if view.mask is None else downscale_mask(view.mask, factor)
-        figures.append(psnr(small, downscale_image(to_uint8(view.image), factor), mask))
+        small = to_uint8(image(smaller(view.camera, 4))).cpu()
+        mask = None if view.mask is None else downscale_mask(view.mask, 4)
+        figures.append(psnr(small, downscale_image(to_uint8(view.image), 4), mask))
     return statistics.fmean(figures)
 
 

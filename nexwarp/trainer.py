@@ -383,7 +383,7 @@ class Trainer:
         return max(len(view.points) for view in self.scene.train if view.points is not None)
 
     def finish(self) -> Model:
-        """Return the model as it is now, with the training views' exposures and the footprints of its surfels."""
+        """Return the model as it is now, with its surfels' footprints and exposures, metered where asked for."""
         cameras, options = self.views.cameras, self.render_options()
         self.surfels.exposures = self.surfels.footprints = self.surfels.far_footprints = None
         if self.config.footprints:

@@ -134,6 +134,13 @@ def test_cameras_between_get_the_gains_that_they_would_have_set(
         torch.testing.assert_close(tensor, found.tensors()[name], atol=1e-4, rtol=0)
 
 
+@pytest.fixture
+def followed(walls: tuple[nw.Surfels, list[Camera]]) -> tuple[nw.Surfels, list[Camera], torch.Tensor]:
+    """The walls, the cameras, and log gains that follow what those see."""
+    seen = brightness(walls[0], None, walls[1], options=OPTIONS)
+    return *walls, -0.7 * (seen - seen.mean(0))
+
+
 def positions(cameras: list[Camera]) -> list[float]:
     return [camera.position[0].item() for camera in cameras]
 
@@ -146,12 +153,10 @@ def test_exposures_that_brightness_does_not_tell_stay(walls: tuple[nw.Surfels, l
 
 
 def test_many_photos_leave_room_for_few_places(
-    walls: tuple[nw.Surfels, list[Camera]], monkeypatch: pytest.MonkeyPatch
+    followed: tuple[nw.Surfels, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No more than 1,000 count in all; places are spread over the capture, or there are none."""
-    surfels, cameras = walls
-    seen = brightness(surfels, None, cameras, options=OPTIONS)
-    gains = -0.7 * (seen - seen.mean(0))
+    surfels, cameras, gains = followed
     monkeypatch.setattr(metering, "PLACES", 15)
     for room, count in ((16, 16), (20, 16), (31, 31), (15, 11)):
         monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + room)
@@ -165,12 +170,10 @@ def test_many_photos_leave_room_for_few_places(
 
 
 def test_of_very_many_photos_each_keeps_its_own_gains(
-    walls: tuple[nw.Surfels, list[Camera]], monkeypatch: pytest.MonkeyPatch
+    followed: tuple[nw.Surfels, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cameras are thinned as their gains were."""
-    surfels, cameras = walls
-    seen = brightness(surfels, None, cameras, options=OPTIONS)
-    gains = -0.7 * (seen - seen.mean(0))
+    surfels, cameras, gains = followed
     for module in (metering, exposures_module):
         monkeypatch.setattr(module, "MOST_PHOTOS", 26)
     monkeypatch.setattr(metering, "PLACES", 5)

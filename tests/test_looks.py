@@ -1,0 +1,34 @@
+"""The benchmark of what a finished model has beside what was trained."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks import looks
+from nexwarp.config import Config, TextureConfig
+from nexwarp.data import write_demo
+from nexwarp.evaluate import evaluate
+from nexwarp.trainer import Trainer
+
+
+@pytest.mark.usefixtures("one_torch_thread", "few_looks")
+def test_the_benchmark_finishes_a_model_as_training_does(tmp_path: Path) -> None:
+    """Its figures at full size are those of the trained model; smaller pictures differ by what it is about."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=12, points=200))
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    trainer = Trainer(scene, Config(iterations=60, max_surfels=200, texture=texture), "cpu")
+    trainer.run()
+    model = trainer.finish()
+    expected = evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+    kept = {name: getattr(model.surfels, name).clone() for name in ("footprints", "far_footprints")}
+    found = looks.compare(model, scene)
+    assert list(found) == ["before", "far looks", "finished", "finished, full size reduced"]
+    assert found["finished"][0][0] == pytest.approx(expected, abs=1e-3)
+    for name, values in kept.items():
+        assert torch.equal(getattr(model.surfels, name), values), name
+    assert found["finished, full size reduced"][0] == found["finished"][0]
+    assert found["far looks"][0][0] == pytest.approx(found["before"][0][0], abs=0.05)
+    assert found["far looks"][2][0] != found["before"][2][0]
+    assert all(len(figures) == len(looks.FACTORS) for figures in found.values())
