@@ -34,7 +34,8 @@ def seen_footprints(
         (N,) of the closest textured hit, NEVER without any; (N,) of the farthest one, or of the centre in those views;
         without any hit, of the centre in all views that it is in front of, NEVER without those either.
     """
-    options = options | {"max_hits": max(options["max_hits"], 1)}
+    if options.get("max_hits") == 0:
+        options = options | {"max_hits": 1}
     closest = surfels.means.new_full((len(surfels),), NEVER)
     if not len(surfels):
         return closest, closest.clone()

@@ -178,8 +178,9 @@ def foretell(
     """Foretell other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
 
     A process of the pose, as `Exposures`, and beside it linear in the brightness. None where that foretells each photo
-    from the others no better, by Akaike's criterion, than the pose alone; channels count as independent, which they are
-    not where a camera has one exposure for all and no white balance: so slopes of all three are asked of each.
+    from the others no better than the pose alone, by Akaike's criterion: each channel has slopes of all three, and a
+    photo counts once, not three times, since what goes wrong with it (its exposure was set by hand, the scene learnt it
+    by heart) goes wrong with all its channels.
 
     Args:
         log_gains: (V, 3) of photos.
@@ -208,7 +209,7 @@ def _foretell(
     fits = [(*_fit(kernel + seen @ seen.T, values, noise), length) for kernel, length in poses for noise in NOISES]
     error, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
     slopes = 3 * seen.shape[1]
-    if not values.numel() * math.log(max(alone, TINY) / max(error, TINY)) > 2 * slopes:
+    if not len(values) * math.log(max(alone, TINY) / max(error, TINY)) > 2 * slopes:
         return None
     points, more = (torch.cat([position, size * direction], 1) for position, direction in (here, there))
     kernel = _matern(torch.cdist(more, points).square(), length)

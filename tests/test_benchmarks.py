@@ -19,6 +19,7 @@ from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
 from nexwarp import Camera, NeuralTexture, ops
 from nexwarp.checkpoint import Model, save_cameras, save_model
+from nexwarp.evaluate import NEVER
 from nexwarp.ops import Pinhole
 from tests.tolerances import assert_close
 
@@ -164,6 +165,13 @@ def test_frames_of_the_trained_scene_are_timed_with_its_options(
     scene = fox(run_folder)
     bench_frame.frame(scene, Options(CPU, quick=True))
     assert seen and all(options == scene.options for options in seen)
+
+
+def test_frames_of_an_untrained_scene_have_what_a_finished_model_has() -> None:
+    scene = small_scene()
+    assert scene.options == {} and scene.surfels.far_footprints is None
+    bench_frame.frame(scene, Options(CPU, quick=True))
+    assert (scene.surfels.footprints < NEVER).any() and (scene.surfels.far_footprints < NEVER).any()
 
 
 def test_command_names_the_trained_scene_or_says_that_it_is_absent(

@@ -69,6 +69,20 @@ def test_gains_that_do_not_are_left_to_the_poses() -> None:
     assert foretell(torch.zeros(40, 3), cameras, 0.2 * random(40, 3), cameras[:2], never) is None
 
 
+def test_what_goes_wrong_with_all_channels_tells_no_more_than_one() -> None:
+    """Errors that the channels share are no evidence for metering, nor, mostly, are those that the scene has learnt."""
+    cameras = [looking(x) for x in np.linspace(0, 4, 28)]
+    others, metered_anyway = cameras[:2], {"unrelated": 0, "learnt": 0}
+    for seed in range(40):
+        gains = 0.1 * random(28, 1, seed=seed) + 0.02 * random(28, 3, seed=1000 + seed)
+        seen = 0.2 * random(28, 1, seed=500 + seed) + 0.05 * random(28, 3, seed=700 + seed)
+        for kind, light in (("unrelated", seen), ("learnt", seen - gains)):
+            found = foretell(gains, cameras, light, others, lambda there=light[:2]: there)
+            metered_anyway[kind] += found is not None
+    assert metered_anyway["unrelated"] == 0
+    assert metered_anyway["learnt"] <= 4
+
+
 def test_brightness_is_that_of_light(device: torch.device) -> None:
     """Of a mean over light, not over sRGB; without the gains that renderings get, which come back after it."""
     scene = random_scene(40, device=device)
