@@ -1,10 +1,10 @@
-"""What a finished model has beside what was trained: looks from farther away, and exposures of other cameras.
+"""What a finished model has beside what was trained: far looks, smooth colours, and exposures of other cameras.
 
     python -m benchmarks.looks runs/fox/model.safetensors fox
 
 renders the test views of a trained model at the photos' size, a half, a quarter and an eighth of it, and compares with
-the photos reduced by area: as its file was before each of the two was there, and as it is finished now, whatever its
-file has. On a CPU or CUDA; nothing is trained.
+the photos reduced by area: as its file was before each of the three was there, and as it is finished now, whatever its
+file has; but colours that are smooth already stay. On a CPU or CUDA; nothing is trained.
 """
 
 import statistics
@@ -21,12 +21,14 @@ from benchmarks.exposures import gains_of
 from benchmarks.quality import arc, smaller
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
+from nexwarp.config import Config
 from nexwarp.data import Scene, load_scene
 from nexwarp.data.images import downscale_image
 from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures
 from nexwarp.metering import metered
 from nexwarp.metrics import flip, psnr, ssim, to_uint8
+from nexwarp.smooth_sh import smooth_sh
 
 FACTORS = (1, 2, 4, 8)
 
@@ -41,7 +43,8 @@ def compare(model: nw.Model, scene: Scene) -> dict[str, list[tuple[float, float,
 
     Returns:
         By form of the model, for each of `FACTORS`, the means of PSNR [dB], SSIM and FLIP (None without its package):
-        "before", "far looks", "finished" (with metered exposures, too), and "finished, full size reduced".
+        "before", "far looks", "smooth colours" (but where the file has them), "finished" (with metered exposures, too),
+        and "finished, full size reduced".
     """
     surfels, options = model.surfels, model.render_options
     cameras = [view.camera for view in scene.train]
@@ -50,18 +53,27 @@ def compare(model: nw.Model, scene: Scene) -> dict[str, list[tuple[float, float,
         surfels.exposures = Exposures.of(gains, cameras, falloff).to(surfels.device)
     surfels.footprints = surfels.far_footprints = None
     closest, farthest = seen_footprints(surfels, cameras, options=options)
+    smooth = (
+        None if model.meta.get("smooth_sh") else smooth_sh(surfels, scene.train, Config().smooth_sh, options=options)
+    )
 
     def image(camera: Camera) -> torch.Tensor:
         return nw.render(surfels, model.texture, camera.to(surfels.device), **options).image.cpu()
 
+    def looked() -> list[tuple[float, float, float | None]]:
+        return judge(scene, lambda camera, factor: image(smaller(camera, factor)))
+
     surfels.footprints = closest
-    found = {"before": judge(scene, lambda camera, factor: image(smaller(camera, factor)))}
+    found = {"before": looked()}
     surfels.far_footprints = farthest
-    found["far looks"] = judge(scene, lambda camera, factor: image(smaller(camera, factor)))
+    found["far looks"] = looked()
+    if smooth is not None:
+        surfels.sh0.data, surfels.shN.data = smooth
+        found["smooth colours"] = looked()
     if surfels.exposures is not None:
         exposures = metered(surfels.exposures, surfels, model.texture, cameras, options=options)
         surfels.exposures = exposures.to(surfels.device)
-    found["finished"] = judge(scene, lambda camera, factor: image(smaller(camera, factor)))
+    found["finished"] = looked()
     found["finished, full size reduced"] = judge(
         scene,
         lambda camera, factor: torch.nn.functional.avg_pool2d(image(camera).permute(2, 0, 1), factor).permute(1, 2, 0),

@@ -227,6 +227,10 @@ def _train_nexwarp(
     trainer.run()
     model = trainer.finish()
     seconds = begun + time.perf_counter() - start
+
+    def image(camera: Camera) -> torch.Tensor:
+        return render(model.surfels, model.texture, camera.to(device), **model.render_options).image
+
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         if models is not None:
@@ -239,13 +243,13 @@ def _train_nexwarp(
         "megabytes": megabytes,
         "seconds": seconds,
         "config": config_name(trainer.config),
-        "train_psnr": _train_psnr(trainer),
-        "zoom_psnr": _zoom_psnr(trainer),
-        "quarter_psnr": _quarter_psnr(scene, lambda camera: _image(trainer, camera, device)),
+        "train_psnr": _train_psnr(scene, image),
+        "zoom_psnr": _zoom_psnr(scene, image),
+        "quarter_psnr": _quarter_psnr(scene, image),
         **shared,
     }
     with torch.no_grad():
-        pictured = [(view, to_uint8(_image(trainer, view.camera, device)).cpu()) for view in scene.test]
+        pictured = [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
     return pictured, facts
 
 
@@ -263,24 +267,18 @@ def _go_on(trainer: Trainer, folder: Path) -> None:
         trainer.restore(Path(own))
 
 
-def _image(trainer: Trainer, camera: Camera, device: torch.device) -> torch.Tensor:
-    return render(trainer.surfels, trainer.texture, camera.to(device), **trainer.render_options()).image
-
-
 @torch.no_grad()
-def _train_psnr(trainer: Trainer) -> float:
+def _train_psnr(scene: Scene, image: Callable[[Camera], torch.Tensor]) -> float:
     """Of every 8th training view."""
-    views = trainer.scene.train[::8]
-    return statistics.fmean(
-        psnr(to_uint8(_image(trainer, view.camera, trainer.device)).cpu(), to_uint8(view.image)) for view in views
-    )
+    views = scene.train[::8]
+    return statistics.fmean(psnr(to_uint8(image(view.camera)).cpu(), to_uint8(view.image)) for view in views)
 
 
 @torch.no_grad()
-def _zoom_psnr(trainer: Trainer) -> float:
+def _zoom_psnr(scene: Scene, image: Callable[[Camera], torch.Tensor]) -> float:
     """Of the middles of the test views, looked at with 4 times the focal length, reduced again, against themselves."""
     figures = []
-    for view in trainer.scene.test:
+    for view in scene.test:
         c, factor = view.camera, 4
         width, height = c.width // factor, c.height // factor
         left, top = (c.width - width) // 2, (c.height - height) // 2
@@ -288,9 +286,9 @@ def _zoom_psnr(trainer: Trainer) -> float:
         K[:2] *= factor
         close = Camera(c.viewmat, K, c.width * factor, c.height * factor, c.near)
         close = close.crop(left * factor, top * factor, width * factor, height * factor)
-        image = _image(trainer, close, trainer.device).clamp(0, 1).permute(2, 0, 1)
-        reduced = torch.nn.functional.avg_pool2d(image, factor).permute(1, 2, 0)
-        plain = _image(trainer, c, trainer.device)[top : top + height, left : left + width]
+        zoomed = image(close).clamp(0, 1).permute(2, 0, 1)
+        reduced = torch.nn.functional.avg_pool2d(zoomed, factor).permute(1, 2, 0)
+        plain = image(c)[top : top + height, left : left + width]
         figures.append(psnr(to_uint8(reduced).cpu(), to_uint8(plain).cpu()))
     return statistics.fmean(figures)
 

@@ -69,6 +69,7 @@ HITS = (
 CHANGES = (
     Row("replacing texture", settings={"texture.residual": False}),
     Row("looks from elsewhere as they come", settings={"footprints": False}),
+    Row("colours as learnt everywhere", settings={"smooth_sh": 0.0}),
     Row("each photo's own exposure", settings={"exposures": False}),
     Row("exposures by poses alone", settings={"metering": False}),
     Row("the lens's dark corners", settings={"vignetting": False}),
@@ -144,9 +145,8 @@ def together(jobs: Iterable[Job], rows: Mapping[str, Row]) -> list[tuple[list[Jo
             alike = min(config.settled - 1, looked - 1, job.iterations)
             if alike > 0:
                 densify = dataclasses.replace(config.densify, floaters=False)
-                begun = dataclasses.replace(
-                    config, max_hits=min(config.max_hits, 2), densify=densify, metering=False, footprints=False
-                )
+                finished = {"metering": False, "footprints": False, "smooth_sh": 0.0}
+                begun = dataclasses.replace(config, max_hits=min(config.max_hits, 2), densify=densify, **finished)
                 key = (dataclasses.replace(job, row=""), json.dumps(begun.as_dict()))
         groups.setdefault(key, ([], alike))[0].append(job)
     return [(found, alike if len(found) > 1 else 0) for found, alike in groups.values()]

@@ -206,11 +206,11 @@ class Train:
                 create_run(run, source, config, device.type)
             _train(trainer, run, console, viewer, tensorboard=self.tensorboard, every=self.checkpoint_every)
             try:
-                _finish(trainer, scene, run, device, console)
+                model = _finish(trainer, scene, run, device, console)
             except OSError as error:
                 raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
             if viewer is not None:
-                viewer.finish(f"{trainer.iteration:,} iterations done")
+                viewer.finish(f"{trainer.iteration:,} iterations done", lambda: _shown(model, config))
                 _show(viewer, console)
 
     def _viewer(self, trainer: Trainer, run: Path, title: str, console: Console) -> Any:
@@ -425,7 +425,7 @@ class View:
         source, config, _ = read_run(self.run)
         model = load(self.run).to(pick_device(self.device))
         with Viewer(
-            lambda: (model.surfels, model.texture if config.max_hits else None, model.render_options),
+            lambda: _shown(model, config),
             load_cameras(self.run / CAMERAS_FILE),
             near=float(model.meta.get("near", 0.01)),
             title=source.name,
@@ -638,8 +638,13 @@ def _describe(step: Any) -> str:
     return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"
 
 
-def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> None:
-    """Write the model, then evaluate what was written."""
+def _shown(model: Model, config: Config) -> tuple[Any, ...]:
+    """A finished model, as the viewer takes it."""
+    return model.surfels, model.texture if config.max_hits else None, model.render_options
+
+
+def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> Model:
+    """Write the model, then evaluate what was written, which is returned."""
     file = save_model(run, trainer.finish())
     sets = {"train": scene.train, "test": scene.test}
     save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
@@ -667,6 +672,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, con
     if scene.test:
         first = Path(scene.test[0].name).with_suffix("")
         console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
+    return model
 
 
 def _figures(results: dict[str, Any], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:

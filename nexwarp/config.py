@@ -13,6 +13,7 @@ from nexwarp.kernels.types import MAX_HITS
 from nexwarp.losses import LossWeights
 from nexwarp.ops.checks import check_range
 from nexwarp.render import MAX_JITTER
+from nexwarp.smooth_sh import MAX_STRENGTH
 
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
@@ -105,6 +106,9 @@ class Config:
     footprints: bool = True
     """Show what is looked at from closer or farther than in training with the detail of then and without aliasing, and
     what was not seen without detail."""
+    smooth_sh: float = 0.01
+    """Once trained, make the surfels' colours smooth over directions that no photo had; larger costs more in those that
+    they had. 0: leave them as they are."""
     exposures: bool = True
     """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
     metering: bool = True
@@ -155,6 +159,7 @@ class Config:
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
+        check_range("smooth_sh", self.smooth_sh, 0.0, MAX_STRENGTH)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
@@ -333,6 +338,7 @@ PRESETS: dict[str, Config] = {
         border=0.0,
         depth_jitter=0.0,
         footprints=False,
+        smooth_sh=0.0,
         exposures=False,
         metering=False,
         vignetting=False,

@@ -29,6 +29,7 @@ from nexwarp.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.losses import border_loss, depth_loss, training_losses, visible_points
 from nexwarp.metering import metered
 from nexwarp.render import Rendering, jitter_factors, render
+from nexwarp.smooth_sh import smooth_sh
 from nexwarp.step_graphs import Learnt, StepGraphs
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
@@ -229,8 +230,6 @@ class Trainer:
 
     def _step(self) -> Progress:
         self.iteration += 1
-        self.surfels.footprints = self.surfels.far_footprints = None  # of surfels that are about to change
-        self.surfels.exposures = None  # the photos are all brought to one
         config = self.config
         coarse = self.iteration <= config.coarse * config.iterations
         index = self._next_view()
@@ -383,22 +382,32 @@ class Trainer:
         return max(len(view.points) for view in self.scene.train if view.points is not None)
 
     def finish(self) -> Model:
-        """Return the model as it is now, with its surfels' footprints and exposures, metered where asked for."""
-        cameras, options = self.views.cameras, self.render_options()
-        self.surfels.exposures = self.surfels.footprints = self.surfels.far_footprints = None
+        """Return a model with surfels of its own: as they are now, with smooth colours, footprints, metered exposures.
+
+        Which of these follows from the settings. The texture is the trainer's own.
+        """
+        with _deterministic(self.config.deterministic and self.device.type == "cuda"):
+            return self._finish()
+
+    def _finish(self) -> Model:
+        raw = {name: value.detach().clone() for name, value in self.surfels.state_dict().items()}
+        surfels, cameras, options = Surfels(raw), self.views.cameras, self.render_options()
+        if self.config.smooth_sh > 0:
+            found = smooth_sh(surfels, self.scene.train, self.config.smooth_sh, options=options)
+            surfels.sh0.data, surfels.shN.data = found
         if self.config.footprints:
-            closest, farthest = seen_footprints(self.surfels, cameras, options=options)
-            self.surfels.footprints, self.surfels.far_footprints = closest, farthest
+            surfels.footprints, surfels.far_footprints = seen_footprints(surfels, cameras, options=options)
         if self.exposures is not None:
             found = self.exposures
             if self.config.metering:
                 texture = self.texture if self.config.max_hits else None
-                found = metered(found, self.surfels, texture, cameras, options=options)
-            self.surfels.exposures = found.to(self.device)
-        return self.model()
+                found = metered(found, surfels, texture, cameras, options=options)
+            surfels.exposures = found.to(self.device)
+        model = self.model()
+        return Model(surfels, model.texture, model.meta | {"smooth_sh": self.config.smooth_sh})
 
     def model(self) -> Model:
-        """Return the model as it is now."""
+        """Return the model as it is now: the trainer's own surfels and texture."""
         meta = {
             **self.render_options(),
             "near": self.scene.train[0].camera.near,

@@ -96,10 +96,10 @@ def rehearse(config: Config, device: torch.device) -> None:
     options = trainer.render_options()
     if config.densify.floaters:
         floaters(trainer.surfels, trainer.views.cameras, [1.0], torch.Generator(), options=options)
-    trainer.finish()
-    evaluate(trainer.surfels, trainer.texture, scene.test, options=options)
+    model = trainer.finish()
+    evaluate(model.surfels, model.texture, scene.test, options=options)
     with torch.no_grad():
-        out = render(trainer.surfels, trainer.texture, scene.test[0].camera.to(device), **options)
+        out = render(model.surfels, model.texture, scene.test[0].camera.to(device), **options)
         out.splat_error(out.alpha)
 
 

@@ -43,6 +43,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "coarse": ("", ""),
     "background": ("", "code"),
     "footprints": ("", ""),
+    "smooth_sh": ("", ""),
     "exposures": ("", ""),
     "metering": ("", ""),
     "vignetting": ("", ""),

@@ -19,6 +19,7 @@ LAYERS = [
         "densify",
         "floaters",
         "metering",
+        "smooth_sh",
         "checkpoint",
         "evaluate",
         "passes",

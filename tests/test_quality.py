@@ -285,7 +285,7 @@ def test_rows_of_which_only_what_comes_late_differs_begin_together() -> None:
     assert together(peers, ROWS) == [([job], 0) for job in peers]
     jobs = list(jobs_of("changes", ("fox",), (0,), 300, 40))
     alike = {tuple(job.row for job in members): count for members, count in together(jobs, ROWS) if count}
-    finished = ("looks from elsewhere as they come", "exposures by poses alone")
+    finished = ("looks from elsewhere as they come", "colours as learnt everywhere", "exposures by poses alone")
     assert alike == {("default", *finished, "floaters left"): 249}
     few = {"none": {"max_hits": 0}, "none, left": {"max_hits": 0, "densify.floaters": False}, "one": {"max_hits": 1}}
     early = {"early": {"densify.stop": 20_000}, "early, left": {"densify.stop": 20_000, "densify.floaters": False}}

@@ -277,7 +277,7 @@ def test_paper_is_the_paper():
     assert p.losses == LossWeights(
         dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0, alpha_hits=8
     )
-    assert (p.border, p.mask_mode, p.footprints) == (0.0, "ignore", False)
+    assert (p.border, p.mask_mode, p.footprints, p.smooth_sh) == (0.0, "ignore", False, 0.0)
     assert (p.exposures, p.metering, p.vignetting) == (False, False, False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),

@@ -611,7 +611,9 @@ def test_looking_changes_nothing_about_a_training(run):
         watched.run(observe)
         assert len(set(drawn)) > 2 and described, "pictures came while it trained"
         assert session.frustums and len(viewer.thumbnails) == len(scene.train)
-        viewer.finish("done")
+        finished = watched.finish()
+        viewer.finish("done", lambda: (finished.surfels, finished.texture, finished.render_options))
+        assert viewer.model()[0] is finished.surfels and finished.surfels is not watched.surfels
     for (name, a), (_, b) in zip(alone._named_parameters(), watched._named_parameters(), strict=True):
         assert torch.equal(a, b), name
 

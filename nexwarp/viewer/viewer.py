@@ -29,13 +29,15 @@ SHARE = 0.2
 TELL_SECONDS = 0.5
 DEFAULT_FOV = 0.9
 
+Shown = Callable[[], tuple[Surfels, NeuralTexture | None, Mapping[str, Any]]]
+
 
 class Viewer:
     """A web page that shows a model; pictures are drawn on the thread that calls `show` or `between_steps`."""
 
     def __init__(
         self,
-        model: Callable[[], tuple[Surfels, NeuralTexture | None, Mapping[str, Any]]],
+        model: Shown,
         cameras: Mapping[str, Mapping[str, Camera]],
         *,
         near: float,
@@ -124,8 +126,9 @@ class Viewer:
             while self.paused and not stop():
                 self._draw_or_wait()
 
-    def finish(self, text: str) -> None:
-        """Say that the training is over."""
+    def finish(self, text: str, model: Shown) -> None:
+        """Say that the training is over, and show another model from now on, as the constructor takes it."""
+        self.model = model
         self.paused = False
         self.status.content = f"{text}"
         self.progress.value = 100.0

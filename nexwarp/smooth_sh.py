@@ -1,0 +1,92 @@
+"""Colours of surfels in directions that no photo looked from: of all that fit the training views, the smoothest.
+
+A surfel's spherical harmonics are learnt from the directions that photos have of it, often few and close to each other.
+What they give elsewhere is an accident of the optimizer's way, and degree 3 strays far: pink and green, where a capture
+has a gap. Once trained, each surfel's coefficients c are therefore taken by ridge regression to
+
+    argmin over x of  sum_v w_v |Y(d_v) (x - c)|^2 / sum_v w_v  +  strength |D x|^2,
+
+where w_v is the sum of the surfel's blending weights in training view v, d_v its direction there, Y the harmonics, and
+D the Laplacian on the sphere, -l (l + 1) for degree l, over that of degree 3: what training views show stays almost as
+it is, and the rest is as even as that allows. Not in the paper.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from nexwarp import ops
+from nexwarp.data import View
+from nexwarp.render import render
+from nexwarp.surfels import Surfels
+
+SURFELS = 2**15  # whose equations are solved at once, in float64
+LEAST = 1e-6  # pixels that a surfel has in all views, at least, if it is seen
+MAX_STRENGTH = 1e6
+
+
+@torch.no_grad()
+def smooth_sh(
+    surfels: Surfels, views: Sequence[View], strength: float, *, options: dict[str, Any]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the surfels' coefficients, `sh0` (N, 1, 3) and `shN` (N, C - 1, 3), as smooth as training views allow.
+
+    A surfel that no view shows gets one colour, that of its `sh0`.
+
+    Args:
+        surfels: N trained ones, without footprints; they stay as they are.
+        views: all training views, on any device; what their masks leave out tells nothing.
+        strength: > 0, up to `MAX_STRENGTH`, what smoothness counts; a view that has all of a surfel's weight counts 1.
+        options: keyword arguments of `nexwarp.render`.
+    """
+    sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
+    count = shN.shape[1] + 1
+    if count == 1 or not len(surfels):
+        return sh0.clone(), shN.clone()
+    gram, total = seen_directions(surfels, views, options=options)
+    degrees = torch.arange(count, device=surfels.device, dtype=torch.float64).sqrt().floor()
+    roughness = (degrees * (degrees + 1) / 12).square()
+    found = torch.cat([sh0, shN], dim=1)
+    for part in torch.arange(len(surfels), device=surfels.device).split(SURFELS):
+        known = total[part] > LEAST
+        # Of what is to be taken away, which is nothing where training views tell all.
+        some = part[known]
+        penalty = strength * roughness
+        left = gram[some].double() / total[some].double()[:, None, None] + torch.diag(penalty)
+        rough = penalty[:, None] * found[some].double()
+        found[some] -= torch.linalg.solve(left, rough).to(found)
+        found[part[~known], 1:] = 0.0
+    return found[:, :1].contiguous(), found[:, 1:].contiguous()
+
+
+@torch.no_grad()
+def seen_directions(
+    surfels: Surfels, views: Sequence[View], *, options: dict[str, Any]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return sum_v w_v Y(d_v)^T Y(d_v), (N, C, C), and sum_v w_v, (N,): which directions views have of each surfel.
+
+    Args:
+        surfels: the N surfels, with C coefficients a channel.
+        views: v, on any device; pixels that their masks leave out do not count.
+        options: keyword arguments of `nexwarp.render`.
+    """
+    count = surfels.shN.shape[1] + 1
+    gram, total = surfels.means.new_zeros(len(surfels), count, count), surfels.means.new_zeros(len(surfels))
+    for view in views:
+        camera = view.camera.to(surfels.device)
+        out = render(surfels, None, camera, **options)
+        counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
+        weights = out.splat_error(counts)
+        basis = _basis(surfels.means.detach(), camera.position, count)
+        gram.baddbmm_((weights[:, None] * basis)[:, :, None], basis[:, None, :])
+        total += weights
+    return gram, total
+
+
+def _basis(means: torch.Tensor, position: torch.Tensor, count: int) -> torch.Tensor:
+    """Spherical harmonics (N, C) of the directions to surfels, as their colours have them: the derivative of those."""
+    sh = means.new_zeros(len(means), count, 3).requires_grad_()
+    with torch.enable_grad():
+        colors = ops.plain_colors(sh, means, position, round(count**0.5) - 1)
+        return torch.autograd.grad(colors.sum(), sh)[0][..., 0]
