@@ -79,7 +79,7 @@ def seen_directions(
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
         weights = out.splat_error(counts)
         basis = _basis(surfels.means.detach(), camera.position, count)
-        gram.baddbmm_((weights[:, None] * basis)[:, :, None], basis[:, None, :])
+        gram.addcmul_((weights[:, None] * basis)[:, :, None], basis[:, None, :])
         total += weights
     return gram, total
 
