@@ -44,7 +44,7 @@ class Model:
         surfels: the surfels, float32.
         texture: the neural texture, float32 (stored in half precision).
         meta: what rendering needs beside them: `max_hits`, `background`, `sh_degree`, `low_pass`, `clamp_texture`,
-            `near`; and `format_version`, `frame`, `scene_scale`, `preset`, `iteration`.
+            `near`; and `format_version`, `frame`, `scene_scale`, `preset`, `iteration`, of a finished one `smooth_sh`.
     """
 
     surfels: Surfels
@@ -185,7 +185,7 @@ def _check_options(meta: dict[str, Any]) -> None:
         raise ValueError(f"background: expected three numbers, got {colour!r}")
     for x in colour:
         check_range("background", x, -LARGEST_COLOR, LARGEST_COLOR)
-    for name in ("near", "scene_scale"):
+    for name in ("near", "scene_scale", "smooth_sh"):
         if name in meta:
             if type(meta[name]) not in (int, float):
                 raise ValueError(f"{name}: expected a number, got {meta[name]!r:.60}")

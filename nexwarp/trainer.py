@@ -382,9 +382,9 @@ class Trainer:
         return max(len(view.points) for view in self.scene.train if view.points is not None)
 
     def finish(self) -> Model:
-        """Return a model with surfels of its own: as they are now, with smooth colours, footprints, metered exposures.
+        """Return a model with surfels of its own: as they are now, and what the settings ask of a finished model.
 
-        Which of these follows from the settings. The texture is the trainer's own.
+        That is smooth colours, footprints and exposures, metered or not. The texture is the trainer's own.
         """
         with _deterministic(self.config.deterministic and self.device.type == "cuda"):
             return self._finish()

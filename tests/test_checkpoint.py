@@ -537,6 +537,9 @@ def test_models_that_cannot_render_are_refused(tmp_path):
         ("background", [0, 0]),
         ("low_pass", 1),
         ("sh_degree", None),
+        ("near", "far"),
+        ("smooth_sh", "smooth"),
+        ("smooth_sh", -0.1),
     ):
         save_model(tmp_path, nw.Model(model.surfels, texture, meta | {key: value}))
         with pytest.raises(ValueError, match=key):

@@ -19,6 +19,7 @@ from tests.tolerances import assert_close
 
 OPTIONS = {"max_hits": 2}
 SIDE = 24
+CONSTANT = 0.28209479177387814  # the harmonic of degree 0
 ROUGHNESS = torch.tensor([(degree * (degree + 1) / 12) ** 2 for degree in range(4) for _ in range(2 * degree + 1)])
 
 
@@ -51,8 +52,8 @@ def colors(surfels: Surfels, views: list[View], sh: tuple[torch.Tensor, torch.Te
     offset = 10.0
     found = []
     for v in views:
-        colors = ops.plain_colors((sh[0] + offset, sh[1]), surfels.means, v.camera.position.to(surfels.device), 3)
-        found.append(colors - 0.5 - 0.28209479177387814 * offset)
+        raised = ops.plain_colors((sh[0] + offset, sh[1]), surfels.means, v.camera.position.to(surfels.device), 3)
+        found.append(raised - 0.5 - CONSTANT * offset)
     return torch.stack(found).detach()
 
 
@@ -71,9 +72,8 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
         surfels.sh0.grad = None
         out = nw.render(surfels, None, camera, max_hits=0)
         (out.plain * counts)[..., 0].sum().backward()
-        y00 = 0.28209479177387814
         shown = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, 3)[:, 0] > 0
-        weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / y00, torch.nan)
+        weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / CONSTANT, torch.nan)
         basis = torch.stack([colors(surfels, [v], one(k, surfels))[0, :, 0] for k in range(16)], dim=1)
         expected += weights[:, None, None] * basis[:, :, None] * basis[:, None, :]
         expected_total += weights
