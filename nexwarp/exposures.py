@@ -94,7 +94,7 @@ class Exposures(nn.Module):
             size, squares = _apart(positions, directions)
             kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
             fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
-            _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+            _, _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
         return cls(*(x.float() for x in tensors), torch.tensor([float(x) for x in falloff or EVEN]))
 
@@ -159,13 +159,19 @@ def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Ten
     return size, torch.cdist(*[torch.cat([positions, size * directions], 1)] * 2).square()
 
 
-def _fit(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[float, torch.Tensor, torch.Tensor]:
-    """Fit a process to values (V, 3): its squared error on each from the others; coefficients (V, 3); mean (3,)."""
+def _fit(
+    kernel: torch.Tensor, values: torch.Tensor, noise: float
+) -> tuple[float, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Fit a process to values (V, 3).
+
+    Returns:
+        The sum of squares of the next; errors (V, 3) of each from the others; coefficients (V, 3); mean (3,).
+    """
     inverse = torch.linalg.inv(kernel + noise * torch.eye(len(values), dtype=values.dtype))
     mean = inverse.sum(0) @ values / inverse.sum()
     coefficients = inverse @ (values - mean)
-    error = (coefficients / inverse.diagonal()[:, None]).square().sum().item()
-    return round(error, 9), coefficients, mean
+    errors = coefficients / inverse.diagonal()[:, None]
+    return round(errors.square().sum().item(), 9), errors, coefficients, mean
 
 
 def foretell(
@@ -177,10 +183,10 @@ def foretell(
 ) -> torch.Tensor | None:
     """Foretell other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
 
-    A process of the pose, as `Exposures`, and beside it linear in the brightness. None where that foretells each photo
-    from the others no better than the pose alone, by Akaike's criterion: each channel has slopes of all three, and a
-    photo counts once, not three times, since what goes wrong with it (its exposure was set by hand, the scene learnt it
-    by heart) goes wrong with all its channels.
+    A process of the pose, as `Exposures`, and beside it linear in the brightness: each channel in those of all three.
+    None where that foretells each photo from the others no better than the pose alone, by Akaike's criterion, corrected
+    for few photos. Channels are not independent there: what goes wrong with a photo (its exposure was set by hand, the
+    scene learnt it by heart) goes wrong with all of them.
 
     Args:
         log_gains: (V, 3) of photos.
@@ -204,17 +210,35 @@ def _foretell(
     size, squares = _apart(*here)
     seen = brightness - brightness.mean(0)
     poses = [(_matern(squares, length * size), length * size) for length in LENGTHS]
-    alone = min(_fit(kernel, values, noise)[0] for kernel, _ in poses for noise in NOISES)
+    alone = min((_fit(kernel, values, noise) for kernel, _ in poses for noise in NOISES), key=lambda fit: fit[0])
     # Slopes as large as the process is, a priori.
     fits = [(*_fit(kernel + seen @ seen.T, values, noise), length) for kernel, length in poses for noise in NOISES]
-    error, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
-    slopes = 3 * seen.shape[1]
-    if not len(values) * math.log(max(alone, TINY) / max(error, TINY)) > 2 * slopes:
+    _, errors, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+    if not _better(errors, alone[1], seen.shape[1]):
         return None
     points, more = (torch.cat([position, size * direction], 1) for position, direction in (here, there))
     kernel = _matern(torch.cdist(more, points).square(), length)
     found = mean + (kernel + (others_brightness() - brightness.mean(0)) @ seen.T) @ coefficients
     return found.clamp(values.amin(0), values.amax(0)).round(decimals=DECIMALS)
+
+
+def _better(errors: torch.Tensor, others: torch.Tensor, slopes: int) -> bool:
+    """Whether errors (V, 3), of a fit with so many slopes a channel, are less than others (V, 3) by Akaike's criterion.
+
+    Of errors that are normal, and dependent from channel to channel, with the correction for few photos (Bedrick and
+    Tsai 1994, Model selection for multivariate regression in small samples).
+    """
+    photos, channels = errors.shape
+
+    def criterion(errors: torch.Tensor, regressors: int) -> float:
+        left = photos - regressors - channels - 1
+        if left <= 0:
+            return math.inf
+        squares = errors.T @ errors + TINY * torch.eye(channels, dtype=errors.dtype)
+        parameters = channels * regressors + channels * (channels + 1) / 2
+        return photos * torch.logdet(squares).item() + 2 * parameters * photos / left
+
+    return criterion(errors, 1 + slopes) < criterion(others, 1)
 
 
 def photo_gains(
