@@ -4,7 +4,7 @@
 
 renders the test views of a trained model at the photos' size, a half, a quarter and an eighth of it, and compares with
 the photos reduced by area: as its file was before each of the three was there, and as it is finished now, whatever its
-file has; but colours that are smooth already stay. On a CPU or CUDA; nothing is trained.
+file has; but colours that are smooth already, with whatever strength, stay. On a CPU or CUDA; nothing is trained.
 """
 
 import statistics
@@ -28,6 +28,7 @@ from nexwarp.evaluate import seen_footprints
 from nexwarp.exposures import Exposures
 from nexwarp.metering import metered
 from nexwarp.metrics import flip, psnr, ssim, to_uint8
+from nexwarp.pictures import save_png, side_by_side
 from nexwarp.smooth_sh import smooth_sh
 
 FACTORS = (1, 2, 4, 8)
@@ -93,12 +94,23 @@ def judge(scene: Scene, image: Callable[[Camera, int], torch.Tensor]) -> list[tu
     return found
 
 
+@torch.no_grad()
+def picture(model: nw.Model, scene: Scene, folder: Path) -> None:
+    """Save each test view, photo and render side by side, in a folder."""
+    for view in scene.test:
+        camera = view.camera.to(model.surfels.device)
+        image = nw.render(model.surfels, model.texture, camera, **model.render_options).image
+        both = [to_uint8(view.image), to_uint8(image).cpu()]
+        save_png(folder / f"{Path(view.name).stem}.png", side_by_side(both, captions=["photo", "render"]))
+
+
 def main(
     model: Annotated[Path, tyro.conf.Positional],
     scene: Annotated[str, tyro.conf.Positional],
     downscale: int = 1,
     held_out: Annotated[str, tyro.conf.arg(metavar="{8th,arc}")] = "8th",
     data: Path = ROOT.parent / "shared" / "data",
+    pictures: Path | None = None,
 ) -> int:
     """Print a Markdown table.
 
@@ -108,10 +120,15 @@ def main(
         downscale: of the photos it was trained on.
         held_out: test views: every 8th, or the arc of `benchmarks.quality`.
         data: folder of scenes.
+        pictures: folder for photo and render of each test view, as finished.
     """
     photos = load_scene(scene if Path(scene).exists() else data / scene, downscale=downscale)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    found = compare(nw.load(model).to(device), arc(photos) if held_out == "arc" else photos)
+    views = arc(photos) if held_out == "arc" else photos
+    finished = nw.load(model).to(device)
+    found = compare(finished, views)
+    if pictures is not None:
+        picture(finished, views, pictures)
     print("| PSNR [dB], SSIM, FLIP | " + " | ".join(f"1/{factor}" for factor in FACTORS) + " |")
     print("|---" * (len(FACTORS) + 1) + "|")
     for name, figures in found.items():

@@ -13,7 +13,7 @@ from nexwarp.kernels.types import MAX_HITS
 from nexwarp.losses import LossWeights
 from nexwarp.ops.checks import check_range
 from nexwarp.render import MAX_JITTER
-from nexwarp.smooth_sh import MAX_STRENGTH
+from nexwarp.smooth_sh import MAX_STRENGTH, MIN_STRENGTH
 
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
@@ -159,7 +159,8 @@ class Config:
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
-        check_range("smooth_sh", self.smooth_sh, 0.0, MAX_STRENGTH)
+        if self.smooth_sh != 0.0:
+            check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
@@ -187,18 +188,25 @@ class Config:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Config":
-        """Rebuild a config from `as_dict`; ValueError names an unknown key."""
-        parts = {
-            "losses": LossWeights,
-            "rates": LearningRates,
-            "texture": TextureConfig,
-            "densify": DensifyConfig,
-        }
+        """Rebuild a config from `as_dict`; ValueError names an unknown key.
+
+        What an older version did not write is as in the preset that the run started from.
+        """
         try:
-            data = {k: parts[k](**_checked(parts[k], _tuples(v), k)) if k in parts else v for k, v in data.items()}
-            return cls(**_checked(cls, _tuples(data), "config"))
+            preset = data.get("preset")
+            base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else cls()
+            data = {k: _part(getattr(base, k), v, k) if k in PARTS else v for k, v in data.items()}
+            return dataclasses.replace(base, **_checked(cls, _tuples(data), "config"))
         except (TypeError, AttributeError, KindError) as error:
             raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
+
+
+PARTS = ("losses", "rates", "texture", "densify")
+
+
+def _part(base: Any, data: Any, where: str) -> Any:
+    """A part of the settings."""
+    return dataclasses.replace(base, **_checked(type(base), _tuples(data), where))
 
 
 class KindError(ValueError):

@@ -1,4 +1,4 @@
-"""Colours of surfels in directions that no photo looked from: of all that fit the training views, the smoothest.
+"""Colours of surfels in directions that no photo looked from: smooth, at a small cost in those that photos have.
 
 A surfel's spherical harmonics are learnt from the directions that photos have of it, often few and close to each other.
 What they give elsewhere is an accident of the optimizer's way, and degree 3 strays far: pink and green, where a capture
@@ -6,9 +6,10 @@ has a gap. Once trained, each surfel's coefficients c are therefore taken by rid
 
     argmin over x of  sum_v w_v |Y(d_v) (x - c)|^2 / sum_v w_v  +  strength |D x|^2,
 
-where w_v is the sum of the surfel's blending weights in training view v, d_v its direction there, Y the harmonics, and
-D the Laplacian on the sphere, -l (l + 1) for degree l, over that of degree 3: what training views show stays almost as
-it is, and the rest is as even as that allows. Not in the paper.
+where w_v is the sum of the surfel's blending weights in training view v, its textured hits' included, d_v its direction
+there, Y the harmonics, before colours are limited to >= 0, and D the Laplacian on the sphere, -l (l + 1) for degree l,
+over that of degree 3: what training views show stays almost as it is, and the rest is as even as that allows. Not in
+the paper.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from nexwarp.surfels import Surfels
 
 SURFELS = 2**15  # whose equations are solved at once, in float64
 LEAST = 1e-6  # pixels that a surfel has in all views, at least, if it is seen
-MAX_STRENGTH = 1e6
+MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less is lost in the rounding
 
 
 @torch.no_grad()
@@ -32,22 +33,23 @@ def smooth_sh(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the surfels' coefficients, `sh0` (N, 1, 3) and `shN` (N, C - 1, 3), as smooth as training views allow.
 
-    A surfel that no view shows gets one colour, that of its `sh0`.
+    A surfel that no view shows gets one colour, that of its `sh0`. Coefficients above the degree that is rendered stay.
 
     Args:
         surfels: N trained ones, without footprints; they stay as they are.
         views: all training views, on any device; what their masks leave out tells nothing.
-        strength: > 0, up to `MAX_STRENGTH`, what smoothness counts; a view that has all of a surfel's weight counts 1.
+        strength: `MIN_STRENGTH` to `MAX_STRENGTH`, what smoothness counts; all of a surfel's weight counts 1.
         options: keyword arguments of `nexwarp.render`.
     """
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
-    count = shN.shape[1] + 1
+    count = _count(surfels, options)
     if count == 1 or not len(surfels):
         return sh0.clone(), shN.clone()
     gram, total = seen_directions(surfels, views, options=options)
     degrees = torch.arange(count, device=surfels.device, dtype=torch.float64).sqrt().floor()
     roughness = (degrees * (degrees + 1) / 12).square()
-    found = torch.cat([sh0, shN], dim=1)
+    every = torch.cat([sh0, shN], dim=1)
+    found = every[:, :count]
     for part in torch.arange(len(surfels), device=surfels.device).split(SURFELS):
         known = total[part] > LEAST
         # Of what is to be taken away, which is nothing where training views tell all.
@@ -57,7 +59,7 @@ def smooth_sh(
         rough = penalty[:, None] * found[some].double()
         found[some] -= torch.linalg.solve(left, rough).to(found)
         found[part[~known], 1:] = 0.0
-    return found[:, :1].contiguous(), found[:, 1:].contiguous()
+    return every[:, :1].contiguous(), every[:, 1:].contiguous()
 
 
 @torch.no_grad()
@@ -67,21 +69,28 @@ def seen_directions(
     """Return sum_v w_v Y(d_v)^T Y(d_v), (N, C, C), and sum_v w_v, (N,): which directions views have of each surfel.
 
     Args:
-        surfels: the N surfels, with C coefficients a channel.
+        surfels: the N surfels; C is the number of their coefficients a channel that are rendered.
         views: v, on any device; pixels that their masks leave out do not count.
         options: keyword arguments of `nexwarp.render`.
     """
-    count = surfels.shN.shape[1] + 1
+    count = _count(surfels, options)
     gram, total = surfels.means.new_zeros(len(surfels), count, count), surfels.means.new_zeros(len(surfels))
     for view in views:
         camera = view.camera.to(surfels.device)
         out = render(surfels, None, camera, **options)
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
         weights = out.splat_error(counts)
-        basis = _basis(surfels.means.detach(), camera.position, count)
-        gram.addcmul_((weights[:, None] * basis)[:, :, None], basis[:, None, :])
+        seen = weights.nonzero()[:, 0]
+        basis = _basis(surfels.means.detach()[seen], camera.position, count)
+        gram[seen] += (weights[seen, None] * basis)[:, :, None] * basis[:, None, :]
         total += weights
     return gram, total
+
+
+def _count(surfels: Surfels, options: dict[str, Any]) -> int:
+    """Coefficients a channel that are rendered."""
+    count = surfels.shN.shape[1] + 1
+    return min(count, (options["sh_degree"] + 1) ** 2) if "sh_degree" in options else count
 
 
 def _basis(means: torch.Tensor, position: torch.Tensor, count: int) -> torch.Tensor:

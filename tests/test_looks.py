@@ -43,11 +43,13 @@ def test_the_benchmark_finishes_a_model_as_training_does(scene: Scene) -> None:
 
 
 @pytest.mark.usefixtures("one_torch_thread", "few_looks")
-def test_colours_that_are_as_learnt_are_made_smooth(scene: Scene) -> None:
+def test_colours_that_are_as_learnt_are_made_smooth(scene: Scene, tmp_path: Path) -> None:
     smooth, learnt = trained(scene), trained(scene, smooth_sh=0.0)
     assert not torch.equal(smooth.surfels.shN, learnt.surfels.shN)
     found = looks.compare(learnt, scene)
     assert list(found)[2] == "smooth colours"
     assert torch.equal(smooth.surfels.shN, learnt.surfels.shN) and torch.equal(smooth.surfels.sh0, learnt.surfels.sh0)
+    looks.picture(learnt, scene, tmp_path / "pictures")
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == len(scene.test)
     again = looks.compare(smooth, scene)
     assert again["finished"] == found["finished"] and again["far looks"] == found["smooth colours"]

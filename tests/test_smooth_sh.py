@@ -149,6 +149,18 @@ def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.dev
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("degree", [1, 2])
+def test_degrees_that_are_not_rendered_take_no_part(device: torch.device, degree: int) -> None:
+    """As if the surfels had no others; what they have above stays."""
+    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
+    count = (degree + 1) ** 2
+    less = Surfels({name: x[:, : count - 1] if name == "shN" else x for name, x in surfels.state_dict().items()})
+    sh0, shN = smooth_sh(surfels, views, 0.01, options=OPTIONS | {"sh_degree": degree})
+    for a, b in zip((sh0, shN[:, : count - 1]), smooth_sh(less, views, 0.01, options=OPTIONS), strict=True):
+        assert_close(a, b, kind="value", name="degrees")
+    assert torch.equal(shN[:, count - 1 :], surfels.shN[:, count - 1 :])
+
+
 def test_many_surfels_are_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     surfels, views = make_surfels(random_scene(50, device=device)), around([0.0, 0.4])
     whole = smooth_sh(surfels, views, 0.01, options=OPTIONS)
@@ -190,6 +202,6 @@ def test_presets_without_it_keep_what_was_learnt(scene: Scene) -> None:
     trainer.run()
     model = trainer.finish()
     assert torch.equal(model.surfels.shN, trainer.surfels.shN) and model.meta["smooth_sh"] == 0.0
-    for value in (-1.0, 2 * MAX_STRENGTH, math.nan):
+    for value in (-1.0, 1e-7, 2 * MAX_STRENGTH, math.nan):
         with pytest.raises(ValueError, match="smooth_sh"):
             Config(smooth_sh=value)

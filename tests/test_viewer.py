@@ -613,7 +613,14 @@ def test_looking_changes_nothing_about_a_training(run):
         assert session.frustums and len(viewer.thumbnails) == len(scene.train)
         finished = watched.finish()
         viewer.finish("done", lambda: (finished.surfels, finished.texture, finished.render_options))
-        assert viewer.model()[0] is finished.surfels and finished.surfels is not watched.surfels
+        asked: list[nw.Surfels] = []
+        shown = viewer.model
+        viewer.model = lambda: asked.append(shown()[0]) or shown()
+        start = time.perf_counter()
+        viewer.show(
+            lambda: (bool(asked) and session.drawn_version == session.version) or time.perf_counter() > start + 20
+        )
+        assert asked and asked[-1] is finished.surfels is not watched.surfels
     for (name, a), (_, b) in zip(alone._named_parameters(), watched._named_parameters(), strict=True):
         assert torch.equal(a, b), name
 

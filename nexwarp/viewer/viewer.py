@@ -129,6 +129,9 @@ class Viewer:
     def finish(self, text: str, model: Shown) -> None:
         """Say that the training is over, and show another model from now on, as the constructor takes it."""
         self.model = model
+        for session in list(self.sessions.values()):
+            session.drawn_version = -1  # what it shows is of the other one
+        self._news.set()
         self.paused = False
         self.status.content = f"{text}"
         self.progress.value = 100.0
