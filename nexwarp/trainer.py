@@ -386,14 +386,12 @@ class Trainer:
 
         That is smooth colours, footprints and exposures, metered or not. The texture is the trainer's own.
         """
-        with _deterministic(self.config.deterministic and self.device.type == "cuda"):
-            return self._finish()
-
-    def _finish(self) -> Model:
         raw = {name: value.detach().clone() for name, value in self.surfels.state_dict().items()}
         surfels, cameras, options = Surfels(raw), self.views.cameras, self.render_options()
         if self.config.smooth_sh > 0:
-            found = smooth_sh(surfels, self.scene.train, self.config.smooth_sh, options=options)
+            # The rest is the same whatever the order of threads.
+            with _deterministic(self.config.deterministic and self.device.type == "cuda"):
+                found = smooth_sh(surfels, self.scene.train, self.config.smooth_sh, options=options)
             surfels.sh0.data, surfels.shN.data = found
         if self.config.footprints:
             surfels.footprints, surfels.far_footprints = seen_footprints(surfels, cameras, options=options)

@@ -124,6 +124,10 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
     assert not torch.are_deterministic_algorithms_enabled()
     for other in runs[1:]:
         assert_same_state(other, runs[0])
+    first, *others = (trainer.finish().surfels for trainer in runs)
+    for other in others:
+        for name in ("sh0", "shN", "footprints", "far_footprints"):
+            assert torch.equal(getattr(other, name), getattr(first, name)), name
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
