@@ -174,6 +174,7 @@ def _fit(
     return round(errors.square().sum().item(), 9), errors, coefficients, mean
 
 
+@_one_thread()
 def foretell(
     log_gains: torch.Tensor,
     cameras: Sequence[Camera],
@@ -195,17 +196,7 @@ def foretell(
         others: M cameras.
         others_brightness: gives (M, 3), likewise; not called where there is nothing to foretell.
     """
-    with _one_thread():
-        return _foretell(log_gains.cpu().double(), cameras, brightness, others, others_brightness)
-
-
-def _foretell(
-    values: torch.Tensor,
-    cameras: Sequence[Camera],
-    brightness: torch.Tensor,
-    others: Sequence[Camera],
-    others_brightness: Callable[[], torch.Tensor],
-) -> torch.Tensor | None:
+    values = log_gains.cpu().double()
     here, there = (_poses(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))
     size, squares = _apart(*here)
     seen = brightness - brightness.mean(0)
