@@ -645,7 +645,9 @@ def _shown(model: Model, config: Config) -> tuple[Any, ...]:
 
 def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> Model:
     """Write the model, evaluate what was written, and return that."""
-    file = save_model(run, trainer.finish())
+    with display.stages(console) as observe:
+        finished = trainer.finish(observe)
+    file = save_model(run, finished)
     sets = {"train": scene.train, "test": scene.test}
     save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
     model = load(run).to(device)

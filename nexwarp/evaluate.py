@@ -9,6 +9,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.data import View
+from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim, to_uint8
 from nexwarp.pictures import error_map, save_png, side_by_side
 from nexwarp.render import render
@@ -16,7 +17,6 @@ from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
 
 NEVER = 1e30  # a footprint that no texture survives
-ALPHA_MIN = 1.0 / 255.0  # weights below this are not seen in 8 bits
 
 
 @torch.no_grad()

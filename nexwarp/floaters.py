@@ -10,7 +10,7 @@ from nexwarp.camera import Camera
 from nexwarp.data import View
 from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.losses import visible_points
-from nexwarp.paths import between, resized
+from nexwarp.paths import between, reduced
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
@@ -83,10 +83,8 @@ def nearest_depth(view: View, points: torch.Tensor) -> float:
 
 def _shares(surfels: Surfels, camera: Camera, nearest: float, options: dict[str, Any]) -> torch.Tensor:
     """(N,) of the picture, by the weights of each surfel's textured hits that are nearer than `nearest`."""
-    if camera.height > HEIGHT:
-        camera = resized(camera, max(round(camera.width * HEIGHT / camera.height), 1), HEIGHT)
-    options = options | {"max_hits": max(options["max_hits"], 1)}
-    out = render(surfels, None, camera.to(surfels.means.device), **options)
+    camera = reduced(camera, HEIGHT).to(surfels.means.device)
+    out = render(surfels, None, camera, **options | {"max_hits": max(options["max_hits"], 1)})
     near = (out.weights >= ALPHA_MIN) & (out.depths < nearest)
     weights = torch.where(near, out.weights, 0) / (camera.width * camera.height)
     sums = out.weights.new_zeros(len(surfels))

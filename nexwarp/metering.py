@@ -5,15 +5,16 @@ the brightness that the trained scene has before their cameras, they tell those 
 around do, most where photos are far: there are renderings to meter.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
 from nexwarp.camera import Camera
 from nexwarp.exposures import MOST_PHOTOS, Exposures, foretell
-from nexwarp.paths import between, resized
+from nexwarp.paths import between, reduced
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 from nexwarp.texture import NeuralTexture
@@ -32,6 +33,7 @@ def metered(
     cameras: Sequence[Camera],
     *,
     options: dict[str, Any],
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Exposures:
     """Return exposures that know, beside the photos', the gains of places between them.
 
@@ -44,6 +46,8 @@ def metered(
         texture: their texture, or None.
         cameras: of all training views, on any device.
         options: keyword arguments of `nexwarp.render`.
+        progress: called with how many renderings are done and of how many, of which those of other places are asked
+            for only where brightness tells gains.
     """
     cameras = cameras[:: -(-len(cameras) // MOST_PHOTOS)]
     room = MOST_PHOTOS - len(cameras)
@@ -53,9 +57,13 @@ def metered(
     for _ in range(math.ceil(PLACES / len(cameras))):
         places += between(cameras, [math.inf] * len(cameras), generator)
     places = places[:: -(-len(places) // room)]
-    found = brightness(surfels, texture, cameras, options=options)
+    done, count = itertools.count(1), len(cameras) + len(places)
+
+    def meter(each: Sequence[Camera]) -> torch.Tensor:
+        return brightness(surfels, texture, each, options=options, progress=lambda: progress(next(done), count))
+
     gains = exposures.log_gains
-    there = foretell(gains, cameras, found, places, lambda: brightness(surfels, texture, places, options=options))
+    there = foretell(gains, cameras, meter(cameras), places, lambda: meter(places))
     if there is None:
         return exposures
     # As exact as the photos' own, though they are not: what the process makes of both varies as smoothly as they do.
@@ -64,17 +72,24 @@ def metered(
 
 @torch.no_grad()
 def brightness(
-    surfels: Surfels, texture: NeuralTexture | None, cameras: Sequence[Camera], *, options: dict[str, Any]
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    cameras: Sequence[Camera],
+    *,
+    options: dict[str, Any],
+    progress: Callable[[], object] = lambda: None,
 ) -> torch.Tensor:
-    """Log mean colours (M, 3) float64, of light, that cameras see at the photos' mean exposure, on the CPU."""
+    """Log mean colours (M, 3) float64, of light, that cameras see at the photos' mean exposure, on the CPU.
+
+    `progress` is called after each camera.
+    """
     kept, surfels.exposures = surfels.exposures, None
     try:
         found = []
         for camera in cameras:
-            if camera.height > HEIGHT:
-                camera = resized(camera, max(round(camera.width * HEIGHT / camera.height), 1), HEIGHT)
-            image = render(surfels, texture, camera.to(surfels.device), **options).image
+            image = render(surfels, texture, reduced(camera, HEIGHT).to(surfels.device), **options).image
             found.append(image.clamp(0, 1).double().pow(LINEAR).mean((0, 1)).pow(1 / LINEAR))
+            progress()
     finally:
         surfels.exposures = kept
     return torch.stack(found).clamp_min(DARKEST).log().cpu()

@@ -174,6 +174,13 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height)
 
 
+def reduced(camera: Camera, height: int) -> Camera:
+    """Return the camera with an image that is at most `height` pixels tall, and as wide as that asks."""
+    if camera.height <= height:
+        return camera
+    return resized(camera, max(round(camera.width * height / camera.height), 1), height)
+
+
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:
     """(3,) float64, the world point with the least sum of squared distances to the optical axes.
 

@@ -12,7 +12,7 @@ over that of degree 3: what training views show stays almost as it is, and the r
 the paper.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -29,7 +29,7 @@ MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less is lost in the rounding
 
 @torch.no_grad()
 def smooth_sh(
-    surfels: Surfels, views: Sequence[View], strength: float, *, options: dict[str, Any]
+    surfels: Surfels, views: Iterable[View], strength: float, *, options: dict[str, Any]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the surfels' coefficients, `sh0` (N, 1, 3) and `shN` (N, C - 1, 3), as smooth as training views allow.
 
@@ -64,7 +64,7 @@ def smooth_sh(
 
 @torch.no_grad()
 def seen_directions(
-    surfels: Surfels, views: Sequence[View], *, options: dict[str, Any]
+    surfels: Surfels, views: Iterable[View], *, options: dict[str, Any]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return sum_v w_v Y(d_v)^T Y(d_v), (N, C, C), and sum_v w_v, (N,): which directions views have of each surfel.
 

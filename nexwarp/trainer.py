@@ -6,10 +6,10 @@ import math
 import random
 import time
 import zlib
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -381,25 +381,31 @@ class Trainer:
     def _most_points(self) -> int:
         return max(len(view.points) for view in self.scene.train if view.points is not None)
 
-    def finish(self) -> Model:
+    def finish(self, observe: Callable[[str, int, int], None] = lambda *_: None) -> Model:
         """Return a model with surfels of its own: as they are now, and what the settings ask of a finished model.
 
         That is smooth colours, footprints and exposures, metered or not. The texture is the trainer's own.
+
+        Args:
+            observe: called with each stage's name, how many views of it are rendered, and of how many.
         """
         raw = {name: value.detach().clone() for name, value in self.surfels.state_dict().items()}
         surfels, cameras, options = Surfels(raw), self.views.cameras, self.render_options()
         if self.config.smooth_sh > 0:
             # The rest is the same whatever the order of threads.
             with _deterministic(self.config.deterministic and self.device.type == "cuda"):
-                found = smooth_sh(surfels, self.scene.train, self.config.smooth_sh, options=options)
+                views = _counted(self.scene.train, "smoothing colours", observe)
+                found = smooth_sh(surfels, views, self.config.smooth_sh, options=options)
             surfels.sh0.data, surfels.shN.data = found
         if self.config.footprints:
-            surfels.footprints, surfels.far_footprints = seen_footprints(surfels, cameras, options=options)
+            looks = _counted(cameras, "measuring footprints", observe)
+            surfels.footprints, surfels.far_footprints = seen_footprints(surfels, looks, options=options)
         if self.exposures is not None:
             found = self.exposures
             if self.config.metering:
                 texture = self.texture if self.config.max_hits else None
-                found = metered(found, surfels, texture, cameras, options=options)
+                told = partial(observe, "metering exposures")
+                found = metered(found, surfels, texture, cameras, options=options, progress=told)
             surfels.exposures = found.to(self.device)
         model = self.model()
         return Model(surfels, model.texture, model.meta | {"smooth_sh": self.config.smooth_sh})
@@ -666,6 +672,13 @@ def _densify_schedule(config: Config) -> DensifyConfig:
     d = config.densify
     every = max(config.scaled(d.every), min(d.every, 10))
     return dataclasses.replace(d, start=config.scaled(d.start), stop=config.scaled(d.stop), every=every)
+
+
+def _counted(views: Sequence[Any], stage: str, observe: Callable[[str, int, int], None]) -> Iterator[Any]:
+    """The views, each of which is done when the next one is asked for."""
+    for done, view in enumerate(views, 1):
+        yield view
+        observe(stage, done, len(views))
 
 
 @contextmanager

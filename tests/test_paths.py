@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.camera import Camera
-from nexwarp.paths import between, ellipse, focus, interpolate, look_at, resized, spiral
+from nexwarp.paths import between, ellipse, focus, interpolate, look_at, reduced, resized, spiral
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -304,6 +304,11 @@ def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
     assert resized(one, 64, 48) is one
     with pytest.raises(ValueError, match="height: expected at least 1, got 0"):
         resized(one, 64, 0)
+    small = reduced(one, 24)
+    assert (small.width, small.height) == (32, 24) and small.K.equal(resized(one, 32, 24).K)
+    assert reduced(one, 48) is reduced(one, 100) is one
+    thin = Camera(one.viewmat, one.K, 2, 48, near=0.2)
+    assert reduced(thin, 5).width == 1  # 2 * 5 / 48 is less than half a pixel
 
 
 def turned(each: Camera) -> Rotation:
