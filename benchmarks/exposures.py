@@ -1,8 +1,8 @@
-"""How far photos differ in exposure, and how well a camera's gains are foretold from the photos around it.
+"""How far photos differ in exposure, and how well a camera's gains are predicted from the photos around it.
 
     python -m benchmarks.exposures fox saharov kitchen25
 
-estimates the gains of each scene's training photos, foretells those of its test views from their poses, and compares
+estimates the gains of each scene's training photos, predicts those of its test views from their poses, and compares
 with the gains that the test photos have when they are estimated together with the others (only here are test photos
 looked at). On a CPU; nothing is trained.
 """
@@ -32,15 +32,15 @@ def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | flo
     """Spread of the training photos' gains by channel (3,), and the test views' errors as root mean squares.
 
     Returns:
-        "spread": standard deviation of the log gains; "foretold": error of what the pose foretells; "ignored": that of
+        "spread": standard deviation of the log gains; "predicted": error of what the pose predicts; "ignored": that of
         a gain of 1; "edge": what the lens leaves of the light where its falloff ends, mostly the corners.
     """
     (mine, falloff), (all_together, _) = gains_of(train), gains_of([*train, *test])
     # Both have the mean 0 of their own photos.
     own = all_together[len(train) :] - (all_together[: len(train)] - mine).mean(0)
     exposures = Exposures.of(mine, [view.camera for view in train])
-    foretold = torch.stack([exposures.gains(view.camera).double().log() for view in test])
-    rms = {"foretold": foretold - own, "ignored": own}
+    predicted = torch.stack([exposures.gains(view.camera).double().log() for view in test])
+    rms = {"predicted": predicted - own, "ignored": own}
     errors = {name: x.square().mean().sqrt().item() for name, x in rms.items()}
     return {"spread": mine.std(0), "edge": math.exp(falloff[0] + falloff[1]), **errors}
 
@@ -53,14 +53,14 @@ def main(scenes: Annotated[tuple[str, ...], tyro.conf.Positional], data: Path = 
         data: folder of scenes.
     """
     print(
-        "| scene | spread of the gains: red, green, blue | error of test views: foretold | left at 1 | light at edge |"
+        "| scene | spread of the gains: red, green, blue | error of test views: predicted | left at 1 | light at edge |"
     )
     print("|---|---|---|---|---|")
     for name in scenes:
         scene = load_scene(name if Path(name).exists() else data / name)
         found = compare(scene.train, scene.test)
         spread = ", ".join(f"{100 * x:.1f}" for x in found["spread"].tolist())
-        errors = " | ".join(f"{100 * found[key]:.1f} %" for key in ("foretold", "ignored", "edge"))
+        errors = " | ".join(f"{100 * found[key]:.1f} %" for key in ("predicted", "ignored", "edge"))
         print(f"| {Path(name).name} | {spread} % | {errors} |")
     return 0
 

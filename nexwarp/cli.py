@@ -128,7 +128,7 @@ class Train:
     format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "the one that is there")] = None
     """Kind of the scene, for a folder that holds more than one."""
     max_hits: Annotated[int | None, option("K", "2")] = None
-    """Hits a pixel textures, 0 to 8; 0 trains without a texture."""
+    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
     """Settings to start from: nexwarp's own, or those of the publication (docs/paper.md)."""
     settings: Annotated[
@@ -137,7 +137,7 @@ class Train:
     ] = ()
     """Change any setting of docs/options.md, such as texture.max_resolution=1024; VALUE is JSON or a bare word."""
     seed: Annotated[int | None, option("N", "0")] = None
-    """Of every random choice."""
+    """Random seed."""
     deterministic: bool = False
     """Give the same bits in every run also on CUDA; slower. A CPU always does."""
     device: Device_ = None
@@ -153,7 +153,7 @@ class Train:
     host: Host_ = "127.0.0.1"
     """Where --view listens; 0.0.0.0 lets other machines look."""
     port: Port_ = 8080
-    """Of --view; 0 for any free one."""
+    """Port for --view; 0 takes any free one."""
     tensorboard: bool = False
     """Also log into RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
 
@@ -414,7 +414,7 @@ class View:
     host: Host_ = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets other machines look."""
     port: Port_ = 8080
-    """To listen on; 0 for any free one."""
+    """Port to listen on; 0 takes any free one."""
     device: Device_ = None
     """Where to compute."""
 

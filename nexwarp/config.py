@@ -18,9 +18,8 @@ from nexwarp.smooth_sh import MAX_STRENGTH, MIN_STRENGTH
 # Schedules are given for runs of this length and stretch with `iterations`.
 REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
-LARGEST_NUMBER = 2**53
+LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
-LARGEST = 2**53  # of numbers in settings: all integers up to there are floats too
 
 
 @dataclass(frozen=True)
@@ -91,38 +90,42 @@ class Config:
     max_surfels: int = 400_000
     """P, the budget: never exceeded. Half of it at most comes from the point cloud."""
     max_hits: int = 2
-    """K, hits a pixel textures, 0 to 8; 0 trains without a texture."""
+    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
     more_hits_from: int = 25_000
-    """Iteration, of a run of 30,000, from which a pixel textures more than 2 hits, where K is more: surfels settle with
-    two, which leave less to what hangs in the air."""
+    """Iteration, of a run of 30,000, from which more than 2 hits are textured, where K is more than 2: geometry
+    converges with K = 2, which makes fewer floaters."""
     sh_degree: int = 3
-    """Highest degree of both appearances; one more is unlocked every 1,000 iterations."""
+    """SH degree of the surfels' and the texture's colours; one more is unlocked every 1,000 iterations."""
     sh_every: int = 1000
     """Iterations, of a run of 30,000, between those."""
     coarse: float = 0.0
-    """Share of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
+    """Fraction of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
     background: tuple[float, float, float] | None = None
     """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
     footprints: bool = True
-    """Show what is looked at from closer or farther than in training with the detail of then and without aliasing, and
-    what was not seen without detail."""
+    """Limit the texture's detail in views from closer or farther away than the training views to what those resolved,
+    and anti-alias surfels in views from farther away. What no training view textured has no detail."""
     smooth_sh: float = 0.01
-    """Once trained, make the surfels' colours smooth over directions that no photo had; larger costs more in those that
-    they had. 0: leave them as they are."""
+    """After training, regularise the surfels' SH towards smoothness, by ridge regression over the training views'
+    directions: the strength. Larger costs more in those directions; 0 keeps the SH as trained."""
     exposures: bool = True
-    """Learn the scene at the photos' mean exposure, each photo's gains taken out; renderings get those around them."""
+    """Estimate each photo's exposure and white balance, as gains of red, green and blue, before training; train at the
+    mean exposure; a rendered view gets the gains predicted from nearby photos."""
     metering: bool = True
-    """With them, where cameras set their exposure by what they saw, renderings get what theirs would set."""
+    """With `exposures`: where the photos' gains follow the brightness of what they show, as automatic exposure makes
+    them, predict those of rendered views by that, too."""
     vignetting: bool = True
-    """With them, take the darkening of the lens towards the corners out, too."""
+    """With `exposures`: estimate and take out the lens's vignetting, too."""
     mask_mode: str = "ignore"
     """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
     border: float = 0.08
-    """Largest shift, in shares of the frame, of steps that look beyond it, where the photo's edge goes on; 0: none."""
+    """Maximum shift, as a fraction of the frame, of border steps, which render beyond a photo's frame, supervised by
+    the photo's repeated edge; 0: no such steps."""
     border_every: int = 4
-    """Every how many steps that is."""
+    """Every how many steps one is a border step."""
     depth_jitter: float = 1.0
-    """Random shifts, along their rays, of where a step looks its texture up: standard deviation in pixels there."""
+    """Random shifts along the ray of the points at which training looks the texture up: standard deviation, in pixels
+    at that depth."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     clamp_texture: bool = False
@@ -130,11 +133,11 @@ class Config:
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
-    """Drop uncertain points of the cloud before sampling."""
+    """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
     seed: int = 0
-    """Of every random choice."""
+    """Random seed."""
     deterministic: bool = False
     """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
     cuda_graphs: bool = True
@@ -313,9 +316,9 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
     """Return a value as its annotation has it: int where float is meant and list for tuple will do."""
     options = [annotation] if annotation in (int, float, bool, str) else _alternatives(annotation)
     for option in options:
-        if option is float and type(value) in (int, float) and abs(value) <= LARGEST:
+        if option is float and type(value) in (int, float) and abs(value) <= LARGEST_NUMBER:
             return float(value)
-        if option is int and type(value) is int and abs(value) <= LARGEST:
+        if option is int and type(value) is int and abs(value) <= LARGEST_NUMBER:
             return value
         if option in (bool, str, type(None)) and type(value) is option:
             return value

@@ -22,13 +22,14 @@ class DensifyConfig:
     every: int = 100
     """Iterations between rounds."""
     fraction: float = 0.05
-    """Share of the surfels that a round splits, as far as the budget allows."""
+    """Fraction of the surfels that a round splits, as far as the budget allows."""
     prune_opacity: float = 0.005
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
     floaters: bool = True
-    """Remove surfels that training views, or views between those, show much nearer than the nearest points are."""
+    """Remove floaters: surfels that training views, or views between them, show at less than 0.6 times the depth of the
+    nearest points."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)

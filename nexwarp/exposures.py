@@ -36,7 +36,7 @@ TINY = 1e-9  # squared error that is none
 class Exposures(nn.Module):
     """Gains of photos by the pose of their cameras: a Gaussian process with the Matern 3/2 kernel.
 
-    Places between the photos, whose gains were foretold (`nexwarp.metering`), count as photos do.
+    Places between the photos, whose gains were predicted (`nexwarp.metering`), count as photos do.
 
     Buffers: `log_gains` (V, 3); `positions` (V, 3) of the cameras, world units; `directions` (V, 3) unit, where they
     look; `coefficients` (V, 3) and `mean` (3,) of the process; `lengths` (2,) world units: what a direction's change by
@@ -84,7 +84,7 @@ class Exposures(nn.Module):
 
         `falloff` (3,) is the lens's, None is an even one.
 
-        How far gains reach and how exact they are is what would have foretold each photo best from the others.
+        How far gains reach and how exact they are is what would have predicted each photo best from the others.
         """
         viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
         every = -(-len(cameras) // MOST_PHOTOS)
@@ -175,17 +175,17 @@ def _fit(
 
 
 @_one_thread()
-def foretell(
+def predict(
     log_gains: torch.Tensor,
     cameras: Sequence[Camera],
     brightness: torch.Tensor,
     others: Sequence[Camera],
     others_brightness: Callable[[], torch.Tensor],
 ) -> torch.Tensor | None:
-    """Foretell other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
+    """Predict other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
 
     A process of the pose, as `Exposures`, and beside it linear in the brightness: each channel in those of all three.
-    None where that foretells each photo from the others no better than the pose alone, by Akaike's criterion, corrected
+    None where that predicts each photo from the others no better than the pose alone, by Akaike's criterion, corrected
     for few photos. Channels are not independent there: what goes wrong with a photo (its exposure was set by hand, the
     scene learnt it by heart) goes wrong with all of them.
 
@@ -194,7 +194,7 @@ def foretell(
         cameras: of those.
         brightness: (V, 3) float64 on the CPU, logarithms, of what is before them (`nexwarp.metering.brightness`).
         others: M cameras.
-        others_brightness: gives (M, 3), likewise; not called where there is nothing to foretell.
+        others_brightness: gives (M, 3), likewise; not called where there is nothing to predict.
     """
     values = log_gains.cpu().double()
     here, there = (_poses(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))

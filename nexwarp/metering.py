@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.exposures import MOST_PHOTOS, Exposures, foretell
+from nexwarp.exposures import MOST_PHOTOS, Exposures, predict
 from nexwarp.paths import between, reduced
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
@@ -63,7 +63,7 @@ def metered(
         return brightness(surfels, texture, each, options=options, progress=lambda: progress(next(done), count))
 
     gains = exposures.log_gains
-    there = foretell(gains, cameras, meter(cameras), places, lambda: meter(places))
+    there = predict(gains, cameras, meter(cameras), places, lambda: meter(places))
     if there is None:
         return exposures
     # As exact as the photos' own, though they are not: what the process makes of both varies as smoothly as they do.

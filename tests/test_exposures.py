@@ -162,7 +162,7 @@ def test_a_camera_gets_the_gains_around_it():
     assert (far - course.mean(0)).abs().max() < 0.3
 
 
-def test_gains_that_nothing_foretells_are_smoothed():
+def test_gains_that_nothing_predicts_are_smoothed():
     """Each photo's own: the process does not follow what its neighbours do not share."""
     noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
     cameras = [looking(x) for x in np.linspace(0, 4, 40)]
@@ -323,7 +323,7 @@ def test_no_exposures_where_none_are_wanted(tmp_path, change):
 
 
 def test_the_benchmark_tells_spread_and_errors():
-    """Gains that follow the camera's position are foretold; the test views' own are those that were put in."""
+    """Gains that follow the camera's position are predicted; the test views' own are those that were put in."""
     course = 0.2 * torch.sin(torch.linspace(0, 3, 16))[:, None].expand(16, 3)
     cameras, photos, points = photographs(course)
     views = [View(c, p, None, f"{i}", None, x) for i, (c, p, x) in enumerate(zip(cameras, photos, points, strict=True))]
@@ -334,5 +334,5 @@ def test_the_benchmark_tells_spread_and_errors():
     torch.testing.assert_close(found["spread"].float(), kept.std(0), atol=0.01, rtol=0)
     expected = (course[2::4] - kept.mean(0)).square().mean().sqrt().item()
     assert found["ignored"] == pytest.approx(expected, abs=0.01)
-    assert found["foretold"] < 0.2 * found["ignored"]
+    assert found["predicted"] < 0.2 * found["ignored"]
     assert found["edge"] == pytest.approx(1.0, abs=0.03)

@@ -1,4 +1,4 @@
-"""Automatic exposure: gains that follow what cameras see are foretold by it, others are left to the poses."""
+"""Automatic exposure: gains that follow what cameras see are predicted by it, others are left to the poses."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from nexwarp import metering
 from nexwarp.camera import Camera
 from nexwarp.config import Config, TextureConfig
 from nexwarp.data import write_demo
-from nexwarp.exposures import Exposures, foretell
+from nexwarp.exposures import Exposures, predict
 from nexwarp.metering import PLACES, brightness, metered
 from nexwarp.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -32,14 +32,14 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("slopes", [-0.8 * torch.eye(3).double(), torch.full((3, 3), -0.25).double()])
-def test_gains_that_follow_the_brightness_are_foretold(slopes: torch.Tensor) -> None:
+def test_gains_that_follow_the_brightness_are_predicted(slopes: torch.Tensor) -> None:
     """White balance, each channel by its own; and one exposure for all. Poses tell nothing of it."""
     cameras = [looking(x) for x in np.linspace(0, 4, 40)]
     others = [looking(x) for x in np.linspace(0.05, 3.95, 25)]
     seen, there = 0.2 * random(40, 3), 0.2 * random(25, 3, seed=1)
     gains = (seen - seen.mean(0)) @ slopes + 0.002 * random(40, 3, seed=2)
     expected = (there - seen.mean(0)) @ slopes
-    found = foretell(gains, cameras, seen, others, lambda: there)
+    found = predict(gains, cameras, seen, others, lambda: there)
     assert found is not None and found.shape == (25, 3)
     inside = (expected > gains.amin(0)) & (expected < gains.amax(0))
     assert inside.double().mean() > 0.8
@@ -58,15 +58,15 @@ def test_gains_that_do_not_are_left_to_the_poses() -> None:
 
     cameras = [looking(x) for x in np.linspace(0, 4, 40)]
     course = 0.2 * torch.linspace(0, 6, 40).double().sin()[:, None].expand(40, 3)
-    assert foretell(course, cameras, 0.2 * random(40, 3), cameras[:2], never) is None
+    assert predict(course, cameras, 0.2 * random(40, 3), cameras[:2], never) is None
     for seed in range(8):
         assert (
-            foretell(0.1 * random(40, 3, seed=seed), cameras, 0.2 * random(40, 3, seed=99), cameras[:2], never) is None
+            predict(0.1 * random(40, 3, seed=seed), cameras, 0.2 * random(40, 3, seed=99), cameras[:2], never) is None
         )
     for count in (1, 2, 3, 4):
         seen = 0.2 * random(count, 3)
-        assert foretell(0.1 * random(count, 3, seed=5), cameras[:count], seen, cameras[:2], never) is None
-    assert foretell(torch.zeros(40, 3), cameras, 0.2 * random(40, 3), cameras[:2], never) is None
+        assert predict(0.1 * random(count, 3, seed=5), cameras[:count], seen, cameras[:2], never) is None
+    assert predict(torch.zeros(40, 3), cameras, 0.2 * random(40, 3), cameras[:2], never) is None
 
 
 def test_what_goes_wrong_with_all_channels_tells_no_more_than_one() -> None:
@@ -77,7 +77,7 @@ def test_what_goes_wrong_with_all_channels_tells_no_more_than_one() -> None:
         gains = 0.1 * random(28, 1, seed=seed) + 0.02 * random(28, 3, seed=1000 + seed)
         seen = 0.2 * random(28, 1, seed=500 + seed) + 0.05 * random(28, 3, seed=700 + seed)
         for kind, light in (("unrelated", seen), ("learnt", seen - gains)):
-            found = foretell(gains, cameras, light, others, lambda there=light[:2]: there)
+            found = predict(gains, cameras, light, others, lambda there=light[:2]: there)
             metered_anyway[kind] += found is not None
     assert metered_anyway["unrelated"] == 0
     assert metered_anyway["learnt"] <= 4

@@ -33,7 +33,7 @@ class SfmOptions:
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
     """CPU threads; with 1 the same photos give the same scene, bit for bit."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Of every random choice."""
+    """Random seed."""
 
     def check(self) -> None:
         """Raise ValueError, naming the option, when a value is out of range or unknown."""
