@@ -33,7 +33,7 @@ from nexwarp.checkpoint import (
 )
 from nexwarp.config import Config, parse_settings, preset, setting, with_settings
 from nexwarp.data import Scene
-from nexwarp.errors import DivergedError, NexwarpError, SceneError, SettingError, StorageError
+from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, SceneError, SettingError, StorageError
 from nexwarp.evaluate import evaluate
 from nexwarp.export import MAX_EXTENT
 from nexwarp.kernels.types import MAX_HITS
@@ -209,6 +209,12 @@ class Train:
                 model = _finish(trainer, scene, run, device, console)
             except OSError as error:
                 raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
+            except (MemoryError, RuntimeError) as error:
+                if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
+                    raise
+                raise OutOfMemoryError(
+                    f"out of memory: it needed {needed}; the training is done and kept: --resume finishes the run"
+                ) from error
             if viewer is not None:
                 viewer.finish(f"{trainer.iteration:,} iterations done", lambda: _shown(model, config))
                 _show(viewer, console)

@@ -22,7 +22,7 @@ from nexwarp.data import View
 from nexwarp.render import render
 from nexwarp.surfels import Surfels
 
-SURFELS = 2**15  # whose equations are solved at once, in float64
+SURFELS = 2**15  # whose equations are added to and solved at once
 LEAST = 1e-6  # pixels that a surfel has in all views, at least, if it is seen
 MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less is lost in the rounding
 
@@ -45,17 +45,19 @@ def smooth_sh(
     count = _count(surfels, options)
     if count == 1 or not len(surfels):
         return sh0.clone(), shN.clone()
-    gram, total = seen_directions(surfels, views, options=options)
+    products, total = seen_directions(surfels, views, options=options)
+    row, column = _pairs(count, surfels.device)
     degrees = torch.arange(count, device=surfels.device, dtype=torch.float64).sqrt().floor()
-    roughness = (degrees * (degrees + 1) / 12).square()
+    penalty = strength * (degrees * (degrees + 1) / 12).square()
     every = torch.cat([sh0, shN], dim=1)
     found = every[:, :count]
     for part in torch.arange(len(surfels), device=surfels.device).split(SURFELS):
         known = total[part] > LEAST
-        # Of what is to be taken away, which is nothing where training views tell all.
         some = part[known]
-        penalty = strength * roughness
-        left = gram[some].double() / total[some].double()[:, None, None] + torch.diag(penalty)
+        left = products.new_zeros(len(some), count, count)
+        left[:, row, column] = left[:, column, row] = products[some] / total[some, None]
+        left += torch.diag(penalty)
+        # Of what is to be taken away, which is nothing where training views tell all.
         rough = penalty[:, None] * found[some].double()
         found[some] -= torch.linalg.solve(left, rough).to(found)
         found[part[~known], 1:] = 0.0
@@ -66,25 +68,36 @@ def smooth_sh(
 def seen_directions(
     surfels: Surfels, views: Iterable[View], *, options: dict[str, Any]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return sum_v w_v Y(d_v)^T Y(d_v), (N, C, C), and sum_v w_v, (N,): which directions views have of each surfel.
+    """Return which directions views have of each surfel: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
+
+    In float64: what float32 rounds away of a sum of products is more than a weak smoothing adds to it.
 
     Args:
-        surfels: the N surfels; C is the number of their coefficients a channel that are rendered.
+        surfels: the N surfels; C is the number of their coefficients a channel that are rendered, i <= j of those are
+            P = C (C + 1) / 2 pairs, row by row of a matrix's upper triangle.
         views: v, on any device; pixels that their masks leave out do not count.
         options: keyword arguments of `nexwarp.render`.
     """
     count = _count(surfels, options)
-    gram, total = surfels.means.new_zeros(len(surfels), count, count), surfels.means.new_zeros(len(surfels))
+    row, column = _pairs(count, surfels.device)
+    products = torch.zeros(len(surfels), len(row), dtype=torch.float64, device=surfels.device)
+    total = products.new_zeros(len(surfels))
     for view in views:
         camera = view.camera.to(surfels.device)
         out = render(surfels, None, camera, **options)
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
-        weights = out.splat_error(counts)
-        seen = weights.nonzero()[:, 0]
-        basis = _basis(surfels.means.detach()[seen], camera.position, count)
-        gram[seen] += (weights[seen, None] * basis)[:, :, None] * basis[:, None, :]
+        weights = out.splat_error(counts).double()
+        for seen in weights.nonzero()[:, 0].split(SURFELS):
+            basis = _basis(surfels.means.detach()[seen], camera.position, count).double()
+            products[seen] += weights[seen, None] * basis[:, row] * basis[:, column]
         total += weights
-    return gram, total
+    return products, total
+
+
+def _pairs(count: int, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows and columns of the upper triangle."""
+    row, column = torch.triu_indices(count, count, device=device)
+    return row, column
 
 
 def _count(surfels: Surfels, options: dict[str, Any]) -> int:

@@ -1,5 +1,6 @@
 """Training: the loop of paper Sec. 3.3, as a class that the command line drives."""
 
+import copy
 import dataclasses
 import hashlib
 import math
@@ -389,6 +390,8 @@ class Trainer:
         Args:
             observe: called with each stage's name, how many views of it are rendered, and of how many.
         """
+        if self.graphs is not None:
+            self.graphs.clear()  # for their memory; steps to come are recorded anew
         raw = {name: value.detach().clone() for name, value in self.surfels.state_dict().items()}
         surfels, cameras, options = Surfels(raw), self.views.cameras, self.render_options()
         if self.config.smooth_sh > 0:
@@ -401,7 +404,7 @@ class Trainer:
             looks = _counted(cameras, "measuring footprints", observe)
             surfels.footprints, surfels.far_footprints = seen_footprints(surfels, looks, options=options)
         if self.exposures is not None:
-            found = self.exposures
+            found = copy.deepcopy(self.exposures)
             if self.config.metering:
                 texture = self.texture if self.config.max_hits else None
                 told = partial(observe, "metering exposures")

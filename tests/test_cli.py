@@ -141,6 +141,21 @@ def test_default_run_folder_is_named_after_the_scene(scene, tmp_path, monkeypatc
 # eval, render, info
 
 
+def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more")
+
+    command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "finish", full)
+        assert cli.main(command) == 2
+    told = "out of memory: it needed 2.00 GiB; the training is done and kept: --resume finishes the run"
+    assert capsys.readouterr().err == f"nexwarp: error: {told}\n"
+    assert cli.main([*command, "--resume"]) == 0
+    assert "resumed at iteration 20" in capsys.readouterr().out
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
 def test_eval_reproduces_the_metrics(finished, capsys):
     before = read(finished, "metrics.json")
     renders = snapshot(finished / "renders")

@@ -80,7 +80,8 @@ def test_collection_in_fixed_point(low_pass: bool, max_hits: int, switched: Any)
         switched(fixed)
         passes = Passes(scene, low_pass=low_pass, max_hits=max_hits)
         passes.hits.watch.errors = errors_of(scene)
-        results.append(passes.gradients() | {"watched": passes.hits.watch.sums})
+        gradients, alone = passes.gradients(), passes.blended(errors_of(scene))
+        results.append(gradients | {"watched": passes.hits.watch.sums, "alone": alone})
     for name, plain in results[0].items():
         assert plain.abs().max() > 0, name
         assert_close(results[1][name], plain, kind="gradient", name=name)
@@ -119,7 +120,7 @@ def test_gradients_repeat_bit_for_bit() -> None:
             watch = out.watch_error(out.alpha.detach())
             parameters = [*surfels.parameters(), *texture.parameters()]
             grads = torch.autograd.grad(out.image.square().sum() + out.weights.square().sum(), parameters)
-            found.append([*grads, watch.sums])
+            found.append([*grads, watch.sums, out.splat_error(out.alpha.detach())])
     finally:
         torch.use_deterministic_algorithms(False)
     for other in found[1:]:

@@ -11,7 +11,7 @@ from nexwarp.camera import Camera
 from nexwarp.config import Config, TextureConfig, preset
 from nexwarp.data import Scene, View, write_demo
 from nexwarp.paths import look_at
-from nexwarp.smooth_sh import MAX_STRENGTH, seen_directions, smooth_sh
+from nexwarp.smooth_sh import MAX_STRENGTH, MIN_STRENGTH, seen_directions, smooth_sh
 from nexwarp.surfels import Surfels
 from nexwarp.trainer import Trainer
 from tests.scenes import make_surfels, random_scene
@@ -64,8 +64,9 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
     mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     mask[:, : SIDE // 2] = True
     views = [*around([0.0, 0.7]), view([0.5, -0.5, -4.0], mask)]
-    gram, total = seen_directions(surfels, views, options=OPTIONS)
-    expected, expected_total = torch.zeros_like(gram), torch.zeros_like(total)
+    found, total = (x.float() for x in seen_directions(surfels, views, options=OPTIONS))
+    row, column = torch.triu_indices(16, 16)
+    expected, expected_total = torch.zeros_like(found), torch.zeros_like(total)
     for v in views:
         camera = v.camera.to(device)
         counts = torch.ones(SIDE, SIDE, 1, device=device) if v.mask is None else v.mask[..., None].to(device)
@@ -75,12 +76,12 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
         shown = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, 3)[:, 0] > 0
         weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / CONSTANT, torch.nan)
         basis = torch.stack([colors(surfels, [v], one(k, surfels))[0, :, 0] for k in range(16)], dim=1)
-        expected += weights[:, None, None] * basis[:, :, None] * basis[:, None, :]
+        expected += weights[:, None] * basis[:, row] * basis[:, column]
         expected_total += weights
     known = expected_total.isfinite()
     assert known.sum() > 10 and (expected_total[known] > 0).any()
     assert_close(total[known], expected_total[known], kind="value", name="weights")
-    assert_close(gram[known], expected[known], kind="value", name="products")
+    assert_close(found[known], expected[known], kind="value", name="products")
 
 
 def one(k: int, surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,19 +90,21 @@ def one(k: int, surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
     return sh[:, :1].contiguous(), sh[:, 1:].contiguous()
 
 
-def test_coefficients_are_those_of_ridge_regression(device: torch.device) -> None:
-    """A minimum of what the module's docstring says: the gradient there is nothing."""
+@pytest.mark.parametrize("strength", [MIN_STRENGTH, 1e-3, 10.0])
+def test_coefficients_are_those_of_ridge_regression(device: torch.device, strength: float) -> None:
+    """A minimum of what the module's docstring says, by the QR of its terms instead of their normal equations."""
     surfels, views = blob(device), around([-0.6, -0.2, 0.1, 0.5])
     before = surfels.sh.detach().clone()
-    strength = 0.02
-    gram, total = (x.double().cpu() for x in seen_directions(surfels, views, options=OPTIONS))
-    x = torch.cat(smooth_sh(surfels, views, strength, options=OPTIONS), dim=1).double().cpu().requires_grad_()
+    weights = torch.stack([seen_directions(surfels, [v], options=OPTIONS)[1][0] for v in views]).cpu()
+    basis = torch.stack([colors(surfels, views, one(k, surfels))[:, 0, 0] for k in range(16)], dim=1).double().cpu()
+    seen = (weights / weights.sum()).sqrt()[:, None] * basis
+    terms = torch.cat([seen, strength**0.5 * torch.diag(ROUGHNESS.double().sqrt())])
+    targets = torch.cat([seen @ before[0].double().cpu(), torch.zeros(16, 3, dtype=torch.float64)])
+    expected = torch.linalg.lstsq(terms, targets, driver="gelsd").solution
+    found = torch.cat(smooth_sh(surfels, views, strength, options=OPTIONS), dim=1)[0].double().cpu()
     assert torch.equal(surfels.sh, before)
-    off = (x - before.double().cpu())[0]
-    objective = (off * (gram[0] / total[0] @ off)).sum() + strength * (ROUGHNESS[:, None] * x[0].square()).sum()
-    (gradient,) = torch.autograd.grad(objective, x)
-    scale = (strength * ROUGHNESS[:, None] * before[0].double().cpu()).abs().max()
-    assert scale > 1e-4 and gradient.abs().max() < 1e-5 * scale.clamp_min(1.0)
+    # The test's own harmonics are of float32, and what a view's last bits tell of others grows as strength falls.
+    assert (found - expected).abs().max() < 2e-3 < (found - before[0].double().cpu()).abs().max()
 
 
 def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch.device) -> None:
@@ -139,9 +142,9 @@ def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device
 
 
 def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.device) -> None:
-    surfels, views = blob(device), around([0.0])
+    surfels, views = blob(device), around([-0.5, 0.5])  # one view alone is told by one colour
     sh0, shN = smooth_sh(surfels, views, 0.01, options=OPTIONS)
-    assert torch.equal(sh0[1], surfels.sh0[1]) and not shN[1].any() and shN[0].any()
+    assert torch.equal(sh0[1], surfels.sh0[1]) and not shN[1].any() and shN[0].abs().max() > 1e-3
     empty = Surfels({name: x[:0] for name, x in surfels.state_dict().items()})
     assert [x.shape for x in smooth_sh(empty, views, 0.01, options=OPTIONS)] == [(0, 1, 3), (0, 15, 3)]
     flat = Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
@@ -176,12 +179,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.mark.usefixtures("one_torch_thread", "few_looks")
-def test_finishing_leaves_the_training_as_it_is(scene: Scene) -> None:
-    """A model of its own: training goes on as if none had been asked for."""
+def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.device) -> None:
+    """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    config = Config(iterations=40, max_surfels=200, texture=texture)
-    asked, other = Trainer(scene, config, "cpu"), Trainer(scene, config, "cpu")
+    config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
+    asked, other = Trainer(scene, config, device), Trainer(scene, config, device)
     asked.run(until=30)
+    if asked.graphs is not None:
+        assert any(stage.graph is not None for stage in asked.graphs.stages.values())
     model = asked.finish()
     assert model.meta["smooth_sh"] == 0.01 and model.surfels is not asked.surfels
     assert model.surfels.footprints is not None and asked.surfels.footprints is None

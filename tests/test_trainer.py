@@ -128,6 +128,8 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
     for other in others:
         for name in ("sh0", "shN", "footprints", "far_footprints"):
             assert torch.equal(getattr(other, name), getattr(first, name)), name
+        for name, value in first.exposures.tensors().items():
+            assert torch.equal(other.exposures.tensors()[name], value), name
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])

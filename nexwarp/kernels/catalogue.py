@@ -98,6 +98,8 @@ def walk_kernels(
     backward = collect_rows_backward_kernel if cpu else collect_backward_kernel
     for low_pass in low_passes:
         yield splat_error_kernel(real, low_pass, tile_size)
+        if fixed and not cpu:
+            yield splat_error_kernel(real, low_pass, tile_size, fixed=True)
         for hits in max_hits:
             yield forward(real, hits, low_pass, tile_size)
             for watch in (False, True):

@@ -471,8 +471,11 @@ def collect_backward_kernel(
 
 
 @functools.cache
-def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
-    """Make the kernel that gives each entry the sum over pixels of weight * error (densification, paper Sec. 3.3)."""
+def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed: bool = False) -> wp.Kernel:
+    """Make the kernel that gives each entry the sum over pixels of weight * error (densification, paper Sec. 3.3).
+
+    With `fixed` the sums are pairs of integers, as those of `collect_backward_kernel`.
+    """
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     intrinsics_of = frame_functions(real).intrinsics_of
@@ -480,7 +483,8 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     load = load_function(4, real)
     view = view_functions(real, tile_size)
     pixels = view.pixels
-    sum1 = lane_sum(real)
+    sum1, put1 = lane_sum(real), fixed_add(real)
+    rows_of_sums = wp.array2d(dtype=wp.int64) if fixed else wp.array(dtype=real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -506,7 +510,8 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         stops: wp.array(dtype=wp.int32),
         errors: wp.array(dtype=real),
         # outputs
-        sums: wp.array(dtype=real),
+        sums: rows_of_sums,
+        bad: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
         tile = thread // pixels
@@ -555,7 +560,10 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
                 row = int(i)
                 if k < rows.shape[0]:
                     row = rows[k]
-                wp.atomic_add(sums, row, share)
+                if wp.static(fixed):
+                    put1(sums, row, share, bad)
+                if wp.static(not fixed):
+                    wp.atomic_add(sums, row, share)
 
     return splat_error
 

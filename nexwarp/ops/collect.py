@@ -108,12 +108,18 @@ def splat_error(
     records = projection.records.detach()
     real = real_of(records)
     rows, slots = _rows(tiles, records)
-    sums = records.new_zeros(slots)
+    fixed = sums_in_fixed_point(records)
+    sums = sums_like(records, (slots,), fixed)
     inputs = _inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
     errors = errors.detach().to(records.dtype).contiguous()
     inputs += [array(rows, wp.int32), array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
-    kernel = splat_error_kernel(real, low_pass, tiles.tile_size)
-    _walk(records, kernel, tiles, inputs, [array(sums, real)])
+    kernel = splat_error_kernel(real, low_pass, tiles.tile_size, fixed)
+    if fixed:
+        bad = torch.zeros(1, dtype=torch.int32, device=records.device)
+        _walk(records, kernel, tiles, inputs, [array(sums, wp.int64), array(bad, wp.int32)])
+        sums = from_fixed_point(sums, bad, records.dtype)
+    else:
+        _walk(records, kernel, tiles, inputs, [array(sums, real), None])
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
 
 
