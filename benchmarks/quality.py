@@ -3,11 +3,13 @@
     python -m benchmarks.quality train --tables peers,hits --data DIR --out results.jsonl
     python -m benchmarks.quality table results.jsonl --out quality.md --json quality.json
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
+    python -m benchmarks.quality train --tables demo --seeds 0 --pictures DIR --out demo.jsonl
 
 `train` appends one JSON line a training, and leaves out what the file holds already: it can be stopped and resumed, on
 several machines too. Rows of which only K or the removal of floaters differs train alike until that counts
-(`more_hits_from`, `densify.stop`): up to there they are one training. `table` makes Markdown of them, means and spreads
-over seeds, and what each row has more than the default, or the row `--against`, on the mean of the scenes; nothing is
+(`more_hits_from`, `densify.stop`): up to there they are one training. The table `demo` needs no data: the built-in
+scene, neighbouring cameras held out, minutes on a CPU. `table` makes Markdown of the lines, means and spreads over
+seeds, and what each row has more than the default, or the row `--against`, on the mean of the scenes; nothing is
 trained twice for two tables. `curve` draws a metric over the number of primitives. Metrics are those of
 `nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had. Speed and memory of a
 training count when it ran alone (`--jobs 1`).
@@ -34,7 +36,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.quality_rows import DEFAULT, ROWS, SCENES, TABLES, Job, Row, config_of, jobs_of, together
+from benchmarks.quality_rows import DEFAULT, DEMO, ROWS, SCENES, TABLES, Job, Row, config_of, jobs_of, together
 from benchmarks.quality_tables import (
     DIGITS,
     METRICS,
@@ -52,6 +54,7 @@ from nexwarp.camera import Camera
 from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
 from nexwarp.config import Config
 from nexwarp.data import Scene, View, load_scene
+from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import downscale_image, downscale_mask
 from nexwarp.evaluate import METRICS as JUDGES
 from nexwarp.metrics import CONVENTION, psnr, to_uint8
@@ -102,9 +105,13 @@ VARIANTS = {
 
 
 @lru_cache(maxsize=1)
-def _scene(path: Path, variant: str, downscale: int) -> Scene:
+def _load(path: Path, variant: str, downscale: int) -> Scene:
     scene = load_scene(path, downscale=downscale)
     return VARIANTS[variant](scene) if variant else scene
+
+
+def _scene(job: Job, data: Path) -> Scene:
+    return _load(demo_folder() if job.scene == DEMO else data / job.scene, job.variant, job.downscale)
 
 
 # One training
@@ -136,7 +143,7 @@ def begin(jobs: Sequence[Job], data: Path, row: Row, iterations: int, folder: Pa
         folder: for the checkpoint.
     """
     job = jobs[0]
-    trainer = Trainer(_scene(data / job.scene, job.variant, job.downscale), config_of(job, row), _device())
+    trainer = Trainer(_scene(job, data), config_of(job, row), _device())
     trainer.run(until=iterations)
     folder.mkdir()
     trainer.save(folder)
@@ -169,7 +176,7 @@ def run_job(
         beginning, if any; the metrics by view; device, date and commit.
     """
     device = _device()
-    scene = _scene(data / job.scene, job.variant, job.downscale)
+    scene = _scene(job, data)
     if device.type == "cuda":
         gc.collect()  # what the training before it in this process held
         torch.cuda.empty_cache()
@@ -489,7 +496,9 @@ def main(arguments: list[str] | None = None) -> int:
     training.add_argument("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
     training.add_argument("--variant", default="", choices=("", *VARIANTS), help="of the scene, for --row")
     training.add_argument(
-        "--scenes", default=",".join(SCENES), help="default: %(default)s; curve, arc and frames are of fox alone"
+        "--scenes",
+        default=",".join(SCENES),
+        help="default: %(default)s; curve, arc and frames are of fox alone, demo of the built-in scene",
     )
     training.add_argument("--seeds", default="0,1", help="default: %(default)s")
     training.add_argument(

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from nexwarp.cli import DEMO_SETTINGS
 from nexwarp.config import Config, preset, with_settings
 
 SCENES = ("fox", "saharov", "kitchen25")
+DEMO = "demo"  # the built-in scene, for who has no others
 GSPLAT = "gsplat MCMC"
 
 
@@ -87,8 +89,12 @@ CHANGES = (
     Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),
     Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
 )
-ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES)}
-TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames")
+# `nexwarp train demo`, and the paper with a run as short: with its rates, but without what the paper has not.
+_SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
+_AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_SETTINGS["rates.mlp"][0],) * 2}
+DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
+ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES, *DEMOS)}
+TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames", "demo")
 CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
 
 
@@ -120,6 +126,9 @@ def jobs_of(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations:
         yield from each((DEFAULT, PAPER), (size,), ("arc",), of=("fox",))
     elif table == "frames":
         yield from each((DEFAULT,), (size,), ("", "x100", "moved"), of=("fox",))
+    elif table == "demo":
+        iterations = DEMO_SETTINGS["iterations"]
+        yield from each(DEMOS, (DEMO_SETTINGS["max_surfels"],), ("arc",), of=(DEMO,))
     else:
         raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
 

@@ -109,7 +109,7 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     if any(row["flip"] is None for row in rows):
         lines += ["FLIP is left out where flip-evaluator was not installed.", ""]
     lines += [
-        "Mean +- standard deviation over seeds. FLIP and LPIPS: lower is better. train: PSNR of every 8th training "
+        "Mean ± standard deviation over seeds. FLIP and LPIPS: lower is better. train: PSNR of every 8th training "
         "view. zoom: the middles of the test views at 4 times the focal length, reduced by 4 again, against the "
         "rendering itself. at 1/4: test views rendered at a quarter of the size, against their photos reduced by 4. "
         "s, it/s, MiB: of trainings that ran alone.",
@@ -132,7 +132,7 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
         lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {last} |")
     for group in differences(results, against):
         lines += ["", f"## Mean of the scenes less that of {against}{_extent(group)}", ""]
-        lines += ["+- is the standard error that follows from the seeds' spread.", ""]
+        lines += ["± is the standard error that follows from the seeds' spread.", ""]
         lines += [f"| | {' | '.join(UNITS[m] for m in COMPARED)} | scenes |", "|---" * (len(COMPARED) + 2) + "|"]
         for row in group["rows"]:
             cells = [_cell(row[metric], DIGITS[metric], signed=True) for metric in COMPARED]
@@ -240,4 +240,4 @@ def _spread(values: Iterable[float | None]) -> list[float | None] | None:
 def _cell(values: list[float | None] | None, digits: int, signed: bool = False) -> str:
     formats = f"{'+' * signed}.{digits}f", f".{digits}f"
     pairs = zip(values or (), formats, strict=False)
-    return " +- ".join(f"{value:{form}}" for value, form in pairs if value is not None)
+    return " ± ".join(f"{value:{form}}" for value, form in pairs if value is not None)

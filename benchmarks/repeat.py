@@ -69,7 +69,7 @@ def _spread(values: Sequence[float], digits: int) -> str:
     if len(values) < 2:
         return mean
     deviation, low, high = statistics.stdev(values), min(values), max(values)
-    return f"{mean} +- {deviation:.{digits}f} (standard deviation; {low:.{digits}f} to {high:.{digits}f})"
+    return f"{mean} ± {deviation:.{digits}f} (standard deviation; {low:.{digits}f} to {high:.{digits}f})"
 
 
 @dataclass

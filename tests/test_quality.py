@@ -43,7 +43,7 @@ def test_every_row_is_a_setting() -> None:
 def test_tables_are_made_of_known_rows(table: str) -> None:
     jobs = list(jobs_of(table, ("fox", "saharov"), (0, 1), 100, 40))
     assert len(jobs) == len(set(jobs)) > 0
-    assert all(job.row in ROWS and job.iterations == 100 for job in jobs)
+    assert all(job.row in ROWS and job.iterations == (1200 if table == "demo" else 100) for job in jobs)
     assert {job.seed for job in jobs} == {0, 1}
     assert all(job.variant in ("", *VARIANTS) for job in jobs)
 
@@ -94,8 +94,8 @@ def test_tables_give_means_spreads_and_the_best_first(tmp_path: Path) -> None:
     text = markdown(results)
     rows = [line for line in text.splitlines() if line.startswith(("| default", f"| {GSPLAT}"))]
     assert rows[0].startswith(f"| {GSPLAT} | 33.00 |")
-    figures = "30.50 +- 0.71 | 0.9000 +- 0.0000 | 0.1000 +- 0.0000 |  |  |  |  | 2.0 +- 0.0"
-    assert rows[1] == f"| default | {figures} | 5 +- 0 | 20.0 +- 0.0 | 100 +- 0 | 2 | abc |"
+    figures = "30.50 ± 0.71 | 0.9000 ± 0.0000 | 0.1000 ± 0.0000 |  |  |  |  | 2.0 ± 0.0"
+    assert rows[1] == f"| default | {figures} | 5 ± 0 | 20.0 ± 0.0 | 100 ± 0 | 2 | abc |"
     assert "## fox, 40 primitives, 100 iterations" in text
     assert "LPIPS is left out where the weights of VGG could not be had." in text
 
@@ -165,14 +165,14 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     assert "## Mean of the scenes less that of default, 40 primitives, 100 iterations" in text
     assert "| | PSNR [dB] | SSIM | FLIP | LPIPS | at 1/4 [dB] | scenes |" in text
     assert "| K = 3 | +1.50 | +0.0000 | +0.0000 |  |  | fox, kitchen |" in text
-    figures = "-0.75 +- 0.90 | +0.0000 +- 0.0000 | +0.1000 +- 0.0500 |  | +0.50 +- 0.00"
+    figures = "-0.75 ± 0.90 | +0.0000 ± 0.0000 | +0.1000 ± 0.0500 |  | +0.50 ± 0.00"
     assert f"| no gamma | {figures} | fox, kitchen |" in text
     (group,) = differences(results, "no gamma")
     figures = {row["row"]: row["psnr"] for row in group["rows"]}
     assert figures == {"K = 3": [2.25, None], "default": [-second["psnr"][0], second["psnr"][1]]}
     text = markdown(results, "no gamma")
     assert "## Mean of the scenes less that of no gamma, 40 primitives, 100 iterations" in text
-    assert "| default | +0.75 +- 0.90 |" in text
+    assert "| default | +0.75 ± 0.90 |" in text
 
 
 def test_trainings_that_began_together_differ_by_pairs() -> None:
@@ -207,7 +207,7 @@ def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.C
     lines = [result("default", 1), result("default", 0, psnr=32.0), result(GSPLAT, 0, jobs=4, commit="abd")]
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert quality.main(["table", str(file), "--json", str(table)]) == 0
-    assert "| default | 31.00 +- 1.41 |" in capsys.readouterr().out
+    assert "| default | 31.00 ± 1.41 |" in capsys.readouterr().out
     found = json.loads(table.read_text())
     assert "11x11 Gaussian window" in found["convention"]
     ours, theirs = found["rows"]
@@ -376,8 +376,8 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
     assert not (tmp_path / "no.png").exists()
 
 
-A_MEAN = r"\d+\.\d\d \+- \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
-A_DIFFERENCE = r"[+-]\d+\.\d\d \+- \d\.\d\d, [+-]0\.\d{4} \+- 0\.\d{4}, [+-]0\.\d{4} \+- 0\.\d{4}"
+A_MEAN = r"\d+\.\d\d ± \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
+A_DIFFERENCE = r"[+-]\d+\.\d\d ± \d\.\d\d, [+-]0\.\d{4} ± 0\.\d{4}, [+-]0\.\d{4} ± 0\.\d{4}"
 
 
 def kept(name: str) -> dict[str, set[tuple]]:
@@ -387,13 +387,13 @@ def kept(name: str) -> dict[str, set[tuple]]:
     for row in summary(results):
         (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
         if spread is not None:
-            text = f"{figure:.2f} +- {spread:.2f}, {similarity:.4f}, {error:.4f}"
+            text = f"{figure:.2f} ± {spread:.2f}, {similarity:.4f}, {error:.4f}"
             found.setdefault(text, set()).add((row["scene"], row["variant"], row["size"], row["row"]))
     for against in ("default", "floaters left"):
         for row in (row for group in differences(results, against) for row in group["rows"]):
             if row["psnr"][1] is not None:
                 each = [(row[metric], digits) for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
-                text = ", ".join(f"{mean:+.{digits}f} +- {error:.{digits}f}" for (mean, error), digits in each)
+                text = ", ".join(f"{mean:+.{digits}f} ± {error:.{digits}f}" for (mean, error), digits in each)
                 found.setdefault(text, set()).add((row["row"], against))
     return found
 
@@ -414,7 +414,7 @@ def tables_of(text: str) -> list[list[list[str]]]:
 def test_the_documents_figures_are_those_of_the_kept_trainings() -> None:
     """Means with their spreads, and differences with their errors; a document is not older than its results."""
     known = kept("quality").keys() | kept("quality_tried").keys() | kept("quality_small").keys()
-    for name, least in (("README.md", 15), ("docs/quality.md", 40), ("benchmarks/NOTES.md", 50)):
+    for name, least in (("docs/quality.md", 40), ("benchmarks/NOTES.md", 50)):
         shown = re.findall(f"{A_MEAN}|{A_DIFFERENCE}", page(name))
         assert len(shown) >= least, f"{name}: the tables' figures are written otherwise"
         assert not (wrong := [figures for figures in shown if figures not in known]), f"{name}: {wrong}"
@@ -422,13 +422,20 @@ def test_the_documents_figures_are_those_of_the_kept_trainings() -> None:
 
 def test_the_readme_gives_each_scene_its_own_figures() -> None:
     figures, lines = kept("quality"), 0
-    for cells in (cells for table in tables_of(page("README.md")) for cells in table):
-        if name := re.fullmatch(rf"({'|'.join(SCENES)}), ([\d,]+)", cells[0]):
-            scene, size = name[1], int(name[2].replace(",", ""))
-            for row, cell in (("default", cells[1]), (GSPLAT, cells[3])):
-                assert (scene, "", size, row) in figures[cell], f"{cells[0]}: {row} has not {cell}"
-            lines += 1
-    assert lines >= 9
+    for header, *table in tables_of(page("README.md")):
+        for cells in table:
+            if name := re.fullmatch(rf"({'|'.join(SCENES)}), ([\d,]+)( \*)?", cells[0]):
+                scene, size = name[1], int(name[2].replace(",", ""))
+                assert [cell.split(": ")[-1] for cell in header[1:]] == ["PSNR [dB]", "SSIM", "FLIP", "MB"] * 2
+                for row, three in (("default", cells[1:4]), (GSPLAT, cells[5:8])):
+                    assert (scene, "", size, row) in figures[", ".join(three)], f"{cells[0]}: {row} has not {three}"
+                lines += 1
+            elif preset := re.fullmatch(r"`--preset (\w+)`", cells[0]):
+                for scene, cell in zip(SCENES, cells[1:], strict=False):
+                    of = {job for text, jobs in figures.items() for job in jobs if text.startswith(f"{cell}, ")}
+                    assert (scene, "", 40_000, preset[1]) in of, f"{scene}: {preset[1]} has not {cell}"
+                lines += 1
+    assert lines >= 11
 
 
 def test_the_tables_of_quality_md_give_each_row_its_own_figures() -> None:

@@ -40,8 +40,8 @@ def test_different_bytes_fail_where_they_were_promised(monkeypatch, capsys, same
     assert Repeat(runs=3, **options)() == code
     out, err = capsys.readouterr()
     assert ("3 runs, 1 different model: identical bytes" if same else "3 runs, 3 different models\n") in out
-    assert "test PSNR 30.2000 +- 0.1000 (standard deviation; 30.1000 to 30.3000) dB" in out
-    assert "200.0 +- 100.0 (standard deviation; 100.0 to 300.0) it/s" in out
+    assert "test PSNR 30.2000 ± 0.1000 (standard deviation; 30.1000 to 30.3000) dB" in out
+    assert "200.0 ± 100.0 (standard deviation; 100.0 to 300.0) it/s" in out
     assert err.count("\n") == 3
 
 
