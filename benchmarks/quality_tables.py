@@ -142,7 +142,8 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
 
 def _extent(what: dict[str, Any]) -> str:
     """Of trainings, for a heading."""
-    reduced = f", photos reduced by {what['downscale']}" if what["downscale"] > 1 else ""
+    by = what["downscale"] if isinstance(what["downscale"], list) else [what["downscale"]]
+    reduced = f", photos reduced by {' and '.join(map(str, by))}" if by != [1] else ""
     return f"{reduced}, {what['size']:,} primitives, {what['iterations']:,} iterations"
 
 
@@ -154,18 +155,19 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
         against: that row.
 
     Returns:
-        By size, downscale and length of training, where there are two scenes or more (unmoved, all photos): `rows`, the
-        best PSNR first, each with its `scenes` and, by metric and for `quarter_psnr`, [difference, its standard error],
-        None where a scene lacks it. Each scene counts alike, with the means over its seeds; the error is that of the
-        seeds' spread, of their differences where each pair began together, None where a scene has one seed alone.
+        By size and length of training, where there are two scenes or more (unmoved, all photos; one whose photos are
+        reduced differently counts apart), with all `downscale`: `rows`, the best PSNR first, each with its `scenes`
+        and, by metric and for `quarter_psnr`, [difference, its standard error], None where a scene lacks it. Each scene
+        counts alike, with the means over its seeds; the error is that of the seeds' spread, of their differences where
+        each pair began together, None where a scene has one seed alone.
     """
-    groups: dict[tuple, dict[str, dict[str, list[dict[str, Any]]]]] = {}
+    groups: dict[tuple, dict[str, dict[tuple[str, int], list[dict[str, Any]]]]] = {}
     for job, result in results.items():
         if not job.variant:
-            rows = groups.setdefault((job.size, job.downscale, job.iterations), {})
-            rows.setdefault(job.row, {}).setdefault(job.scene, []).append(result)
+            rows = groups.setdefault((job.size, job.iterations), {})
+            rows.setdefault(job.row, {}).setdefault((job.scene, job.downscale), []).append(result)
     found = []
-    for (size, downscale, iterations), rows in sorted(groups.items()):
+    for (size, iterations), rows in sorted(groups.items()):
         base = rows.pop(against, {})
         shown = []
         for name, scenes in rows.items():
@@ -173,10 +175,12 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
             if len(both) < 2:
                 continue
             figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in COMPARED}
-            shown.append({"row": name, "scenes": sorted(both)} | {m: _mean_difference(x) for m, x in figures.items()})
+            means = {m: _mean_difference(x) for m, x in figures.items()}
+            shown.append({"row": name, "scenes": sorted(scene for scene, _ in both), "of": both} | means)
         if shown:
             shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
-            found.append({"size": size, "downscale": downscale, "iterations": iterations, "rows": shown})
+            reduced = sorted({downscale for row in shown for _, downscale in row.pop("of")})
+            found.append({"size": size, "downscale": reduced, "iterations": iterations, "rows": shown})
     return found
 
 
