@@ -1,10 +1,10 @@
-"""What a finished model has beside what was trained: far looks, smooth colours, and exposures of other cameras.
+"""What a finished model has beside what was trained: far looks, smooth SH, and exposures of other cameras.
 
     python -m benchmarks.looks runs/fox/model.safetensors fox
 
 renders the test views of a trained model at the photos' size, a half, a quarter and an eighth of it, and compares with
 the photos reduced by area: as its file was before each of the three was there, and as it is finished now, whatever its
-file has; but colours that are smooth already, with whatever strength, stay. On a CPU or CUDA; nothing is trained.
+file has; but SH that are smooth already, with whatever strength, stay. On a CPU or CUDA; nothing is trained.
 """
 
 import statistics
@@ -44,7 +44,7 @@ def compare(model: nw.Model, scene: Scene) -> dict[str, list[tuple[float, float,
 
     Returns:
         By form of the model, for each of `FACTORS`, the means of PSNR [dB], SSIM and FLIP (None without its package):
-        "before", "far looks", "smooth colours" (but where the file has them), "finished" (with metered exposures, too),
+        "before", "far looks", "smooth SH" (but where the file has them), "finished" (with metered exposures, too),
         and "finished, full size reduced".
     """
     surfels, options = model.surfels, model.render_options
@@ -70,7 +70,7 @@ def compare(model: nw.Model, scene: Scene) -> dict[str, list[tuple[float, float,
     found["far looks"] = looked()
     if smooth is not None:
         surfels.sh0.data, surfels.shN.data = smooth
-        found["smooth colours"] = looked()
+        found["smooth SH"] = looked()
     if surfels.exposures is not None:
         exposures = metered(surfels.exposures, surfels, model.texture, cameras, options=options)
         surfels.exposures = exposures.to(surfels.device)

@@ -122,7 +122,7 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     title = ""
     for row in rows:
         variant = f", {row['variant']}" if row["variant"] else ""
-        here = f"{row['scene']}{variant}{_extent(row)}"
+        here = f"{row['scene']}{variant}{_extent(row, row['downscale'])}"
         if here != title:
             lines += [""] * bool(title) + [f"## {here}", "", f"| | {' | '.join(columns)} |"]
             lines += ["|---" * (len(columns) + 1) + "|"]
@@ -131,7 +131,7 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
         last = f"{len(row['seeds'])} | {', '.join(row['commits'])}"
         lines.append(f"| {row['row']} | " + " | ".join(cells) + f" | {last} |")
     for group in differences(results, against):
-        lines += ["", f"## Mean of the scenes less that of {against}{_extent(group)}", ""]
+        lines += ["", f"## Mean of the scenes less that of {against}{_extent(group, *group['downscales'])}", ""]
         lines += ["± is the standard error that follows from the seeds' spread.", ""]
         lines += [f"| | {' | '.join(UNITS[m] for m in COMPARED)} | scenes |", "|---" * (len(COMPARED) + 2) + "|"]
         for row in group["rows"]:
@@ -140,10 +140,9 @@ def markdown(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name) ->
     return "\n".join([*lines, ""])
 
 
-def _extent(what: dict[str, Any]) -> str:
+def _extent(what: dict[str, Any], *downscale: int) -> str:
     """Of trainings, for a heading."""
-    by = what["downscale"] if isinstance(what["downscale"], list) else [what["downscale"]]
-    reduced = f", photos reduced by {' and '.join(map(str, by))}" if by != [1] else ""
+    reduced = f", photos reduced by {' and '.join(map(str, downscale))}" if downscale != (1,) else ""
     return f"{reduced}, {what['size']:,} primitives, {what['iterations']:,} iterations"
 
 
@@ -156,7 +155,7 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
 
     Returns:
         By size and length of training, where there are two scenes or more (unmoved, all photos; one whose photos are
-        reduced differently counts apart), with all `downscale`: `rows`, the best PSNR first, each with its `scenes`
+        reduced differently counts apart), with their `downscales`: `rows`, the best PSNR first, each with its `scenes`
         and, by metric and for `quarter_psnr`, [difference, its standard error], None where a scene lacks it. Each scene
         counts alike, with the means over its seeds; the error is that of the seeds' spread, of their differences where
         each pair began together, None where a scene has one seed alone.
@@ -180,7 +179,7 @@ def differences(results: dict[Job, dict[str, Any]], against: str = DEFAULT.name)
         if shown:
             shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
             reduced = sorted({downscale for row in shown for _, downscale in row.pop("of")})
-            found.append({"size": size, "downscale": reduced, "iterations": iterations, "rows": shown})
+            found.append({"size": size, "downscales": reduced, "iterations": iterations, "rows": shown})
     return found
 
 

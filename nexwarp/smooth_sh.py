@@ -24,7 +24,7 @@ from nexwarp.surfels import Surfels
 
 SURFELS = 2**15  # whose equations are added to and solved at once
 LEAST = 1e-6  # pixels that a surfel has in all views, at least, if it is seen
-MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less is lost in the rounding
+MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less would be lost in the harmonics' rounding
 
 
 @torch.no_grad()

@@ -385,7 +385,7 @@ class Trainer:
     def finish(self, observe: Callable[[str, int, int], None] = lambda *_: None) -> Model:
         """Return a model with surfels of its own: as they are now, and what the settings ask of a finished model.
 
-        That is smooth colours, footprints and exposures, metered or not. The texture is the trainer's own.
+        That is smooth SH, footprints and exposures, metered or not. The texture is the trainer's own.
 
         Args:
             observe: called with each stage's name, how many views of it are rendered, and of how many.
@@ -397,7 +397,7 @@ class Trainer:
         if self.config.smooth_sh > 0:
             # The rest is the same whatever the order of threads.
             with _deterministic(self.config.deterministic and self.device.type == "cuda"):
-                views = _counted(self.scene.train, "smoothing colours", observe)
+                views = _counted(self.scene.train, "smoothing SH", observe)
                 found = smooth_sh(surfels, views, self.config.smooth_sh, options=options)
             surfels.sh0.data, surfels.shN.data = found
         if self.config.footprints:

@@ -47,9 +47,9 @@ def test_colours_that_are_as_learnt_are_made_smooth(scene: Scene, tmp_path: Path
     smooth, learnt = trained(scene), trained(scene, smooth_sh=0.0)
     assert not torch.equal(smooth.surfels.shN, learnt.surfels.shN)
     found = looks.compare(learnt, scene)
-    assert list(found)[2] == "smooth colours"
+    assert list(found)[2] == "smooth SH"
     assert torch.equal(smooth.surfels.shN, learnt.surfels.shN) and torch.equal(smooth.surfels.sh0, learnt.surfels.sh0)
     looks.picture(learnt, scene, tmp_path / "pictures")
     assert len(list((tmp_path / "pictures").glob("*.png"))) == len(scene.test)
     again = looks.compare(smooth, scene)
-    assert again["finished"] == found["finished"] and again["far looks"] == found["smooth colours"]
+    assert again["finished"] == found["finished"] and again["far looks"] == found["smooth SH"]

@@ -154,7 +154,7 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
             results[job]["quarter_psnr"] = 20.5 if row == "no gamma" else 20.0
     results |= {dataclasses.replace(job, variant="moved"): found for job, found in results.items()}
     (group,) = differences(results)
-    assert (group["size"], group["downscale"], group["iterations"]) == (40, [1], 100)
+    assert (group["size"], group["downscales"], group["iterations"]) == (40, [1], 100)
     first, second = group["rows"]
     assert (first["row"], first["scenes"], first["psnr"]) == ("K = 3", ["fox", "kitchen"], [1.5, None])
     # fox: -1 with variance 2 / 2; kitchen: -0.5 with 4.5 / 2.
@@ -176,7 +176,7 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     # Each scene with itself, however its photos are reduced.
     mixed = {dataclasses.replace(job, downscale=2) if job.scene == "fox" else job: x for job, x in results.items()}
     (again,) = differences(mixed)
-    assert again["downscale"] == [1, 2] and again["rows"] == differences(results)[0]["rows"]
+    assert again["downscales"] == [1, 2] and again["rows"] == differences(results)[0]["rows"]
     extent = ", photos reduced by 1 and 2, 40 primitives, 100 iterations"
     assert f"## Mean of the scenes less that of default{extent}" in markdown(mixed)
 
