@@ -11,7 +11,7 @@ import torch
 import nexwarp as nw
 from benchmarks import quality
 from benchmarks.quality import ARC, VARIANTS, arc, moved
-from benchmarks.quality_rows import GSPLAT, ROWS, SCENES, TABLES, Job, Row, jobs_of, together
+from benchmarks.quality_rows import DEFAULT, GSPLAT, ROWS, SCENES, TABLES, Job, Row, jobs_of, together
 from benchmarks.quality_tables import curves_of, differences, drop_unfinished, markdown, read_results, summary
 from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
@@ -382,6 +382,7 @@ def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.Ca
     assert not (tmp_path / "no.png").exists()
 
 
+OLDER = ("default of 705b43b", "floaters left")  # rows of the default as it was
 A_MEAN = r"\d+\.\d\d ± \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
 A_DIFFERENCE = r"[+-]\d+\.\d\d ± \d\.\d\d, [+-]0\.\d{4} ± 0\.\d{4}, [+-]0\.\d{4} ± 0\.\d{4}"
 
@@ -395,7 +396,7 @@ def kept(name: str) -> dict[str, set[tuple]]:
         if spread is not None:
             text = f"{figure:.2f} ± {spread:.2f}, {similarity:.4f}, {error:.4f}"
             found.setdefault(text, set()).add((row["scene"], row["variant"], row["size"], row["row"]))
-    for against in ("default", "floaters left"):
+    for against in ("default", *OLDER):
         for row in (row for group in differences(results, against) for row in group["rows"]):
             if row["psnr"][1] is not None:
                 each = [(row[metric], digits) for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
@@ -435,8 +436,9 @@ def test_the_readme_gives_each_scene_its_own_figures() -> None:
             if name := re.fullmatch(rf"({'|'.join(SCENES)}), ([\d,]+)( \*)?", cells[0]):
                 scene, size = name[1], int(name[2].replace(",", ""))
                 assert [cell.split(": ")[-1] for cell in header[1:]] == ["PSNR [dB]", "SSIM", "FLIP", "MB"] * 2
-                for row, three in (("default", cells[1:4]), (GSPLAT, cells[5:8])):
-                    assert (scene, "", size, row) in figures[", ".join(three)], f"{cells[0]}: {row} has not {three}"
+                for rows, three in (((DEFAULT.name, *OLDER[: bool(name[3])]), cells[1:4]), ((GSPLAT,), cells[5:8])):
+                    jobs = {(scene, "", size, row) for row in rows}
+                    assert jobs & figures[", ".join(three)], f"{cells[0]}: {rows[-1]} has not {three}"
                 lines += 1
             elif preset := re.fullmatch(r"`--preset (\w+)`", cells[0]):
                 for scene, cell in zip(SCENES, cells[1:], strict=False):
@@ -450,15 +452,15 @@ def test_the_tables_of_quality_md_give_each_row_its_own_figures() -> None:
     figures, checked = kept("quality"), 0
     for header, *lines in tables_of(page("docs/quality.md")):
         left = any(cells[0] == "default but floaters left" for cells in lines)
-        names = {"default, K = 2": "default", "default but floaters left": "floaters left"}
+        base = OLDER[left]
+        names = {f"{OLDER[0]}, K = 2": OLDER[0], "default but floaters left": OLDER[1]}
         for cells in lines:
             row = names.get(cells[0], re.sub(r" \(.*", "", cells[0]) + (", floaters left" if left else ""))
             for column, cell in zip(header[1:], cells[1:], strict=True):
                 if column in SCENES:
                     assert (column, "", 10_000, row) in figures[cell], f"{column}: {row} has not {cell}"
                 elif re.fullmatch(A_DIFFERENCE, cell):
-                    against = "floaters left" if left else "default"
-                    assert (row, against) in figures[cell], f"{row} less {against} is not {cell}"
+                    assert (row, base) in figures[cell], f"{row} less {base} is not {cell}"
                 elif cells[0] in SCENES and re.fullmatch(A_MEAN, cell):
                     preset = "paper" if "preset paper" in column else "default"
                     assert (cells[0], "", 40_000, preset) in figures[cell], f"{cells[0]}: {preset} has not {cell}"
