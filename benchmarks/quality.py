@@ -21,6 +21,7 @@ import gc
 import hashlib
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -30,8 +31,9 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import torch
@@ -393,7 +395,8 @@ def train(given: argparse.Namespace) -> int:
     jobs = [job for job in wanted if job not in have]
     print(f"{len(jobs)} of {len(wanted)} trainings to do")
     failed = 0
-    with tempfile.TemporaryDirectory() as beginnings, ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
+    workers = ProcessPoolExecutor(given.jobs, get_context("spawn"), initializer=_end_with_parent)
+    with tempfile.TemporaryDirectory() as beginnings, workers as pool:
         waiting: dict[Future, list[Job]] = {}
 
         def start(job: Job, beginning: Beginning | None = None) -> None:
@@ -408,7 +411,15 @@ def train(given: argparse.Namespace) -> int:
             else:
                 start(*members)
         while waiting:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            try:
+                done = wait(waiting, return_when=FIRST_COMPLETED).done
+            except KeyboardInterrupt:
+                for worker in active_children():  # else each would train to its end, and so would those that wait
+                    worker.terminate()
+                lost = sum(map(len, waiting.values()))
+                print(f"interrupted: the same command does the {lost} that are missing", file=sys.stderr)
+                return 130
+            for future in done:
                 members = waiting.pop(future)
                 try:
                     result = future.result()
@@ -425,6 +436,17 @@ def train(given: argparse.Namespace) -> int:
                     file.write(json.dumps(result | {"jobs": given.jobs}) + "\n")
                 print(_told(members[0], result), flush=True)
     return 1 if failed else 0
+
+
+def _end_with_parent() -> None:
+    """For a worker: not to outlive the command, however that ends; Ctrl-C in a terminal is the command's to handle."""
+
+    def follow() -> None:
+        parent_process().join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=follow, daemon=True).start()
 
 
 def _told(job: Job, result: dict[str, Any]) -> str:

@@ -3,6 +3,10 @@
 import dataclasses
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -339,6 +343,21 @@ def test_a_training_from_a_common_beginning_is_the_training(
         texture.append(one.texture.grid)
     assert not torch.equal(*texture[:2])
     torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path: Path, how: signal.Signals) -> None:
+    command = [sys.executable, "-m", "benchmarks.quality", "train", "--row", "mine:default:{}", "--scenes", "tiny"]
+    command += ["--seeds", "0,1", "--size", "60", "--iterations", "1000000", "--data", str(folder)]
+    command += ["--out", str(tmp_path / "out.jsonl")]
+    with subprocess.Popen(command, cwd=quality.ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"2 of 2 trainings to do\n"
+        time.sleep(3)
+        process.send_signal(how)  # to this process alone
+        said = process.communicate(timeout=60)[1].decode()  # ends when the last that could write has
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    assert ("the same command does the 2 that are missing" in said) == (how == signal.SIGINT)
+    assert not (tmp_path / "out.jsonl").exists()
 
 
 def test_only_some_rows_of_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
