@@ -27,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -394,6 +394,11 @@ def train(given: argparse.Namespace) -> int:
             raise ValueError(f"{given.out}: expected {told}, got others ({have[job]['commit']}): give another --out")
     jobs = [job for job in wanted if job not in have]
     print(f"{len(jobs)} of {len(wanted)} trainings to do")
+    return _train_all(jobs, rows, given)
+
+
+def _train_all(jobs: Sequence[Job], rows: Mapping[str, Row], given: argparse.Namespace) -> int:
+    """Do these, `given.jobs` at once; each result is appended to `given.out` as it comes. Return the exit code."""
     failed = 0
     workers = ProcessPoolExecutor(given.jobs, get_context("spawn"), initializer=_end_with_parent)
     with tempfile.TemporaryDirectory() as beginnings, workers as pool:
@@ -403,38 +408,36 @@ def train(given: argparse.Namespace) -> int:
             future = pool.submit(run_job, job, given.data, rows[job.row], given.pictures, given.models, beginning)
             waiting[future] = [job]
 
-        for number, (members, alike) in enumerate(together(jobs, rows)):
-            if alike:
-                folder = Path(beginnings) / str(number)
-                future = pool.submit(begin, members, given.data, rows[members[0].row], alike, folder)
-                waiting[future] = members
-            else:
-                start(*members)
-        while waiting:
-            try:
-                done = wait(waiting, return_when=FIRST_COMPLETED).done
-            except KeyboardInterrupt:
-                for worker in active_children():  # else each would train to its end, and so would those that wait
-                    worker.terminate()
-                lost = sum(map(len, waiting.values()))
-                print(f"interrupted: the same command does the {lost} that are missing", file=sys.stderr)
-                return 130
-            for future in done:
-                members = waiting.pop(future)
-                try:
-                    result = future.result()
-                except Exception as error:  # one failure must not lose the others' results
-                    failed += len(members)
-                    for job in members:
-                        print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
-                    continue
-                if isinstance(result, Beginning):
-                    for job in members:
-                        start(job, result)
-                    continue
-                with given.out.open("a") as file:
-                    file.write(json.dumps(result | {"jobs": given.jobs}) + "\n")
-                print(_told(members[0], result), flush=True)
+        try:
+            for number, (members, alike) in enumerate(together(jobs, rows)):
+                if alike:
+                    folder = Path(beginnings) / str(number)
+                    future = pool.submit(begin, members, given.data, rows[members[0].row], alike, folder)
+                    waiting[future] = members
+                else:
+                    start(*members)
+            while waiting:
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    members = waiting.pop(future)
+                    try:
+                        result = future.result()
+                    except Exception as error:  # one failure must not lose the others' results
+                        failed += len(members)
+                        for job in members:
+                            print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
+                        continue
+                    if isinstance(result, Beginning):
+                        for job in members:
+                            start(job, result)
+                        continue
+                    with given.out.open("a") as file:
+                        file.write(json.dumps(result | {"jobs": given.jobs}) + "\n")
+                    print(_told(members[0], result), flush=True)
+        except KeyboardInterrupt:
+            for worker in active_children():  # else each would train to its end, and then what waits
+                worker.terminate()
+            print("interrupted: the same command does what is missing", file=sys.stderr)
+            return 130
     return 1 if failed else 0
 
 

@@ -354,9 +354,12 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
         assert process.stdout.readline() == b"2 of 2 trainings to do\n"
         time.sleep(3)
         process.send_signal(how)  # to this process alone
-        said = process.communicate(timeout=60)[1].decode()  # ends when the last that could write has
+        try:
+            said = process.communicate(timeout=60)[1].decode()  # ends when the last that could write has
+        finally:
+            process.kill()
     assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    assert ("the same command does the 2 that are missing" in said) == (how == signal.SIGINT)
+    assert ("interrupted: the same command does what is missing" in said) == (how == signal.SIGINT)
     assert not (tmp_path / "out.jsonl").exists()
 
 
