@@ -15,17 +15,17 @@ ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "paper.md"
 CITED = re.compile(r"\b(Sec|Eq)(?:tions?|uations?|s)?\b\.?\s*\(?(\d+(?:\.\d+)*)", re.I)
 CANONICAL = re.compile(r"paper (Sec|Eq)\. (\d+(?:\.\d+)?)")
-MORE_NUMBERS = re.compile(r"(?:,| and| or| to|-|–)\s*\d+(?:\.\d+)?(?=[):;,.]|\s+and\b|$)")
+MORE_NUMBERS = re.compile(r"(?:,| and| or| to|-)\s*\d+(?:\.\d+)?(?=[):;,.]|\s+and\b|$)")
 BY_TITLE = re.compile(r"(?:paper's|publication's|its)\s+(?:section|Sec\.)\s+\"[^\"]*\"", re.I)
 
 # What a citation of an equation speaks of, within NEARBY characters: a number that exists may still be the wrong one.
 NEARBY = 160
 SUBJECTS = {
     "1": "composit|blend|transmittance",
-    "2": r"hash|H\(x\)",
+    "2": r"features|concatenat|H\(x\)",
     "3": "kernel|gaussian|gamma|hit of a ray",
-    "4": "down-weight|delta|fade|footprint",
-    "5": r"field|texture|G\(",
+    "4": "down-weight|delta|fade|focal",
+    "5": r"field|filter|G\(",
     "6": r"plain|\bN\b|buffer|weight",
     "7": "compos|add|sum|image|colou?r",
     "8": "image|SSIM",
@@ -134,4 +134,4 @@ def test_what_counts_as_a_citation(text, right):
 
 
 def test_other_words_and_numbers_are_no_citations():
-    assert not list(citations("text", "2 seconds 3; sections: 4; sequence 5; 10 sec of 3 equal parts; Section headings"))
+    assert not list(citations("text", "2 seconds 3; sections: 4; sequence 5; 10 sec of 3; Section headings"))

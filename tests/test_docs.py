@@ -1,17 +1,22 @@
-"""The documents against the code: options.md is made from it, format.md tells what a run holds, commands can be typed.
+"""The documents against the code: options.md and cli.md are made from it, format.md says what a run holds.
 
-python -m tests.test_docs --write      # writes docs/options.md
+python -m tests.test_docs --write      # writes docs/options.md and docs/cli.md
 """
 
 import ast
+import contextlib
 import dataclasses
+import importlib.util
 import inspect
+import io
 import itertools
 import json
+import os
 import re
 import shlex
 import shutil
 import struct
+import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -31,14 +36,15 @@ from nexwarp.exposures import Exposures
 
 DOCS = Path(__file__).parents[1] / "docs"
 
-# The publication's symbol of a setting, and the section that gives its value; "code": only the authors' code does.
+# The publication's symbol of a setting, and the section that gives its value (docs/paper.md has their titles);
+# "code": only the authors' code gives it.
 SYMBOLS: dict[str, tuple[str, str]] = {
     "preset": ("", ""),
-    "iterations": ("", "Optimization"),
-    "max_surfels": ("P", "Adaptive Density Control"),
-    "max_hits": ("K", "Rendering"),
+    "iterations": ("", "4.3"),
+    "max_surfels": ("P", "4.3"),
+    "max_hits": ("K", "5"),
     "more_hits_from": ("", ""),
-    "sh_degree": ("S = (d + 1)^2", "Results"),
+    "sh_degree": ("S = (d + 1)^2", "5"),
     "sh_every": ("", "code"),
     "coarse": ("", ""),
     "background": ("", "code"),
@@ -59,12 +65,12 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "seed": ("", "code"),
     "deterministic": ("", ""),
     "cuda_graphs": ("", ""),
-    "losses.dssim": ("λ_D-SSIM", "Losses"),
-    "losses.alpha": ("λ_alpha", "Losses"),
+    "losses.dssim": ("λ_D-SSIM", "4.3"),
+    "losses.alpha": ("λ_alpha", "4.3"),
     "losses.alpha_hits": ("", ""),
-    "losses.texture": ("λ_texture", "Losses"),
-    "losses.opacity": ("λ_opacity", "Losses"),
-    "losses.grid": ("λ_grid", "Losses"),
+    "losses.texture": ("λ_texture", "4.3"),
+    "losses.opacity": ("λ_opacity", "4.3"),
+    "losses.grid": ("λ_grid", "4.3"),
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
     "losses.border": ("", ""),
@@ -77,50 +83,53 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.shN": ("", "code"),
     "rates.grid": ("", "code"),
     "rates.mlp": ("", "code"),
-    "texture.levels": ("L", "Results"),
-    "texture.table_size": ("T", "Results"),
-    "texture.features": ("F", "Results"),
+    "texture.levels": ("L", "5"),
+    "texture.table_size": ("T", "5"),
+    "texture.features": ("F", "5"),
     "texture.min_resolution": ("s_0", "code"),
     "texture.max_resolution": ("s_(L-1)", "code"),
-    "texture.width": ("", "Results"),
-    "texture.hidden_layers": ("", "Results"),
-    "texture.sh_degree": ("S = (d + 1)^2", "Results"),
+    "texture.width": ("", "5"),
+    "texture.hidden_layers": ("", "5"),
+    "texture.sh_degree": ("S = (d + 1)^2", "5"),
     "texture.residual": ("", ""),
-    "texture.down_weighting": ("Δ", "Representation"),
-    "densify.start": ("", "Adaptive Density Control"),
-    "densify.stop": ("", "Adaptive Density Control"),
-    "densify.every": ("", "Adaptive Density Control"),
-    "densify.fraction": ("", "Adaptive Density Control"),
-    "densify.prune_opacity": ("", "Adaptive Density Control"),
+    "texture.down_weighting": ("Δ", "4.1"),
+    "densify.start": ("", "4.3"),
+    "densify.stop": ("", "4.3"),
+    "densify.every": ("", "4.3"),
+    "densify.fraction": ("", "4.3"),
+    "densify.prune_opacity": ("", "4.3"),
     "densify.prune_at_cap": ("", "code"),
     "densify.floaters": ("", ""),
 }
 
 INTRODUCTION = """\
-# Options
+# Settings
 
-Made from the code by `python -m tests.test_docs --write`; a test fails when the two disagree.
+Options of each command, and all settings of a training ([below](#all-settings)). The page is made from the code by
+`python -m tests.test_docs --write`; a test fails if the two disagree.
 
-Every command has `--help`. Bad input gives one line on stderr and exit code 2; Ctrl-C exits with 130.
+Every command has `--help` ([Commands](cli.md)). Bad input gives one line on stderr and exit code 2. Ctrl-C exits
+with 130.
 """
 
 SETTINGS = """\
-## Settings
+## All settings
 
-What a training depends on beside its scene: `nexwarp.config.Config`. `--preset` picks the values to start from, the
-flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
+A training depends on its scene and on these settings (`nexwarp.Config`). `--preset` chooses the values to start from.
+The flags of `nexwarp train` change some of them, and `--set KEY=VALUE`, which can be repeated, changes any:
 
     nexwarp train SCENE --preset paper --set texture.max_resolution=1024
     nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
 
-VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY, a value of another type or
-out of range is refused before anything is written. The settings of a run are in its `config.json`; with `--resume`
-they come from there, and what is given must agree.
+VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY and a value of another type or
+out of range are refused before anything is written. The settings of a run are in its `config.json`. With `--resume`
+they come from there, and options that are given must agree with them.
 
 `demo` has settings of its own, for a short training on a CPU, with either preset: DEMO.
 
-Symbol and section are the publication's; "code" is what only the authors' code has. Where there is neither, the
-publication has no such thing, and `paper` turns it off or it is of no effect there. Values that differ are bold.
+Symbol and section are the publication's; "code" means that only the authors' code has the setting. A setting without
+either is not in the publication; `paper` turns it off, or it has no effect there. Values that differ are bold.
+[Presets and paper](paper.md) says why they differ.
 """
 
 
@@ -193,8 +202,49 @@ def options_page() -> str:
         default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
         symbol, section = SYMBOLS[name]
         theirs = theirs if theirs == default else f"**{theirs}**"
+        section = f"paper Sec. {section}" if section[:1].isdigit() else section
         page.append(f"| `{name}` | {default} | {theirs} | {cell(text)} | {symbol} | {section} |")
     return "\n".join(page) + "\n"
+
+
+# docs/cli.md
+
+COMMANDS_PAGE = """\
+# Commands
+
+What `nexwarp COMMAND --help` prints. The page is made from the code by `python -m tests.test_docs --write`; a test
+fails if the two disagree. [Settings](options.md) has the same options as tables, and the keys of `--set`.
+"""
+ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def help_text(*command: str) -> str:
+    """What --help of a command prints, 100 columns wide."""
+    out, columns = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            cli.main([*command, "--help"])
+    finally:
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+    lines = [line.rstrip() for line in ANSI.sub("", out.getvalue()).splitlines()]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).strip()
+
+
+def commands_page() -> str:
+    """The text of docs/cli.md."""
+    page = [COMMANDS_PAGE]
+    for command in ([], *([name] for name in cli.COMMANDS)):
+        page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
+    return "\n".join(page)
+
+
+def test_the_commands_page_is_that_of_the_code():
+    page = (DOCS / "cli.md").read_text(encoding="utf-8")
+    assert page == commands_page(), "docs/cli.md is out of date: python -m tests.test_docs --write"
 
 
 def test_the_options_page_is_that_of_the_code():
@@ -374,9 +424,10 @@ def test_checkpoint(run):
     assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
 
 
-# docs/paper.md, docs/migrating.md, and what is said to be typed anywhere
+# docs/paper.md, docs/migrating.md, the README, and commands on any page
 
-PAGES = [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"]
+ROOT = DOCS.parent
+PAGES = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -431,19 +482,69 @@ def test_examples(run, tmp_path, monkeypatch, capsys):
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
 
 
+def test_the_readme_s_python_runs(run, tmp_path, monkeypatch, capsys):
+    """As it stands, where a run of the demo is."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    assert len([line for line in example.splitlines() if line]) <= 12
+    names: dict[str, Any] = {}
+    exec(example, names)
+    shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
+    assert capsys.readouterr().out.splitlines()[0] == shapes
+    assert names["model"].surfels.means.grad.norm() > 0
+
+
+def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
+    """It reads what its command writes."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
+    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
+    exec(example, {})
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1000
+
+
+def test_pages_are_in_the_site_s_navigation():
+    """Each page of docs/ is there, and each is reached from the first page."""
+    listed = set(re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M))
+    pages = {page.name for page in DOCS.glob("*.md")}
+    assert pages <= listed
+    first = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert pages - {"index.md"} <= set(re.findall(r"\]\(([a-z_]+\.md)", first))
+
+
+def test_the_api_page_has_every_public_name():
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
+def test_the_site_builds(tmp_path):
+    """All links and anchors between pages lead somewhere, and all names of the API are found."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "paper Eq. 6" in (tmp_path / "site" / "method" / "index.html").read_text(encoding="utf-8")
+
+
 def test_links():
     """Every link from one document to another leads somewhere."""
-    for page in [*PAGES, DOCS.parent / "CONTRIBUTING.md"]:
+    for page in PAGES:
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def main(arguments: list[str]) -> int:
-    """Write docs/options.md."""
+    """Write docs/options.md and docs/cli.md."""
     if arguments != ["--write"]:
         print("usage: python -m tests.test_docs --write", file=sys.stderr)
         return 2
     (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
+    (DOCS / "cli.md").write_text(commands_page(), encoding="utf-8")
     return 0
 
 
