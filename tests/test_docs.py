@@ -525,7 +525,7 @@ def test_the_api_page_has_every_public_name():
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
 def test_the_site_builds(tmp_path):
     """All links and anchors between pages lead somewhere, and all names of the API are found."""
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "paper Eq. 6" in (tmp_path / "site" / "method" / "index.html").read_text(encoding="utf-8")
