@@ -15,7 +15,7 @@ from rich.console import Console
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.device import keep_freed_memory, pick_device
-from nexwarp.cli.display import device_name, warn
+from nexwarp.cli.display import device_name
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.signals import Stopped, deferred_stop
@@ -149,7 +149,7 @@ class Train:
         if resume:
             tidy_run(run)
         if resume and has_checkpoint(run):
-            trainer.restore(run, partial(warn, console))
+            trainer.restore(run, partial(display.warn, console))
             console.print(f"resumed at iteration {trainer.iteration:,}")
         elif self.resume:
             console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
@@ -281,7 +281,7 @@ def _train(
                 raise Stopped(number)
 
         def warn(text: str) -> None:
-            warn(console, text)
+            display.warn(console, text)
             log.rewind()
 
         try:
