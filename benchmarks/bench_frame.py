@@ -13,7 +13,7 @@ from benchmarks import suite
 from benchmarks.scenes import Scene, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import MIB, Measurement, figure, process_memory, synchronize
-from nexwarp.evaluate import seen_footprints
+from nexwarp.finish.detail_limits import seen_footprints
 
 STEADY_FRAMES = 50
 

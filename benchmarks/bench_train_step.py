@@ -13,12 +13,12 @@ from benchmarks import suite
 from benchmarks.scenes import GARDEN, Scene, cloud, garden, saharov
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, synchronize
-from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene as Photos
 from nexwarp.data import View
-from nexwarp.floaters import floaters, nearest_depth
-from nexwarp.metrics import to_uint8
-from nexwarp.trainer import Trainer
+from nexwarp.io.pictures import to_uint8
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.floaters import floaters, nearest_depth
+from nexwarp.train.trainer import Trainer
 
 MIDDLE = 10_000  # iteration
 POINTS = 1000

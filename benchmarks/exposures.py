@@ -17,7 +17,8 @@ import tyro
 
 from benchmarks.timing import ROOT
 from nexwarp.data import View, load_scene
-from nexwarp.exposures import Exposures, photo_gains
+from nexwarp.representation.exposures import Exposures
+from nexwarp.train.exposure_calibration import photo_gains
 
 
 def gains_of(views: list[View]) -> tuple[torch.Tensor, tuple[float, float, float]]:

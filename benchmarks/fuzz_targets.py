@@ -12,19 +12,21 @@ import torch
 
 from benchmarks.fuzz_inputs import Files
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import Model, load, load_cameras, save_cameras, save_model
-from nexwarp.config import Config
+from nexwarp.cameras.cameras_file import load_cameras, save_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
 from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply, write_ply
-from nexwarp.export import load_surfels_ply, save_splats_ply, save_surfels_ply
-from nexwarp.nerfstudio import load_camera_path, save_camera_path, save_transforms
-from nexwarp.pictures import load_exr, save_exr
-from nexwarp.runs import SceneSource, create_run, read_run
-from nexwarp.surfels import Surfels
-from nexwarp.texture import NeuralTexture
+from nexwarp.io.pictures import load_exr, save_exr
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import load, save_model
+from nexwarp.model.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import NeuralTexture
+from nexwarp.run.folder import SceneSource, create_run, read_run
+from nexwarp.train.config import Config
 
 WIDTH, HEIGHT, VIEWS = 12, 9, 3
 

@@ -186,10 +186,10 @@ def main(
         base: folder for the scenes; those that are there are taken as they are.
         names: which forms; by default all.
     """
-    from nexwarp.cli import DEMO_SETTINGS
-    from nexwarp.config import preset, with_settings
-    from nexwarp.evaluate import evaluate
-    from nexwarp.trainer import Trainer
+    from nexwarp.run.evaluate import evaluate
+    from nexwarp.train.presets import DEMO_SETTINGS, preset
+    from nexwarp.train.settings import with_settings
+    from nexwarp.train.trainer import Trainer
 
     demo = base / "pinhole"
     forms = {

@@ -22,8 +22,9 @@ from typing import Annotated
 
 import tyro
 
-from nexwarp.checkpoint import CHECKPOINTS, MODEL_FILE
-from nexwarp.runs import CONFIG_FILE
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.run.folder import CONFIG_FILE
+from nexwarp.train.checkpoint import CHECKPOINTS
 
 POLL_SECONDS = 0.002
 

@@ -16,7 +16,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.kernels.sh import BAND_0
-from nexwarp.losses import image_loss
+from nexwarp.train.losses import image_loss
 
 FLOATS = 59  # a Gaussian: means 3, quats 4, scales 3, opacity 1, SH 48
 SH_DEGREE = 3

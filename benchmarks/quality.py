@@ -11,7 +11,7 @@ several machines too. Rows of which only K or the removal of floaters differs tr
 scene, neighbouring cameras held out, minutes on a CPU. `table` makes Markdown of the lines, means and spreads over
 seeds, and what each row has more than the default, or the row `--against`, on the mean of the scenes; nothing is
 trained twice for two tables. `curve` draws a metric over the number of primitives. Metrics are those of
-`nexwarp.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had. Speed and memory of a
+`nexwarp.run.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had. Speed and memory of a
 training count when it ran alone (`--jobs 1`).
 """
 
@@ -53,16 +53,17 @@ from benchmarks.quality_tables import (
 )
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import load_checkpoint, save_checkpoint, save_model
-from nexwarp.config import Config
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import downscale_image, downscale_mask
-from nexwarp.evaluate import METRICS as JUDGES
-from nexwarp.metrics import CONVENTION, psnr, to_uint8
-from nexwarp.pictures import error_map, save_png, side_by_side
+from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.model.model_file import save_model
 from nexwarp.render import render
-from nexwarp.trainer import Trainer
+from nexwarp.run.evaluate import METRICS as JUDGES
+from nexwarp.run.metrics import CONVENTION, psnr
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.config import Config
+from nexwarp.train.trainer import Trainer
 
 ARC = 8  # held-out cameras in a row
 

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from nexwarp.cli import DEMO_SETTINGS
-from nexwarp.config import Config, preset, with_settings
+from nexwarp.train.config import Config
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
 
 SCENES = ("fox", "saharov", "kitchen25")
 DEMO = "demo"  # the built-in scene, for who has no others

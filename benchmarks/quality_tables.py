@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.quality_rows import DEFAULT, GSPLAT, Job
-from nexwarp.metrics import CONVENTION
+from nexwarp.run.metrics import CONVENTION
 
 METRICS = ("psnr", "ssim", "flip", "lpips")
 OTHERS = ("train_psnr", "zoom_psnr", "quarter_psnr")

@@ -21,8 +21,8 @@ from typing import Annotated
 import tyro
 
 from benchmarks.suite import Options
-from nexwarp.checkpoint import MODEL_FILE
-from nexwarp.runs import METRICS_FILE
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.run.folder import METRICS_FILE
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ import tyro
 import warp as wp
 
 import nexwarp as nw
-from nexwarp import warmup
-from nexwarp.config import preset
-from nexwarp.trainer import Trainer
+from nexwarp.run import warmup
+from nexwarp.train.presets import preset
+from nexwarp.train.trainer import Trainer
 
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 # Iterations of a full run: all degrees of spherical harmonics, then a step beyond the frame with a density round.

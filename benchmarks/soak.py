@@ -20,11 +20,11 @@ import tyro
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.config import Config, TextureConfig
+from nexwarp.cli.device import keep_freed_memory
 from nexwarp.data import Scene, write_demo
-from nexwarp.densify import DensifyConfig
-from nexwarp.runs import keep_freed_memory
-from nexwarp.trainer import Progress, Trainer
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.trainer import Progress, Trainer
 
 MIB = 2**20
 WARMUP, WINDOW = 500, 1000

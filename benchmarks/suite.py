@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from benchmarks.timing import ROOT, Measurement, measure
-from nexwarp.checkpoint import MODEL_FILE
+from nexwarp.model.model_file import MODEL_FILE
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import Model, load
 from nexwarp.data import Scene, View, load_scene
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import load
+from nexwarp.model.options import RenderOptions
 from nexwarp.render import Rendering, render
-from nexwarp.surfels import Surfels
-from nexwarp.texture import NeuralTexture
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import NeuralTexture
 
 __version__ = "0.1.0"
 
@@ -20,6 +22,7 @@ __all__ = [
     "Camera",
     "Model",
     "NeuralTexture",
+    "RenderOptions",
     "Rendering",
     "Scene",
     "Surfels",

@@ -2,6 +2,6 @@
 
 import sys
 
-from nexwarp.cli import main
+from nexwarp.cli.main import main
 
 sys.exit(main())

@@ -1,10 +1,12 @@
 """Pinhole cameras: world to camera, x right, y down, z forward (OpenCV, as COLMAP writes them)."""
 
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+
+from nexwarp.checks import check_range
 
 ROTATION_TOLERANCE = 1e-3
 
@@ -130,3 +132,50 @@ def _check_intrinsics(intrinsics: torch.Tensor) -> None:
         raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
     if last != [0.0, 0.0, 1.0]:
         raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")
+
+
+def visible_points(
+    pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Return `places` and `expected` of `depth_loss` for the points that an image shows; None when it shows none.
+
+    Args:
+        pixels: (M, 2) pixel coordinates of the points, x and y, of any size or none behind the camera.
+        depths: (M,) their z-depths, those <= 0 being behind the camera.
+        width: of the image.
+        height: of the image.
+        mask: (H, W) bool, True where the photograph counts; None is everywhere.
+    """
+    size = torch.tensor([width, height], device=pixels.device)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+    column, row = pixels[inside].long().unbind(-1)
+    places, expected = row * width + column, depths[inside]
+    if mask is not None:
+        counts = mask.flatten()[places]
+        places, expected = places[counts], expected[counts]
+    return (places, expected) if len(places) else None
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera with another image size, in pixels, that sees what it did from top to bottom.
+
+    Pixels keep their shape: another aspect ratio shows more or less at the sides. The principal point keeps its
+    offset from the middle, relative to the height.
+    """
+    check_range("width", width, 1)
+    check_range("height", height, 1)
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    scale = height / camera.height
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = camera.fx * scale, camera.fy * scale
+    K[0, 2] = (camera.cx - camera.width / 2) * scale + width / 2
+    K[1, 2] = camera.cy * scale
+    return replace(camera, K=K, width=width, height=height)
+
+
+def reduced(camera: Camera, height: int) -> Camera:
+    """Return the camera with an image that is at most `height` pixels tall, and as wide as that asks."""
+    if camera.height <= height:
+        return camera
+    return resized(camera, max(round(camera.width * height / camera.height), 1), height)

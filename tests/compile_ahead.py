@@ -10,9 +10,9 @@ import warp as wp
 
 from nexwarp.kernels import launch
 from nexwarp.kernels.catalogue import thread_kernels
-from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel
+from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel
 from nexwarp.ops.tiles import TILE_SIZE
-from nexwarp.warmup import Build, compile_all
+from nexwarp.run.warmup import Build, compile_all
 
 HITS = (2, 0, 1, 8, 4)
 

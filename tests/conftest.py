@@ -10,10 +10,10 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import config, floaters
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
-from tests import beside as beside_others
+from nexwarp.train import floaters, presets
+from tests import background_jobs
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -22,22 +22,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("cuda"):
                 item.add_marker(pytest.mark.skip(reason="no CUDA device"))
-    if len(items) >= beside_others.MANY:
-        items.sort(key=lambda item: beside_others.key(item) is not None)
+    if len(items) >= background_jobs.MANY:
+        items.sort(key=lambda item: background_jobs.key(item) is not None)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def begun(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[beside_others.Beside]:
+def begun(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[background_jobs.BackgroundJobs]:
     """Kernels that are not in Warp's cache yet are compiled beside the first tests; then the marked tests' work."""
     items, compilers = request.session.items, [sys.executable, "-m", "tests.compile_ahead"]
-    with beside_others.begun(items, tmp_path_factory.mktemp, compilers) as work:
+    with background_jobs.begun(items, tmp_path_factory.mktemp, compilers) as work:
         yield work
 
 
 @pytest.fixture
-def beside(request: pytest.FixtureRequest, begun: beside_others.Beside) -> Any:
-    """What the work of the test's mark `beside` gave."""
-    return begun.result(beside_others.key(request.node))
+def background_job(request: pytest.FixtureRequest, begun: background_jobs.BackgroundJobs) -> Any:
+    """What the work of the test's mark `background_job` gave."""
+    return begun.result(background_jobs.key(request.node))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -85,7 +87,7 @@ def few_looks() -> Iterator[None]:
 def small_preset(request: pytest.FixtureRequest, one_torch_thread: None, few_looks: None) -> Iterator[None]:
     """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "default", request.module.SMALL)
+        patch.setitem(presets.PRESETS, "default", request.module.SMALL)
         yield
 
 

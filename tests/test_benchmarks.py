@@ -18,8 +18,10 @@ from benchmarks.scenes import Scene, cloud, fox, garden, geometry, outputs, rand
 from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
 from nexwarp import Camera, NeuralTexture, ops
-from nexwarp.checkpoint import Model, save_cameras, save_model
-from nexwarp.evaluate import NEVER
+from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.finish.detail_limits import NEVER
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import save_model
 from nexwarp.ops import Pinhole
 from tests.tolerances import assert_close
 

@@ -17,15 +17,16 @@ from PIL import Image
 
 import nexwarp as nw
 from benchmarks.inputs import write_blender, write_points
-from nexwarp import cli
-from nexwarp.checkpoint import load_cameras
-from nexwarp.config import Config, TextureConfig
-from nexwarp.console import TrainingDisplay
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
+from nexwarp.cli.display import TrainingDisplay
 from nexwarp.data import write_demo
-from nexwarp.densify import Densifier, DensifyConfig
-from nexwarp.metrics import CONVENTION, psnr, to_uint8
-from nexwarp.pictures import CAPTION_HEIGHT
-from nexwarp.trainer import Trainer
+from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
+from nexwarp.run.metrics import CONVENTION, psnr
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.presets import config_from_dict
+from nexwarp.train.trainer import Trainer
 from tests.test_scene import make_scene
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -89,7 +90,7 @@ def test_a_run_holds_what_it_should(trained, scene):
     given = {"path": str(scene.resolve()), "images": "images", "downscale": 1, "masks": "masks"}
     assert config["scene"] == given | dict.fromkeys(("background", "points", "format"))
     assert config["device"] == "cpu" and config["config"]["preset"] == "default"
-    settings = Config.from_dict(config["config"])
+    settings = config_from_dict(config["config"])
     assert (settings.iterations, settings.max_surfels, settings.texture) == (20, 100, SMALL.texture)
     metrics = read(trained, "metrics.json")
     assert list(metrics["views"]) == ["view_000.png", "view_008.png"] and metrics["convention"] == CONVENTION
@@ -126,7 +127,7 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
     assert "8 training and 2 test views of 48x36" in out
     for word in ("iteration 20/20", "it/s", "loss", "train", "dB", "surfels", "s left", "test PSNR", "test SSIM"):
         assert word in out, word
-    settings = Config.from_dict(read(run, "config.json")["config"])
+    settings = config_from_dict(read(run, "config.json")["config"])
     assert (settings.max_hits, settings.seed) == (0, 3)
     assert nw.load(run).meta["max_hits"] == 0
 

@@ -21,16 +21,16 @@ def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProces
 @pytest.mark.parametrize(
     ("arch", "least"),
     [
-        pytest.param(80, 30, marks=pytest.mark.beside(compiled, 80, "one run")),
-        pytest.param(90, 100, marks=pytest.mark.beside(compiled, 90, "usual")),
+        pytest.param(80, 30, marks=pytest.mark.background_job(compiled, 80, "one run")),
+        pytest.param(90, 100, marks=pytest.mark.background_job(compiled, 90, "usual")),
         *(
-            pytest.param(arch, 150, marks=[pytest.mark.beside(compiled, arch, "all"), pytest.mark.slow])
+            pytest.param(arch, 150, marks=[pytest.mark.background_job(compiled, arch, "all"), pytest.mark.slow])
             for arch in (80, 90)
         ),
     ],
 )
-def test_kernels_compile_for_cuda(arch: int, least: int, beside: subprocess.CompletedProcess) -> None:
-    assert beside.returncode == 0, beside.stderr
-    sizes = json.loads(beside.stdout.splitlines()[-1])
+def test_kernels_compile_for_cuda(arch: int, least: int, background_job: subprocess.CompletedProcess) -> None:
+    assert background_job.returncode == 0, background_job.stderr
+    sizes = json.loads(background_job.stdout.splitlines()[-1])
     assert len(sizes) >= least
     assert all(size > 1000 for size in sizes.values()), "a kernel left no machine code"

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.densify import PARAMETERS, Densifier, DensifyConfig, split_surfels
+from nexwarp.train.densify import PARAMETERS, Densifier, DensifyConfig, split_surfels
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 

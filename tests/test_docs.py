@@ -28,11 +28,15 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import cli
-from nexwarp.checkpoint import load_cameras, save_model
-from nexwarp.config import PRESETS, Config, preset, setting, with_settings
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
+from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
-from nexwarp.exposures import Exposures
+from nexwarp.model.model_file import save_model
+from nexwarp.representation.exposures import Exposures
+from nexwarp.train.config import Config
+from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
+from nexwarp.train.settings import setting, with_settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -115,8 +119,8 @@ with 130.
 SETTINGS = """\
 ## All settings
 
-A training depends on its scene and on these settings (`nexwarp.Config`). `--preset` chooses the values to start from.
-The flags of `nexwarp train` change some of them, and `--set KEY=VALUE`, which can be repeated, changes any:
+What a training depends on beside its scene: `nexwarp.Config`. `--preset` picks the values to start from, the
+flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
 
     nexwarp train SCENE --preset paper --set texture.max_resolution=1024
     nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
@@ -194,7 +198,7 @@ def options_page() -> str:
         page.append("| option | default | what |\n|---|---|---|")
         page += [f"| `{cell(option)}` | {cell(default)} | {cell(text)} |" for option, default, text in rows]
         page.append("")
-    demo = ", ".join(f"`{name}` {json.dumps(value)}" for name, value in cli.DEMO_SETTINGS.items())
+    demo = ", ".join(f"`{name}` {json.dumps(value)}" for name, value in DEMO_SETTINGS.items())
     page.append(SETTINGS.replace("DEMO", demo))
     page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
     ours, paper = preset("default"), preset("paper")
@@ -446,7 +450,7 @@ def test_commands_can_be_typed(page, monkeypatch):
     for arguments in commands(page):
         assert cli.main(arguments) == 0, arguments
         command = understood.pop()
-        if isinstance(command, cli.Train):
+        if isinstance(command, Train):
             config = dataclasses.replace(command, resume=False)._config(Path("nowhere"))
             assert config.preset == command.preset
 

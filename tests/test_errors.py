@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import cli, errors
-from nexwarp.checkpoint import load_checkpoint
+from nexwarp import errors
+from nexwarp.cli import main as cli
+from nexwarp.cli.device import pick_device
 from nexwarp.errors import (
     CheckpointError,
     DivergedError,
@@ -24,9 +25,10 @@ from nexwarp.errors import (
     SettingError,
     StorageError,
 )
-from nexwarp.files import write_atomically
-from nexwarp.outputs import RenderOrder
-from nexwarp.runs import SceneSource, pick_device, prepare_run, read_run
+from nexwarp.io.files import write_atomically
+from nexwarp.run.folder import SceneSource, prepare_run, read_run
+from nexwarp.run.render_job import RenderOrder
+from nexwarp.train.checkpoint import load_checkpoint
 
 KIN = {
     SettingError: ValueError,
@@ -147,8 +149,8 @@ def test_terminated_commands_end_in_order(tmp_path):
     program = f"""
 import os, signal, sys
 from pathlib import Path
-from nexwarp import cli
-from nexwarp.files import written_aside
+from nexwarp.cli import main as cli
+from nexwarp.io.files import written_aside
 
 def wait(*_):
     with written_aside(Path({str(tmp_path)!r}) / "file") as temporary:

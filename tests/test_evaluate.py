@@ -11,9 +11,9 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.data import View
-from nexwarp.evaluate import evaluate
-from nexwarp.metrics import CONVENTION, ssim, to_uint8
-from nexwarp.pictures import CAPTION_HEIGHT, error_map
+from nexwarp.io.pictures import CAPTION_HEIGHT, error_map, to_uint8
+from nexwarp.run.evaluate import evaluate
+from nexwarp.run.metrics import CONVENTION, ssim
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 WIDTH, HEIGHT, GAP = 40, 30, 4

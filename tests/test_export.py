@@ -8,14 +8,16 @@ import torch
 
 import nexwarp as nw
 from benchmarks.splats import draw, untextured
-from nexwarp.cli import DEMO_SETTINGS
-from nexwarp.config import preset, with_settings
+from nexwarp.camera import resized
+from nexwarp.cameras.paths import look_at
 from nexwarp.data import write_demo
-from nexwarp.export import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
-from nexwarp.metrics import psnr, to_uint8
-from nexwarp.paths import look_at, resized
-from nexwarp.splats import Pieces, split_large
-from nexwarp.trainer import Trainer
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.splats import Pieces, split_large
+from nexwarp.model.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.run.metrics import psnr
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
+from nexwarp.train.trainer import Trainer
 from tests.reference import ewa
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_surfels, random_scene

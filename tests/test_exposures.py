@@ -8,17 +8,18 @@ import torch
 
 import nexwarp as nw
 from benchmarks.exposures import compare
-from nexwarp import exposures
+from nexwarp.buffers import load_buffers, render_buffers, save_buffers
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import Model
-from nexwarp.config import Config, TextureConfig
 from nexwarp.data import Scene, View, write_demo
-from nexwarp.evaluate import evaluate
-from nexwarp.exposures import EVEN, Exposures, photo_gains
-from nexwarp.metrics import to_uint8
-from nexwarp.passes import load_buffers, render_buffers, save_buffers
-from nexwarp.trainer import Trainer
-from nexwarp.training_views import TrainingViews
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.model import Model
+from nexwarp.representation import exposures
+from nexwarp.representation.exposures import EVEN, Exposures
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.exposure_calibration import photo_gains
+from nexwarp.train.trainer import Trainer
+from nexwarp.train.views import TrainingViews
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

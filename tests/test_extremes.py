@@ -8,7 +8,7 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.kernels import tape as warp_passes
+from nexwarp import tape as warp_passes
 from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES, check_entries
 from tests.scenes import SURFEL_KEYS, Scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite

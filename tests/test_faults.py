@@ -12,14 +12,15 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import cli
-from nexwarp.checkpoint import _read_checkpoint, load_cameras, load_checkpoint
-from nexwarp.config import Config, TextureConfig
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.densify import DensifyConfig
 from nexwarp.errors import NexwarpError, StorageError
-from nexwarp.pictures import load_exr
-from nexwarp.runs import check_room, read_metrics, read_run
+from nexwarp.io.pictures import load_exr
+from nexwarp.run.folder import check_room, read_metrics, read_run
+from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
 from tests.faults import Disk, failing
 
 pytestmark = pytest.mark.usefixtures("small_preset")

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import floaters as module
-from nexwarp import paths
+from nexwarp.cameras import paths
 from nexwarp.data import View
-from nexwarp.floaters import floaters, nearest_depth
+from nexwarp.train import floaters as module
+from nexwarp.train.floaters import floaters, nearest_depth
 
 
 def looking_ahead(z: float, width: int = 64, focal: float = 80.0) -> nw.Camera:
@@ -39,7 +39,7 @@ def facing(squares: list[tuple[tuple[float, float, float], float]], device: torc
 
 @pytest.fixture(autouse=True)
 def between(monkeypatch: pytest.MonkeyPatch) -> list[nw.Camera]:
-    """What `nexwarp.paths.between` returns in the test; the cameras themselves when empty."""
+    """What `nexwarp.cameras.between.between` returns in the test; the cameras themselves when empty."""
     cameras: list[nw.Camera] = []
     monkeypatch.setattr(module, "between", lambda given, *_: cameras or given)
     return cameras

@@ -40,13 +40,13 @@ def fuzzed(folder: Path) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture
-def results(beside: subprocess.CompletedProcess) -> dict:
+def results(background_job: subprocess.CompletedProcess) -> dict:
     pytest.importorskip("hypothesis")
-    assert beside.returncode == 0, beside.stderr
-    return json.loads(beside.stdout.splitlines()[-1])
+    assert background_job.returncode == 0, background_job.stderr
+    return json.loads(background_job.stdout.splitlines()[-1])
 
 
-@pytest.mark.beside.with_args(fuzzed)
+@pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", TARGETS)
 def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
@@ -55,7 +55,7 @@ def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
     assert 0 < result["loaded"] < inputs, "inputs are neither all as good as new nor all beyond recognition"
 
 
-@pytest.mark.beside.with_args(fuzzed)
+@pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", DRAWN)
 def test_readers_stand_what_hypothesis_draws(results: dict, name: str) -> None:
     result = results[f"hypothesis {name}"]

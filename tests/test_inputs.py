@@ -30,14 +30,14 @@ from benchmarks.inputs import (
     write_points,
     write_text,
 )
-from nexwarp.config import preset
 from nexwarp.data import initial_points, load_scene, write_demo
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import Map, pycolmap_module
 from nexwarp.data.random_points import random_points
 from nexwarp.data.raytrace import render
 from nexwarp.data.scene import find_format
-from nexwarp.trainer import Trainer
+from nexwarp.train.presets import preset
+from nexwarp.train.trainer import Trainer
 from tests.test_scene import make_scene, project, views_of
 
 SIZE = {"width": 96, "height": 72, "views": 10, "points": 300}

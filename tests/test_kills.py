@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks.kills import Kills, kill_and_resume
-from nexwarp import cli, config
-from nexwarp.config import Config, TextureConfig
+from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.densify import DensifyConfig
+from nexwarp.train import presets
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
 
 ROOT = Path(__file__).parents[1]
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "1"]
@@ -27,13 +28,13 @@ SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), dens
 
 def main() -> None:
     """The command line, whose default preset is a small one."""
-    config.PRESETS["default"] = SMALL
+    presets.PRESETS["default"] = SMALL
     sys.exit(cli.main())
 
 
 @pytest.fixture(autouse=True)
 def small_preset(monkeypatch):
-    monkeypatch.setitem(config.PRESETS, "default", SMALL)
+    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.slow)])

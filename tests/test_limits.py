@@ -13,15 +13,17 @@ import safetensors.torch
 import torch
 from PIL import Image
 
-from nexwarp.checkpoint import load, load_cameras, save_model
-from nexwarp.config import Config
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import load_scene
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_mask
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.files import one_line
-from nexwarp.json_files import parse_json
-from nexwarp.nerfstudio import load_camera_path
+from nexwarp.io.files import one_line
+from nexwarp.io.json_files import parse_json
+from nexwarp.model.model_file import load, save_model
+from nexwarp.train.config import Config
+from nexwarp.train.presets import config_from_dict
 from tests.test_checkpoint import make_model, rewrite
 from tests.test_scene import HEIGHT, WIDTH, make_scene, pose
 
@@ -311,9 +313,9 @@ def test_paths_and_cameras_with_absurd_numbers(tmp_path):
     ],
 )
 def test_settings_have_types(changes, match):
-    assert Config.from_dict(json.loads(json.dumps(Config().as_dict()))) == Config()
+    assert config_from_dict(json.loads(json.dumps(Config().as_dict()))) == Config()
     with pytest.raises(ValueError, match=match):
-        Config.from_dict({**Config().as_dict(), **changes})
+        config_from_dict({**Config().as_dict(), **changes})
 
 
 def test_what_files_say_is_told_on_one_line():

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from nexwarp import losses
-from nexwarp.losses import LossWeights
+from nexwarp.train import losses
+from nexwarp.train.losses import LossWeights
 from tests.tolerances import assert_close
 
 DTYPES = [torch.float32, torch.float64]

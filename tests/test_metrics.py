@@ -10,7 +10,8 @@ import pytest
 import skimage.metrics
 import torch
 
-from nexwarp import losses, metrics
+from nexwarp.run import metrics
+from nexwarp.train import losses
 
 
 def images(height: int = 48, width: int = 61) -> list[torch.Tensor]:

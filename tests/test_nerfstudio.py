@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.nerfstudio import load_camera_path, load_transforms, save_camera_path, save_transforms
-from nexwarp.paths import look_at
+from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path, save_transforms
+from nexwarp.cameras.paths import look_at
 from tests.scenes import intrinsics, rigid
 
 FAR = 1e-6

@@ -42,10 +42,12 @@ def short_form(folder: Path, name: str) -> tuple[subprocess.CompletedProcess, Pa
     return subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540), folder
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.beside(short_form, name)) for name in NAMES])
-def test_short_form_runs_from_clean(name: str, beside: tuple[subprocess.CompletedProcess, Path]) -> None:
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.background_job(short_form, name)) for name in NAMES]
+)
+def test_short_form_runs_from_clean(name: str, background_job: tuple[subprocess.CompletedProcess, Path]) -> None:
     """Its own assertions hold, nothing is warned of, and every figure of the kept form is drawn."""
-    done, folder = beside
+    done, folder = background_job
     assert done.returncode == 0, done.stderr
     kept, run = (nbformat.read(where / f"{name}.ipynb", as_version=4) for where in (FOLDER, folder))
     assert [cell.source for cell in kept.cells] == [cell.source for cell in run.cells]

@@ -11,17 +11,20 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp import cli
-from nexwarp.checkpoint import Model, load_cameras, save_cameras, save_model
-from nexwarp.config import Config
-from nexwarp.export import load_surfels_ply
-from nexwarp.exposures import Exposures
-from nexwarp.metrics import to_uint8
-from nexwarp.nerfstudio import load_camera_path, load_transforms, save_camera_path
-from nexwarp.outputs import RenderOrder
-from nexwarp.passes import load_buffers
-from nexwarp.paths import ellipse, interpolate, resized, spiral
-from nexwarp.runs import SceneSource, create_run
+from nexwarp.buffers import load_buffers
+from nexwarp.camera import resized
+from nexwarp.cameras.cameras_file import load_cameras, save_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path
+from nexwarp.cameras.paths import ellipse, interpolate, spiral
+from nexwarp.cli import main as cli
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import save_model
+from nexwarp.model.surfels_ply import load_surfels_ply
+from nexwarp.representation.exposures import Exposures
+from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.render_job import RenderOrder
+from nexwarp.train.config import Config
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.test_paths import ring, row
 

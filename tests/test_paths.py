@@ -6,8 +6,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nexwarp.camera import Camera
-from nexwarp.paths import between, ellipse, focus, interpolate, look_at, reduced, resized, spiral
+from nexwarp.camera import Camera, reduced, resized
+from nexwarp.cameras.between import between
+from nexwarp.cameras.paths import ellipse, focus, interpolate, look_at, spiral
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from nexwarp import losses
 from nexwarp.kernels import launch
 from nexwarp.ops import photometric
 from nexwarp.ops.photometric import photometric_terms
+from nexwarp.train import losses
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nexwarp.metrics import to_uint8
-from nexwarp.pictures import error_map, save_exr, save_png, side_by_side
+from nexwarp.io.pictures import error_map, save_exr, save_png, side_by_side, to_uint8
 
 
 def read(path: Path) -> torch.Tensor:

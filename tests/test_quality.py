@@ -17,10 +17,12 @@ from benchmarks import quality
 from benchmarks.quality import ARC, VARIANTS, arc, moved
 from benchmarks.quality_rows import DEFAULT, GSPLAT, ROWS, SCENES, TABLES, Job, Row, jobs_of, together
 from benchmarks.quality_tables import curves_of, differences, drop_unfinished, markdown, read_results, summary
-from nexwarp.config import preset, with_settings
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
-from nexwarp.metrics import psnr, to_uint8
+from nexwarp.io.pictures import to_uint8
+from nexwarp.run.metrics import psnr
+from nexwarp.train.presets import preset
+from nexwarp.train.settings import with_settings
 from tests.tolerances import assert_close
 
 

@@ -10,9 +10,12 @@ from PIL import Image
 
 import nexwarp as nw
 from benchmarks.inputs import write_blender
-from nexwarp import cli
-from nexwarp.config import PRESETS, Config, LearningRates, parse_settings, preset, setting, with_settings
+from nexwarp.cli import main as cli
+from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
+from nexwarp.train.config import Config, LearningRates
+from nexwarp.train.presets import PRESETS, config_from_dict, preset
+from nexwarp.train.settings import parse_settings, setting, with_settings
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
 FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]
@@ -124,7 +127,7 @@ def test_rates_of_zero_are_allowed():
 
 def test_a_run_keeps_what_was_set(run):
     stored = json.loads((run / "config.json").read_text())["config"]
-    config = Config.from_dict(stored)
+    config = config_from_dict(stored)
     changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "border": 0}
     changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
     assert config == with_settings(preset("default"), changes)
@@ -177,7 +180,7 @@ def test_a_scene_on_a_background_takes_it_from_its_flag(scene, tmp_path, capsys)
 
 def test_the_demo_keeps_what_makes_a_preset():
     """Its own settings are those of a short run on a CPU; the paper's texture stays the paper's."""
-    train = cli.Train("demo", preset="paper")
+    train = Train("demo", preset="paper")
     config, paper = train._config(Path("nowhere")), preset("paper")
     assert (config.preset, config.iterations, config.texture.levels) == ("paper", 1200, 12)
     for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "border"):

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.config import PRESETS, Config, TextureConfig, preset, with_settings
 from nexwarp.data import Scene, View
-from nexwarp.evaluate import evaluate
-from nexwarp.trainer import Trainer
-from nexwarp.training_views import mean_color
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.presets import PRESETS, config_from_dict, preset
+from nexwarp.train.settings import with_settings
+from nexwarp.train.trainer import Trainer
+from nexwarp.train.views import mean_color
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
@@ -41,19 +43,19 @@ def test_settings_reach_into_parts() -> None:
         rates=dataclasses.replace(Config().rates, mlp=(1e-3, 1e-3)),
     )
     assert config == expected
-    assert Config.from_dict(config.as_dict()) == config
+    assert config_from_dict(config.as_dict()) == config
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_settings_of_an_older_version_are_completed_from_their_preset(name: str) -> None:
     """What it did not know is not what another preset has: a run of the paper's stays the paper's."""
     full = preset(name).as_dict()
-    assert Config.from_dict({"preset": name}) == preset(name)
+    assert config_from_dict({"preset": name}) == preset(name)
     older = {key: value for key, value in full.items() if key != "smooth_sh"}
     older["texture"] = {"levels": 5, "table_size": 2**8}
-    found = Config.from_dict(older)
+    found = config_from_dict(older)
     assert found == with_settings(preset(name), {"texture.levels": 5, "texture.table_size": 2**8})
-    assert Config.from_dict({"preset": "of mine", "seed": 3}) == dataclasses.replace(Config(), preset="of mine", seed=3)
+    assert config_from_dict({"preset": "of mine", "seed": 3}) == dataclasses.replace(Config(), preset="of mine", seed=3)
 
 
 @pytest.mark.parametrize("name", ["texture.residul", "texture.levels.x", "colour", "seed.x", "losses.", ".residual"])

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from nexwarp import cli
+from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from nexwarp.data.capture import Capture
 from nexwarp.data.colmap import read_model

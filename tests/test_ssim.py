@@ -6,9 +6,9 @@ from torch.autograd import gradcheck
 
 from nexwarp.kernels import launch
 from nexwarp.kernels.ssim import LANES, PAD, WINDOW_SIZE
-from nexwarp.losses import LossWeights, training_losses
 from nexwarp.ops import ssim
 from nexwarp.ops.ssim import weighted_dssim
+from nexwarp.train.losses import LossWeights, training_losses
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 

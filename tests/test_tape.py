@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.kernels import tape as passes
+from nexwarp import tape as passes
 from nexwarp.kernels.types import types
 from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, random_scene
 from tests.tolerances import assert_close

@@ -7,12 +7,12 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.config import Config, TextureConfig
 from nexwarp.data import write_demo
-from nexwarp.densify import DensifyConfig
 from nexwarp.kernels import launch
-from nexwarp.losses import depth_loss
-from nexwarp.trainer import Trainer
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.losses import depth_loss
+from nexwarp.train.trainer import Trainer
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

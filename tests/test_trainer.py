@@ -11,17 +11,18 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import floaters as floaters_module
-from nexwarp import trainer as trainer_module
 from nexwarp.camera import Camera
-from nexwarp.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.config import MIN_SURFELS, Config, LearningRates, TextureConfig, preset
 from nexwarp.data import Scene, View, initial_points
-from nexwarp.densify import DensifyConfig
-from nexwarp.evaluate import evaluate
-from nexwarp.initial import initial_surfels, quats_towards, texture_shape
-from nexwarp.losses import LossWeights
-from nexwarp.trainer import Trainer
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train import floaters as floaters_module
+from nexwarp.train import trainer as trainer_module
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.config import MIN_SURFELS, Config, LearningRates, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.initial import initial_surfels, quats_towards, texture_shape
+from nexwarp.train.losses import LossWeights
+from nexwarp.train.presets import config_from_dict, preset
+from nexwarp.train.trainer import Trainer
 from tests.reference.collect import rotations
 from tests.tolerances import assert_close
 
@@ -327,7 +328,7 @@ def test_unknown_preset_is_refused():
 
 @pytest.mark.parametrize("config", [Config(), preset("paper"), small(background=(0.1, 0.5, 1.0), seed=3)])
 def test_config_survives_json(config):
-    again = Config.from_dict(json.loads(json.dumps(config.as_dict())))
+    again = config_from_dict(json.loads(json.dumps(config.as_dict())))
     assert again == config and again.as_dict() == config.as_dict()
 
 
@@ -343,7 +344,7 @@ def test_config_survives_json(config):
 )
 def test_unknown_settings_are_refused(change):
     with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
-        Config.from_dict(change(Config().as_dict()))
+        config_from_dict(change(Config().as_dict()))
     assert "\n" not in str(caught.value)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.video import check_video, video_writer
+from nexwarp.io.video import check_video, video_writer
 
 av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
 

@@ -19,13 +19,14 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp import cli, config
-from nexwarp.config import Config, TextureConfig
+from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.densify import DensifyConfig
-from nexwarp.exposures import Exposures
-from nexwarp.runs import keep_camera_path
-from nexwarp.trainer import Trainer
+from nexwarp.representation.exposures import Exposures
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.train import presets
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.trainer import Trainer
 from nexwarp.viewer import Viewer
 from nexwarp.viewer.camera_path import OPENGL, Keyframe, interpolate, path_json
 from nexwarp.viewer.modes import BY_SLOT, COUNTED, MODES, TEXTURED, Settings, draw
@@ -377,7 +378,7 @@ def run(tmp_path_factory) -> Path:
     scene = write_demo(folder / "tiny", width=48, height=36, views=10, points=200)
     small = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "default", small)
+        patch.setitem(presets.PRESETS, "default", small)
         flags = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
         assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
     return folder / "run"

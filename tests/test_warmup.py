@@ -13,21 +13,23 @@ import pytest
 import torch
 import warp as wp
 
-from nexwarp import cli, warmup
-from nexwarp.config import PRESETS, Config, TextureConfig
-from nexwarp.densify import Densifier, DensifyConfig
+from nexwarp.cli import main as cli
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels
-from nexwarp.trainer import Trainer
+from nexwarp.run import warmup
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.presets import PRESETS
+from nexwarp.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 
 # Two processes with one cache. What a preset is compiled for stays; its tables shrink, to fit a CPU.
 WARM = """
 import json, sys, torch
-from nexwarp import warmup
-from nexwarp.config import preset
-from nexwarp.runs import pick_device
+from nexwarp.run import warmup
+from nexwarp.train.presets import preset
+from nexwarp.cli.device import pick_device
 device = pick_device(sys.argv[1])
 counts = [len(warmup.cached_binaries())]
 warmup.compile_all(warmup.needed(preset("default"), device), device)
@@ -39,12 +41,12 @@ print(json.dumps(counts))
 USE = """
 import json, sys, torch
 from dataclasses import replace
-from nexwarp import cli, config, warmup
+from nexwarp.cli import main as cli; from nexwarp.train import presets; from nexwarp.run import warmup
 from nexwarp.data import write_demo
 scene, run, device = sys.argv[1:]
 write_demo(scene, width=48, height=36, views=10, points=200)
-base = config.PRESETS["default"]
-config.PRESETS["default"] = replace(base, texture=replace(base.texture, table_size=2**10))
+base = presets.PRESETS["default"]
+presets.PRESETS["default"] = replace(base, texture=replace(base.texture, table_size=2**10))
 before = warmup.cached_binaries()
 short = ["--iterations", "60", "--max-surfels", "100"]
 commands = {
@@ -77,13 +79,13 @@ def warmed(folder: Path, device: str) -> tuple[list[str], list[str]]:
 @pytest.mark.parametrize(
     "device",
     [
-        pytest.param("cpu", marks=pytest.mark.beside(warmed, "cpu")),
-        pytest.param("cuda", marks=[pytest.mark.beside(warmed, "cuda"), pytest.mark.cuda]),
+        pytest.param("cpu", marks=pytest.mark.background_job(warmed, "cpu")),
+        pytest.param("cuda", marks=[pytest.mark.background_job(warmed, "cuda"), pytest.mark.cuda]),
     ],
 )
-def test_nothing_is_left_to_compile(device: str, beside: tuple[list[str], list[str]]) -> None:
+def test_nothing_is_left_to_compile(device: str, background_job: tuple[list[str], list[str]]) -> None:
     """The list alone is enough for the rehearsal; and after both, no command compiles, not even a second warm-up."""
-    warm, use = beside
+    warm, use = background_job
     at_first, listed, rehearsed = json.loads(warm[-1])
     assert at_first == 0 and listed > 20
     assert rehearsed == listed, "the rehearsal compiled kernels that the catalogue does not list"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nexwarp.files import one_line
+from nexwarp.io.files import one_line
 
 # PIL has more, some of which start other programs.
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF")

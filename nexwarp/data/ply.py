@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, check_points
-from nexwarp.files import one_line, written_aside
+from nexwarp.io.files import one_line, written_aside
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

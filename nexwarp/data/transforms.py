@@ -27,7 +27,7 @@ from nexwarp.data.capture import (
 from nexwarp.data.images import image_size, read_image
 from nexwarp.data.lens import Lens
 from nexwarp.data.ply import read_ply
-from nexwarp.json_files import read_json
+from nexwarp.io.json_files import read_json
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = {split: f"transforms_{split}.json" for split in ("train", "test", "val")}

@@ -22,7 +22,7 @@ from nexwarp.data.images import (
     resize_mask,
 )
 from nexwarp.data.lens import FACES, PANORAMA, Lens, Maps, Pinhole
-from nexwarp.files import one_line
+from nexwarp.io.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255

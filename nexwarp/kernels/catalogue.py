@@ -5,19 +5,18 @@ from collections.abc import Iterator, Sequence
 import warp as wp
 
 from nexwarp.kernels.activate import activate_kernels
-from nexwarp.kernels.collect import (
-    collect_backward_kernel,
-    collect_kernel,
-    reduce_rows_kernel,
-    splat_error_kernel,
-)
-from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel
+from nexwarp.kernels.antialias import antialias_kernels
+from nexwarp.kernels.collect import collect_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel
+from nexwarp.kernels.cpu.hashgrid import hashgrid_rows_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
-from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.reduce import reduce_rows_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
+from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.ssim import LANES, ssim_kernels
 from nexwarp.kernels.tiles import (
     depth_keys_kernel,
@@ -28,7 +27,6 @@ from nexwarp.kernels.tiles import (
 )
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.unproject import unproject_kernel
-from nexwarp.kernels.widen import widen_kernels
 
 
 def all_kernels(
@@ -41,7 +39,7 @@ def all_kernels(
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     yield from thread_kernels(real, storage, tile_size, ssim_lanes=(1, LANES) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
-    yield widen_kernels(real).backward  # of trained surfels, which training itself has no use for
+    yield antialias_kernels(real).backward  # of trained surfels, which training itself has no use for
 
 
 def thread_kernels(
@@ -60,7 +58,7 @@ def thread_kernels(
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
-    yield widen_kernels(real).forward
+    yield antialias_kernels(real).forward
     yield from (surfel_ids_kernel, tile_offsets_kernel)
     yield from (reduce_rows_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)

@@ -16,9 +16,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.fixed import fixed_units
-from nexwarp.kernels.loads import load_function
-from nexwarp.kernels.simd import lane_functions, slot_functions
+from nexwarp.kernels.native.fixed_point import fixed_units
+from nexwarp.kernels.native.simd import lane_functions, slot_functions
+from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.types import types
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.simd import lane_functions
+from nexwarp.kernels.native.simd import lane_functions
 from nexwarp.kernels.types import types
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.

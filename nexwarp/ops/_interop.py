@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from nexwarp.kernels import launch as launching
-from nexwarp.kernels.fixed import HIGH, LOW
+from nexwarp.kernels.native.fixed_point import HIGH, LOW
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
 STORAGES = {**REALS, torch.float16: wp.float16}

@@ -7,33 +7,31 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.collect import (
-    BLOCK_DIM,
-    collect_backward_kernel,
-    collect_kernel,
-    reduce_rows_kernel,
-    splat_error_kernel,
-)
-from nexwarp.kernels.collect_rows import collect_rows_backward_kernel, collect_rows_kernel, row_lanes
+from nexwarp.checks import check_tensors
+from nexwarp.kernels.collect import collect_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel
+from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel, row_lanes
+from nexwarp.kernels.reduce import reduce_rows_kernel
+from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.types import MAX_HITS, types
+from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops._interop import array, from_fixed_point, launch, real_of, sums_in_fixed_point, sums_like
-from nexwarp.ops.checks import check_tensors
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 from nexwarp.ops.tiles import Tiles
 
 
 @dataclass
-class ErrorWatch:
-    """Lets the backward pass add up blended errors on its way; see `Rendering.watch_error`.
+class SplatErrorRequest:
+    """Asks the backward pass to add up blended errors on its way; see `Rendering.request_splat_error`.
 
     Attributes:
-        errors: (H, W) error of each pixel, set between forward and backward; None watches nothing.
-        sums: (N,) what `splat_error` would give, there after the backward pass.
+        errors: (H, W) error of each pixel, set between forward and backward; None asks for nothing.
+        sums_after_backward: (N,) what `splat_error` would give; the backward pass fills it.
     """
 
     errors: torch.Tensor | None = None
-    sums: torch.Tensor | None = None
+    sums_after_backward: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Hits:
         weights: (H, W, K), 0 in empty slots; differentiable.
         alpha: (H, W) 1 - final transmittance; differentiable.
         stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
-        watch: asks the backward pass for blended errors.
+        error_request: asks the backward pass for blended errors.
     """
 
     plain: torch.Tensor
@@ -58,7 +56,7 @@ class Hits:
     weights: torch.Tensor
     alpha: torch.Tensor
     stops: torch.Tensor
-    watch: ErrorWatch
+    error_request: SplatErrorRequest
 
 
 def collect(
@@ -75,11 +73,11 @@ def collect(
     """
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
-    watch = ErrorWatch()
+    request = SplatErrorRequest()
     buffers = _Collect.apply(
-        projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, watch
+        projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, request
     )
-    return Hits(*buffers, watch)
+    return Hits(*buffers, request)
 
 
 def splat_error(
@@ -110,20 +108,20 @@ def splat_error(
     rows, slots = _rows(tiles, records)
     fixed = sums_in_fixed_point(records)
     sums = sums_like(records, (slots,), fixed)
-    inputs = _inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
+    inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
     errors = errors.detach().to(records.dtype).contiguous()
     inputs += [array(rows, wp.int32), array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     kernel = splat_error_kernel(real, low_pass, tiles.tile_size, fixed)
     if fixed:
         bad = torch.zeros(1, dtype=torch.int32, device=records.device)
-        _walk(records, kernel, tiles, inputs, [array(sums, wp.int64), array(bad, wp.int32)])
+        launch_walk(records, kernel, tiles, inputs, [array(sums, wp.int64), array(bad, wp.int32)])
         sums = from_fixed_point(sums, bad, records.dtype)
     else:
-        _walk(records, kernel, tiles, inputs, [array(sums, real), None])
+        launch_walk(records, kernel, tiles, inputs, [array(sums, real), None])
     return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
 
 
-def _walk(
+def launch_walk(
     like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Any], outputs: list[Any], lanes: int = 1
 ) -> None:
     """Launch a kernel over the pixels of all tiles, `lanes` of them a thread."""
@@ -138,7 +136,7 @@ def _rows_a_thread(like: torch.Tensor) -> bool:
     return like.device.type == "cpu"
 
 
-def _inputs(
+def walk_inputs(
     records: torch.Tensor,
     centers: torch.Tensor,
     limits: torch.Tensor,
@@ -187,7 +185,7 @@ class _Collect(torch.autograd.Function):
         camera: Pinhole,
         max_hits: int,
         low_pass: bool,
-        watch: ErrorWatch,
+        request: SplatErrorRequest,
     ) -> tuple[torch.Tensor, ...]:
         real = real_of(records)
         shape = (camera.height, camera.width)
@@ -205,15 +203,15 @@ class _Collect(torch.autograd.Function):
             array(alphas.view(-1), real),
             array(stops.view(-1), wp.int32),
         ]
-        inputs = [*_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
+        inputs = [*walk_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
         if _rows_a_thread(records):
             kernel = collect_rows_kernel(real, max_hits, low_pass, tiles.tile_size)
-            _walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
+            launch_walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
         else:
-            _walk(records, collect_kernel(real, max_hits, low_pass, tiles.tile_size), tiles, inputs, outputs)
+            launch_walk(records, collect_kernel(real, max_hits, low_pass, tiles.tile_size), tiles, inputs, outputs)
         ctx.save_for_backward(records, centers, limits, plain, base, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
-        ctx.rest = (tiles, camera, max_hits, low_pass, watch)
+        ctx.rest = (tiles, camera, max_hits, low_pass, request)
         return plain, base, ids, depths, weights, alphas, stops
 
     @staticmethod
@@ -229,7 +227,7 @@ class _Collect(torch.autograd.Function):
         _stops: None,
     ) -> tuple[torch.Tensor | None, ...]:
         records, centers, limits, plain, base, ids, weights, alphas, stops = ctx.saved_tensors
-        tiles, camera, max_hits, low_pass, watch = ctx.rest
+        tiles, camera, max_hits, low_pass, request = ctx.rest
         real = real_of(records)
         t = types(real)
         slots = max(max_hits, 1)
@@ -244,7 +242,7 @@ class _Collect(torch.autograd.Function):
         # Centres carry a gradient only through the low-pass.
         grad_center_rows = sums_like(centers, (count if low_pass else 1, 3), fixed)
         inputs = [
-            *_inputs(records, centers, limits, tiles, camera),
+            *walk_inputs(records, centers, limits, tiles, camera),
             array(tiles.reaches, t.vec2),
             array(rows, wp.int32),
             array(plain.view(-1, 3), t.vec3),
@@ -258,16 +256,16 @@ class _Collect(torch.autograd.Function):
             buffer(grad_depths, real),
             buffer(grad_weights, real),
             array(grad_alphas.contiguous().view(-1), real),
-            array(None if watch.errors is None else watch.errors.view(-1), real),
+            array(None if request.errors is None else request.errors.view(-1), real),
         ]
-        error_rows = None if watch.errors is None else sums_like(records, (count,), fixed)
-        variant = (real, max_hits, low_pass, tiles.tile_size, watch.errors is not None)
+        error_rows = None if request.errors is None else sums_like(records, (count,), fixed)
+        variant = (real, max_hits, low_pass, tiles.tile_size, request.errors is not None)
         if fixed:
             bad = torch.zeros(1, dtype=torch.int32, device=records.device)
             sums = (grad_rows, grad_center_rows, error_rows)
             outputs = [None if x is None else array(x.view(len(x), -1), wp.int64) for x in sums]
             kernel = collect_backward_kernel(*variant, fixed=True)
-            _walk(records, kernel, tiles, inputs, [*outputs, array(bad, wp.int32)])
+            launch_walk(records, kernel, tiles, inputs, [*outputs, array(bad, wp.int32)])
             grad_rows, grad_center_rows, error_rows = (
                 None if x is None else from_fixed_point(x, bad, records.dtype) for x in sums
             )
@@ -275,11 +273,11 @@ class _Collect(torch.autograd.Function):
             outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
             if _rows_a_thread(records):
                 kernel = collect_rows_backward_kernel(*variant)
-                _walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
+                launch_walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
             else:
-                _walk(records, collect_backward_kernel(*variant), tiles, inputs, [*outputs, None])
+                launch_walk(records, collect_backward_kernel(*variant), tiles, inputs, [*outputs, None])
         if error_rows is not None:
-            watch.sums = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
+            request.sums_after_backward = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
         grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)
         grad_centers = None
         if low_pass:

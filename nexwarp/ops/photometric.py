@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from nexwarp.checks import check_tensors
 from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch, real_of
-from nexwarp.ops.checks import check_tensors
 
 Factors = tuple[float, float, float]
 
@@ -24,7 +24,7 @@ def photometric_terms(
     texture: float = 0.0,
     alpha: float = 0.0,
 ) -> tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor | None]:
-    """Return the L1, texture and alpha terms of `nexwarp.losses`, each times its factor.
+    """Return the L1, texture and alpha terms of `nexwarp.train.losses`, each times its factor.
 
     Differentiable once, with respect to image, textured and weights. What no wanted term reads may be None.
 

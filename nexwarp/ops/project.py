@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from nexwarp.checks import check_tensors
 from nexwarp.kernels.project import project_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, grad_like, launch, real_of
-from nexwarp.ops.checks import check_tensors
 
 
 @dataclass(frozen=True)

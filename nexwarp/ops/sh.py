@@ -5,10 +5,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from nexwarp.checks import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch, real_of
-from nexwarp.ops.checks import check_tensors
 
 
 def plain_colors(

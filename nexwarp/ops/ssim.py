@@ -6,13 +6,13 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from nexwarp.checks import check_tensors
 from nexwarp.kernels.ssim import LANES, PAD, rows_a_thread, ssim_kernels
 from nexwarp.ops._interop import array, launch, real_of
-from nexwarp.ops.checks import check_tensors
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
-    """Return factor * (1 - SSIM), see `nexwarp.losses.dssim`; differentiable once, with respect to `image` only.
+    """Return factor * (1 - SSIM), see `nexwarp.train.losses.dssim`; differentiable once, with respect to `image` only.
 
     Args:
         image: (H, W, 3) float32 or float64.

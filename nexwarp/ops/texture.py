@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from nexwarp.kernels.cpu.hashgrid import LANES as ROW
+from nexwarp.kernels.cpu.hashgrid import hashgrid_rows_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
-from nexwarp.kernels.hashgrid_rows import LANES as ROW
-from nexwarp.kernels.hashgrid_rows import hashgrid_rows_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point

@@ -28,7 +28,7 @@ LANES = 8
 
 
 @dataclass(frozen=True)
-class Room:
+class ListCapacity:
     """How much room lists have, and what to ask for how much they need.
 
     Attributes:
@@ -57,7 +57,7 @@ class Tiles:
         columns: tiles in a row.
         exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
             or, when `ends` says that there are more than M, the lists are incomplete and the walk goes over `order`.
-        kind: as in `Room`.
+        kind: as in `ListCapacity`.
     """
 
     order: torch.Tensor
@@ -72,9 +72,9 @@ class Tiles:
     kind: tuple[int, int, bool]
 
     @property
-    def room(self) -> Room:
+    def room(self) -> ListCapacity:
         """All of the lists that is worth keeping of a rendering."""
-        return Room(len(self.surfel_ids), self.ends, self.kind)
+        return ListCapacity(len(self.surfel_ids), self.ends, self.kind)
 
 
 def intersect_tiles(
@@ -250,7 +250,7 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
     return need.room
 
 
-def roomy(room: Room) -> bool:
+def fits(room: ListCapacity) -> bool:
     """Whether lists that a CUDA graph fills have the room that their kind is known to need; asked after each replay."""
     return _room(room.ends, room.kind) <= room.entries
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from nexwarp.checkpoint import write_json
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.io.json_files import write_json
 from nexwarp.sfm.colmap_scene import move_scene
 from nexwarp.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.sfm.pairs import exhaustive_pairs, sequential_pairs

@@ -1,6 +1,6 @@
 """What the viewer shows of a rendering: every buffer as a picture, and a legend that says how to read it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -10,9 +10,10 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.render import Rendering, render
-from nexwarp.surfels import Surfels
-from nexwarp.texture import NeuralTexture
+from nexwarp.model.model import Model
+from nexwarp.model.options import RenderChanges
+from nexwarp.render import Rendering
+from nexwarp.representation.surfels import Surfels
 
 MODES = {
     "image": "The picture: plain + textured + background.",
@@ -84,21 +85,18 @@ class Picture:
 
 @torch.no_grad()
 def draw(
-    surfels: Surfels,
-    texture: NeuralTexture | None,
+    model: Model,
     bands: Iterable[Camera],
     settings: Settings,
-    options: Mapping[str, Any],
     stale: Callable[[], bool] = lambda: False,
 ) -> Picture | None:
     """Render one view the way the settings say.
 
     Args:
-        surfels: of the model.
-        texture: of the model; None where it has none.
-        bands: cameras of the picture's bands of rows from top to bottom, or of the whole, on the surfels' device.
-        settings: what to show; its K and SH degree replace those of `options`, the degree up to that of `options`.
-        options: keyword arguments of `nexwarp.render` that the model was trained with.
+        model: what to show.
+        bands: cameras of the picture's bands of rows from top to bottom, or of the whole.
+        settings: what to show of it; its K and SH degree replace those of the model's options, the degree up to
+            that of the options.
         stale: asked before each band but the first; True gives the picture up, and returns None.
     """
     hits = settings.max_hits
@@ -106,13 +104,19 @@ def draw(
         hits = max(hits, settings.slot)
     elif settings.mode == "hit count":
         hits = MAX_HITS
-    chosen = {**options, "max_hits": hits, "sh_degree": min(settings.sh_degree, options["sh_degree"])}
+    if settings.mode not in TEXTURED:
+        model = Model(model.surfels, None, model.exposures, model.detail_limits, model.options)
+    changes: RenderChanges = {
+        "max_hits": hits,
+        "sh_degree": min(settings.sh_degree, model.options.sh_degree),
+        "exposure": "photos" if settings.photo_exposure else "mean",
+    }
     parts: list[torch.Tensor] = []
     for camera in bands:
         if parts and stale():
             return None
-        out = render(surfels, texture if settings.mode in TEXTURED else None, camera, **chosen)
-        parts.append(_values(out, surfels, camera, settings))
+        out = model.render(camera, **changes)
+        parts.append(_values(out, model.surfels, camera, settings))
     colours, span = _colours(torch.cat(parts), settings.mode)
     pixels = (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
     return Picture(pixels.cpu().numpy(), span)
@@ -122,10 +126,7 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
     """What a mode shows: (H, W, 3) colours, or (H, W) numbers, NaN where there is nothing to tell."""
     mode, slot = settings.mode, settings.slot - 1
     if mode in ("image", "plain", "textured"):
-        colours = getattr(out, mode)
-        if surfels.exposures is None or settings.photo_exposure:
-            return colours
-        return colours / surfels.exposures.factors(camera).to(colours)
+        return getattr(out, mode)
     if mode == "alpha":
         return out.alpha
     if mode == "hit count":
@@ -158,8 +159,7 @@ def _colours(values: torch.Tensor, mode: str) -> tuple[torch.Tensor, tuple[float
 
 def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
     """(N, 3) unit normals in the world frame, on the side that `position` is on."""
-    w, x, y, z = surfels.quats.unbind(dim=-1)
-    normals = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+    normals = surfels.normals
     behind = ((surfels.means - position) * normals).sum(dim=-1, keepdim=True) > 0
     return torch.where(behind, -normals, normals)
 

@@ -6,15 +6,14 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.surfels import Surfels
-from nexwarp.texture import NeuralTexture
+from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.server import start_server
@@ -29,15 +28,13 @@ SHARE = 0.2
 TELL_SECONDS = 0.5
 DEFAULT_FOV = 0.9
 
-Shown = Callable[[], tuple[Surfels, NeuralTexture | None, Mapping[str, Any]]]
-
 
 class Viewer:
     """A web page that shows a model; pictures are drawn on the thread that calls `show` or `between_steps`."""
 
     def __init__(
         self,
-        model: Shown,
+        model: Callable[[], Model],
         cameras: Mapping[str, Mapping[str, Camera]],
         *,
         near: float,
@@ -51,8 +48,7 @@ class Viewer:
         """Start to listen.
 
         Args:
-            model: gives the surfels, the texture (None for none) and the keyword arguments of `nexwarp.render`, as
-                they are when a picture is drawn.
+            model: gives the model as it is when a picture is drawn.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
             near: near depth of the viewer's cameras, world units.
             title: shown above the panel.
@@ -68,7 +64,7 @@ class Viewer:
         self.model, self.near, self.title, self.total = model, near, title, total
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos, self.save_path = photos, save_path
-        self.world = World.around(list(self.cameras.values()), model()[0].means)
+        self.world = World.around(list(self.cameras.values()), model().surfels.means)
         self.home = self._home()
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
         self.pace, self.share = pacing.Pace(), pacing.Share(SHARE)
@@ -126,7 +122,7 @@ class Viewer:
             while self.paused and not stop():
                 self._draw_or_wait()
 
-    def finish(self, text: str, model: Shown) -> None:
+    def finish(self, text: str, model: Callable[[], Model]) -> None:
         """Say that the training is over, and show another model from now on, as the constructor takes it."""
         self.model = model
         for session in list(self.sessions.values()):
@@ -199,14 +195,14 @@ class Viewer:
         self, here: Viewpoint, scale: float, settings: Settings, stale: Callable[[], bool] = lambda: False
     ) -> Picture | None:
         """A picture; None when it was given up because it had become stale."""
-        surfels, texture, options = self.model()
+        model = self.model()
         kind, pixels = _kind(settings), here.width * here.height * scale**2
         limit = self.focal_limit if settings.as_trained else math.inf
-        bands = here.bands(scale, self.near, surfels.means, self.pace.bands(kind, pixels), limit)
-        if surfels.device.type == "cuda":
-            torch.cuda.synchronize(surfels.device)  # what training has queued is not the picture's cost
+        bands = here.bands(scale, self.near, model.surfels.means, self.pace.bands(kind, pixels), limit)
+        if model.device.type == "cuda":
+            torch.cuda.synchronize(model.device)  # what training has queued is not the picture's cost
         start = time.perf_counter()
-        picture = draw(surfels, texture, bands, settings, options, stale)
+        picture = draw(model, bands, settings, stale)
         if picture is not None:
             self.pace.observe(kind, picture.pixels.size // 3, time.perf_counter() - start)
         return picture
@@ -232,13 +228,14 @@ class Viewer:
             return False
         camera = self.cameras[name]
         here = Viewpoint(camera_to_world(camera), vertical_fov(camera), camera.width, camera.height)
-        surfels, texture, options = self.model()
-        small = here.bands(min(THUMBNAIL / max(camera.width, camera.height), 1.0), self.near, surfels.means)
-        pixels = draw(surfels, texture, small, Settings(max_hits=options["max_hits"]), options).pixels
+        model = self.model()
+        small = here.bands(min(THUMBNAIL / max(camera.width, camera.height), 1.0), self.near, model.surfels.means)
+        picture = draw(model, small, Settings(max_hits=model.options.max_hits))
+        assert picture is not None
         with self._lock:
-            self.thumbnails[name] = pixels
+            self.thumbnails[name] = picture.pixels
             for session in self.sessions.values():
-                session.show_thumbnail(name, pixels)
+                session.show_thumbnail(name, picture.pixels)
         return True
 
     # The page
@@ -313,7 +310,7 @@ class Viewer:
 
     def _settings(self) -> Settings:
         """What clients see first: the picture, as it was trained."""
-        return Settings(max_hits=self.model()[2]["max_hits"])
+        return Settings(max_hits=self.model().options.max_hits)
 
     def _goodbye(self, client: "viser.ClientHandle") -> None:
         with self._lock:

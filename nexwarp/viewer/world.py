@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.camera import Camera
-from nexwarp.paths import focus
+from nexwarp.cameras.paths import focus
 
 # The browser flies two units a second: with the cameras three units around, a scene is crossed in three seconds.
 RADIUS = 3.0

@@ -1,0 +1,1 @@
+"""Cameras of a path or of a file."""

@@ -1,0 +1,313 @@
+"""Cameras as nerfstudio's JSON: a scene's `transforms.json` and the viewer's camera paths, in and out.
+
+Their matrices are camera to world with x right, y up, z backward (OpenGL); nexwarp's are world to camera with x right,
+y down, z forward. World frames are the same, but for the `applied_transform` and `applied_scale` of a transforms.json,
+which are taken back.
+"""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.errors import FormatError, MissingError
+from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.json_files import read_json
+
+# OpenGL camera axes in those of OpenCV, and back.
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+SINGULAR = 1e-9
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
+
+EXACT = 1e-9
+LAST_ROW = 1e-6
+MAX_SIDE = 2**16  # pixels
+LARGEST = 1e15  # of a number: squares stay finite in single precision
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Cameras along a path.
+
+    Attributes:
+        cameras: float32 on the CPU, in order.
+        fps: frames a second that the file asks for; None where it does not say.
+    """
+
+    cameras: list[Camera]
+    fps: float | None
+
+
+def save_transforms(
+    path: str | os.PathLike[str],
+    cameras: Mapping[str, Camera],
+    *,
+    train: Sequence[str] | None = None,
+    test: Sequence[str] | None = None,
+) -> None:
+    """Write cameras as a `transforms.json`: a pinhole a frame, so that sizes and principal points may differ.
+
+    Args:
+        path: where to; written aside, then renamed.
+        cameras: name of the image file -> camera.
+        train: names to list as `train_filenames`.
+        test: names to list as `val_filenames` and `test_filenames`. Without both, no split is written.
+
+    Raises:
+        ValueError: no cameras; OSError: `path` cannot be written.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none")
+    frames = [
+        {
+            "file_path": name,
+            "transform_matrix": _camera_to_world(camera).tolist(),
+            **_intrinsics(camera),
+            "w": camera.width,
+            "h": camera.height,
+        }
+        for name, camera in cameras.items()
+    ]
+    data: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames}
+    if train is not None or test is not None:
+        held_out = list(test or [])
+        data |= {"train_filenames": list(train or []), "val_filenames": held_out, "test_filenames": held_out}
+    _write(path, data)
+
+
+def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[str, Camera]:
+    """Read the cameras of a `transforms.json`; its images need not be there. Distortion is left out: they are pinholes.
+
+    Intrinsics stand in the frame, else in the file: `fl_x`, `fl_y` or else `camera_angle_x`, `camera_angle_y`; `cx`,
+    `cy` (default: the middle); `w`, `h`.
+
+    Args:
+        path: the file.
+        near: near depth of the cameras, world units.
+
+    Returns:
+        Name of the image file -> camera, float32 on the CPU, in the order of the file.
+
+    Raises:
+        FileNotFoundError: no such file; ValueError: naming the frame and key where the file is not as expected.
+    """
+    path = Path(path)
+    return _frames(path, _read(path), near)
+
+
+def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fps: float = 30.0) -> None:
+    """Write a camera path as nerfstudio's viewer does, for `ns-render camera-path` and `nexwarp render --path`.
+
+    nerfstudio's entries know one vertical field of view and a centred principal point. Of cameras that are not so, the
+    focal lengths and principal point are written too (`fl_x`, `fl_y`, `cx`, `cy`), which nexwarp reads and nerfstudio
+    ignores.
+
+    Args:
+        path: where to; written aside, then renamed.
+        cameras: of one size.
+        fps: frames a second.
+
+    Raises:
+        ValueError: no cameras, cameras of several sizes, `fps` not > 0; OSError: `path` cannot be written.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none")
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise ValueError(f"cameras: expected one size, got {' and '.join(f'{w}x{h}' for w, h in sizes[:2])}")
+    if not 0 < fps < math.inf:
+        raise ValueError(f"fps: expected more than 0 frames a second, got {fps}")
+    ((width, height),) = sizes
+    entries = []
+    for camera in cameras:
+        fov = math.degrees(2 * math.atan(height / (2 * camera.fy)))
+        entry = {"camera_to_world": _camera_to_world(camera).flatten().tolist(), "fov": fov, "aspect": width / height}
+        plain = (camera.fy, camera.fy, width / 2, height / 2)
+        exact = _intrinsics(camera)
+        if any(abs(a - b) > EXACT * b for a, b in zip(exact.values(), plain, strict=True)):
+            entry |= exact
+        entries.append(entry)
+    data = {
+        "camera_type": "perspective",
+        "render_width": width,
+        "render_height": height,
+        "fps": fps,
+        "seconds": len(cameras) / fps,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "default_fov": entries[0]["fov"],
+        "keyframes": [],
+        "camera_path": entries,
+    }
+    _write(path, data)
+
+
+def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> CameraPath:
+    """Read a camera path: nerfstudio's (key `camera_path`), or the frames of a `transforms.json` in their order.
+
+    Args:
+        path: the file.
+        near: near depth of the cameras, world units.
+
+    Raises:
+        FileNotFoundError: no such file; ValueError: naming the entry and key where the file is not as expected.
+    """
+    path = Path(path)
+    data = _read(path)
+    if "camera_path" not in data:
+        if "frames" in data:
+            return CameraPath(list(_frames(path, data, near).values()), None)
+        found = ", ".join(sorted(data)[:8]) or "none"
+        raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(found)}")
+    if data.get("camera_type", "perspective") != "perspective":
+        raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
+    width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
+    fps = _number(path, data, "fps", above=0.0) if "fps" in data else None
+    entries = _list(path, data, "camera_path")
+    cameras = []
+    for i, entry in enumerate(entries):
+        where = f"{path}: camera_path[{i}]"
+        pose = _pose(where, entry, "camera_to_world")
+        if all(key in entry for key in INTRINSICS):
+            fx, fy, cx, cy = (_number(where, entry, key) for key in INTRINSICS)
+        else:
+            fov = _number(where, entry, "fov", above=0.0, below=180.0)
+            fx = fy = height / (2 * math.tan(math.radians(fov) / 2))
+            cx, cy = width / 2, height / 2
+        cameras.append(_camera(where, pose, (fx, fy, cx, cy), width, height, near))
+    return CameraPath(cameras, fps)
+
+
+def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
+    model = data.get("camera_model", "PINHOLE")
+    if model not in PINHOLES:
+        raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
+    undo = torch.eye(4, dtype=torch.float64)
+    if "applied_transform" in data:
+        undo = torch.linalg.inv(_pose(str(path), data, "applied_transform"))
+    scale = _number(path, data, "applied_scale", above=0.0) if "applied_scale" in data else 1.0
+    cameras: dict[str, Camera] = {}
+    for i, frame in enumerate(_list(path, data, "frames")):
+        where = f"{path}: frames[{i}]"
+        pose = _pose(where, frame, "transform_matrix")
+        pose[:3, 3] /= scale
+        values = {**data, **frame}
+        width, height = (_size(where, values, key) for key in ("w", "h"))
+        if "fl_x" in values or "fl_y" in values:
+            # One of them stands for both.
+            fx, fy = (
+                _number(where, values, key if key in values else other)
+                for key, other in (("fl_x", "fl_y"), ("fl_y", "fl_x"))
+            )
+        else:
+            fx = _focal(where, values, "camera_angle_x", width)
+            fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
+        cx = _number(where, values, "cx") if "cx" in values else width / 2
+        cy = _number(where, values, "cy") if "cy" in values else height / 2
+        name = one_line(frame.get("file_path", f"{i:04d}"))
+        if name in cameras:
+            raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
+        cameras[name] = _camera(where, undo @ pose, (fx, fy, cx, cy), width, height, near)
+    return cameras
+
+
+def _camera_to_world(camera: Camera) -> torch.Tensor:
+    """(4, 4) float64 on the CPU. An inverse, not a transpose: a float32 rotation is orthonormal to 1e-7 only."""
+    return torch.linalg.inv(camera.viewmat.detach().double().cpu()) @ FLIP
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return dict(zip(INTRINSICS, (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
+
+
+def _camera(
+    where: str, pose: torch.Tensor, intrinsics: tuple[float, ...], width: int, height: int, near: float
+) -> Camera:
+    fx, fy, cx, cy = intrinsics
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    try:
+        return Camera(torch.linalg.inv(pose @ FLIP).float(), K, width, height, near)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
+    return size / (2 * math.tan(_number(where, values, key, above=0.0, below=math.pi) / 2))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise MissingError(f"{path}: no such file, expected cameras as JSON")
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise FormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _write(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
+    with written_aside(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def _list(path: Path, data: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    entries = data[key]
+    if not isinstance(entries, list) or not entries:
+        raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise FormatError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
+    return entries
+
+
+def _number(
+    where: str | Path, values: Mapping[str, Any], key: str, above: float = -math.inf, below: float = math.inf
+) -> float:
+    if key not in values:
+        raise ValueError(f"{where}: expected the key {key}, found none")
+    value = values[key]
+    fits = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (fits and above < value < below and abs(value) <= LARGEST):
+        least = f" above {above:g}" if above > -math.inf else ""
+        most = f" below {below:g}" if below < math.inf else ""
+        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r:.60}")
+    return float(value)
+
+
+def _size(where: str | Path, values: Mapping[str, Any], key: str) -> int:
+    size = _number(where, values, key, above=0.0)
+    if size > MAX_SIDE:
+        raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
+    if size != int(size):
+        raise ValueError(f"{where}: {key}: expected a whole number of pixels, got {size:g}")
+    return int(size)
+
+
+def _pose(where: str, values: Mapping[str, Any], key: str) -> torch.Tensor:
+    """(4, 4) float64 of three or four rows of four, nested or in one list."""
+    if key not in values:
+        raise ValueError(f"{where}: expected the key {key}, found none")
+    try:
+        matrix = torch.tensor(values[key], dtype=torch.float64)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        matrix = torch.empty(0)
+    if tuple(matrix.shape) not in ((16,), (12,), (4, 4), (3, 4)):
+        raise ValueError(f"{where}: {key}: expected a 4x4 matrix of numbers, got {one_line(values[key], 60)}")
+    matrix = matrix.reshape(-1, 4)
+    if len(matrix) == 3:
+        matrix = torch.cat([matrix, matrix.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+    if not bool(torch.isfinite(matrix).all()):
+        raise ValueError(f"{where}: {key}: expected finite numbers, got {matrix.tolist()}")
+    if (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() > LAST_ROW:
+        raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {matrix[3].tolist()}")
+    if torch.linalg.det(matrix[:3, :3]).abs() <= SINGULAR:
+        raise ValueError(f"{where}: {key}: expected an invertible pose, got the singular matrix {matrix.tolist()}")
+    return matrix

@@ -1,0 +1,195 @@
+"""Camera paths for videos, an ellipse, a spiral or a flight from view to view; and cameras between the views."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.checks import check_range
+
+DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
+ONE_WAY = 0.5  # least length of the mean viewing direction for a spiral
+SPREAD = 0.9  # share of the cameras, along each axis, that a spiral spans
+FRAMES_PER_KEY = 10
+NEIGHBORS = 4  # cameras, the nearest that look alike, towards one of which `between` goes
+ALIKE = math.cos(math.radians(60.0))
+
+BEYOND = 0.5  # share of the way that `between` goes at most beyond either end
+
+
+def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
+    """Return `count` cameras on a closed ellipse through the region of the given ones.
+
+    The ellipse lies in the plane of the camera centres (through their mean, along their two main axes).
+    Along each axis it spans 90 % of them, from the 5th to the 95th percentile; it starts beside the first
+    camera. All its cameras look at `focus(cameras)`, with the mean up direction, and have intrinsics, size,
+    near, dtype and device of the first one. Centres on one line give a path to and fro along it. A rigid
+    motion and scaling of all cameras does the same to the path.
+
+    Raises:
+        ValueError: fewer than two distinct centres, parallel optical axes, no common up direction, or a path
+            that meets the focus or passes straight above or below it; `count` < 1.
+    """
+    check_range("count", count, 1)
+    viewmats, centres = _poses(cameras)
+    target, up = focus(cameras), -viewmats[:, 1, :3].mean(0)
+    if (centres - centres.mean(0)).norm(dim=1).max() <= DEGENERATE * (centres - target).norm(dim=1).max():
+        raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
+    centre, axes, semi = _fit_ellipse(viewmats, centres)
+    x, y = ((axes @ (centres[0] - centre)) / semi.clamp(min=DEGENERATE * semi.max().item())).tolist()
+    angles = math.atan2(y, x) + torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
+    offsets = torch.stack([torch.cos(angles), torch.sin(angles)], dim=1) * semi @ axes
+    first = cameras[0]
+    viewmats = [look_at(centre + offset, target, up).to(first.viewmat) for offset in offsets]
+    return [replace(first, viewmat=viewmat) for viewmat in viewmats]
+
+
+def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[Camera]:
+    """Return `count` cameras on a closed spiral amid cameras that face one way.
+
+    Seen from the mean camera it winds `turns` times about the centre, once forward and back meanwhile; along each of
+    that camera's axes it reaches the distance within which 90 % of the cameras lie. Its cameras look at
+    `focus(cameras)` or, where the optical axes do not meet in front of all of them, along the mean direction; up is the
+    mean up direction. Intrinsics, size, near, dtype and device are those of the first camera. A rigid motion and
+    scaling of all cameras does the same to the path.
+
+    Raises:
+        ValueError: cameras that do not face one way, or all at one place; `count` or `turns` < 1.
+    """
+    check_range("count", count, 1)
+    check_range("turns", turns, 1)
+    viewmats, centres = _poses(cameras)
+    forward, down = viewmats[:, 2, :3].mean(0), viewmats[:, 1, :3].mean(0)
+    if forward.norm() < ONE_WAY:
+        raise ValueError(
+            f"cameras: expected cameras that face one way, got a mean direction of length {forward.norm().item():.2f} "
+            f"(at least {ONE_WAY}); an ellipse suits cameras all around"
+        )
+    centre = centres.mean(0)
+    axes = look_at(centre, centre + forward, -down)[:3, :3]
+    radii = torch.quantile(((centres - centre) @ axes.T).abs(), SPREAD, dim=0)
+    if radii.max() == 0.0:
+        raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
+    target = _common_target(cameras)
+    angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
+    rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
+    first, path = cameras[0], []
+    for position in centre + rounds * radii @ axes:
+        viewmat = look_at(position, position + forward if target is None else target, -down)
+        path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
+    return path
+
+
+def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
+    """Return `count` cameras on a smooth flight from the first of the given ones to the last.
+
+    The flight passes through key cameras: through all, or, where there are more than `keys`, through that many, evenly
+    spaced in the list, the first and last among them. Between two, it takes time in proportion to the way and the turn.
+    Centres follow a cubic spline, rotations one of continuous angular acceleration. Intrinsics, size, near, dtype and
+    device are those of the first camera. A rigid motion and scaling of all cameras does the same to the path.
+
+    Args:
+        cameras: in the order to fly by.
+        count: cameras to return; the first is at the first key, the last at the last.
+        keys: at most so many keys, at least 2; by default one for every 10 of `count`.
+
+    Raises:
+        ValueError: fewer than two distinct cameras; `count` < 1, `keys` < 2.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    check_range("count", count, 1)
+    keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
+    check_range("keys", keys, 2)
+    viewmats, centres = _poses(cameras)
+    if len(cameras) > keys:
+        chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()
+        viewmats, centres = viewmats[chosen], centres[chosen]
+    turned = Rotation.from_matrix(viewmats[:, :3, :3].mT.numpy())
+    ways = (centres[1:] - centres[:-1]).norm(dim=1).numpy()
+    turns = (turned[:-1].inv() * turned[1:]).magnitude() if len(ways) else ways
+    # Two views at one place, turned alike, are one key: they would be a halt.
+    spans = sum(x / x.mean() if x.sum() > 0.0 else 0.0 * x for x in (ways, turns)) if len(ways) else ways
+    distinct = np.concatenate([[True], spans > DEGENERATE])
+    if distinct.sum() < 2:
+        raise ValueError(f"cameras: expected at least two distinct ones, got {len(cameras)} that are the same")
+    times = np.concatenate([[0.0], spans.cumsum()])[distinct]
+    at = np.linspace(0.0, times[-1], count)
+    positions = CubicSpline(times, centres.numpy()[distinct], bc_type="natural")(at)
+    rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
+    placed = zip(torch.from_numpy(rotations), torch.from_numpy(positions), strict=True)
+    return [_placed(cameras[0], rotation, position) for rotation, position in placed]
+
+
+def focus(cameras: Sequence[Camera]) -> torch.Tensor:
+    """(3,) float64, the world point with the least sum of squared distances to the optical axes.
+
+    Raises:
+        ValueError: the axes are parallel, as a single camera's are.
+    """
+    viewmats, centres = _poses(cameras)
+    axes = viewmats[:, 2, :3]
+    # Each matrix takes off the part of a vector that is along its axis.
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    if torch.linalg.eigvalsh(across.mean(0))[0] < DEGENERATE**2:
+        raise ValueError(f"cameras: expected two or more with axes that are not parallel, got {len(cameras)}")
+    return torch.linalg.solve(across.mean(0), (across @ centres[:, :, None]).mean(0)[:, 0])
+
+
+def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
+    """(4, 4) world-to-camera matrix at `position` looking at `target`, `up` being up in the image; (3,) each.
+
+    Raises:
+        ValueError: `target` is at `position`, or `up` is zero or along the line between them.
+    """
+    forward = target - position
+    right = torch.linalg.cross(forward, up)
+    if right.norm() <= DEGENERATE * forward.norm() or forward.norm() == 0:
+        raise ValueError("up: expected a direction across the line from position to target, got none or one along it")
+    forward, right = forward / forward.norm(), right / right.norm()
+    viewmat = torch.eye(4, dtype=position.dtype, device=position.device)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return viewmat
+
+
+def _placed(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) -> Camera:
+    """The camera with another world-to-camera rotation (3, 3) and centre (3,), float64."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    return replace(camera, viewmat=viewmat.to(camera.viewmat))
+
+
+def _poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
+    """World-to-camera matrices (n, 4, 4) and centres (n, 3), float64 on the CPU."""
+    if not cameras:
+        raise ValueError("cameras: expected at least one, got none")
+    viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
+    return viewmats, -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+
+
+def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Centre (3,), unit axes (2, 3) and semi-axes (2,) of the ellipse, counter-clockwise from above."""
+    mean = centres.mean(0)
+    axes = torch.linalg.svd(centres - mean)[2][:2]
+    # The axes come with arbitrary signs. The cameras' down or, in an upright plane, forward direction settles
+    # the sense of rotation; the start at the first camera makes the rest irrelevant.
+    normal = torch.linalg.cross(axes[0], axes[1])
+    if max((viewmats[:, 1:3, :3].mean(0) @ normal).tolist(), key=abs) > 0.0:
+        axes = axes * axes.new_tensor([[1.0], [-1.0]])
+    low, high = torch.quantile((centres - mean) @ axes.T, axes.new_tensor([0.05, 0.95]), dim=0)
+    return mean + (low + high) / 2.0 @ axes, axes, (high - low) / 2.0
+
+
+def _common_target(cameras: Sequence[Camera]) -> torch.Tensor | None:
+    """`focus(cameras)`, where it lies in front of all; None where it does not, or the axes are parallel."""
+    try:
+        target = focus(cameras)
+    except ValueError:
+        return None
+    viewmats, _ = _poses(cameras)
+    return target if bool(((viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0).all()) else None

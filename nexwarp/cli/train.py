@@ -1,0 +1,248 @@
+"""`nexwarp train`."""
+
+import dataclasses
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from nexwarp.cli import display
+from nexwarp.cli.device import keep_freed_memory, pick_device
+from nexwarp.cli.display import device_name
+from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
+from nexwarp.cli.training_session import TrainingSession
+from nexwarp.cli.view import show_until_interrupted
+from nexwarp.data import Scene
+from nexwarp.errors import SettingError
+from nexwarp.io.json_files import Json
+from nexwarp.run.folder import (
+    DEMO,
+    SceneSource,
+    create_run,
+    keep_camera_path,
+    prepare_run,
+    read_run,
+)
+from nexwarp.run.log import check_tensorboard
+from nexwarp.train.config import Config
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import parse_settings, setting, with_settings
+from nexwarp.train.trainer import Trainer
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
+
+
+@dataclass
+class Train:
+    """Train a scene, evaluate it on its test views, and keep everything in a run folder."""
+
+    scene: Scene_
+    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
+    run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
+    """Folder to write to."""
+    max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
+    """Budget of surfels, never exceeded."""
+    iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
+    """Training steps, one photo each; schedules stretch with them."""
+    downscale: Annotated[int, option("N")] = 1
+    """Reduce photos by this factor, by area."""
+    images: Annotated[str, option("FOLDER")] = "images"
+    """Folder of the photos below SCENE, such as images_4."""
+    masks: Annotated[str, option("{FOLDER,alpha,none}")] = "masks"
+    """Folder of the masks below SCENE, if it is there; `alpha` takes the photos' own transparency."""
+    mask_mode: Annotated[str | None, option("{ignore,background}", "ignore")] = None
+    """What masks leave out: learn nothing there, or learn that nothing is there."""
+    background: Annotated[
+        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else photos count as opaque")
+    ] = None
+    """Colour behind transparent photos, and behind renderings; R,G,B go up to 1, `random` is another each step."""
+    points: Annotated[str | None, option("FILE.ply", "the scene's own points")] = None
+    """Points to start from."""
+    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "the one that is there")] = None
+    """Kind of the scene, for a folder that holds more than one."""
+    max_hits: Annotated[int | None, option("K", "2")] = None
+    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
+    preset: Preset_ = "default"
+    """Settings to start from: nexwarp's own, or those of the publication (docs/paper.md)."""
+    settings: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """Change any setting of docs/options.md, such as texture.max_resolution=1024; VALUE is JSON or a bare word."""
+    seed: Annotated[int | None, option("N", "0")] = None
+    """Random seed."""
+    deterministic: bool = False
+    """Give the same bits in every run also on CUDA; slower. A CPU always does."""
+    device: Device_ = None
+    """Where to train."""
+    resume: bool = False
+    """Continue the run in --run, however it ended: with its settings, whatever else is given must agree with them."""
+    checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
+    """Iterations between checkpoints, of which the last two are kept."""
+    overwrite: bool = False
+    """Replace the run in --run."""
+    view: bool = False
+    """Show the training in the browser (extra `viewer`); afterwards the result, until Ctrl-C."""
+    host: Host_ = "127.0.0.1"
+    """Where --view listens; 0.0.0.0 lets other machines look."""
+    port: Port_ = 8080
+    """Port for --view; 0 takes any free one."""
+    tensorboard: bool = False
+    """Also log into RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
+
+    def __call__(self, console: Console) -> None:
+        """Train."""
+        source = self._source()
+        run = self.run or Path("runs") / source.name
+        resume = prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
+        if resume:
+            source = self._resumed_source(source, run)
+        device = pick_device(self.device)
+        config = self._config(run, resume)
+        self._check()
+        console.print(f"{source.name} on {device_name(device)}, preset {config.preset}")
+        with display.loading(console) as progress:
+            scene = source.load(progress)
+        config = self._with_background(config, scene, resume)
+        size = scene.train[0].camera
+        console.print(
+            f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
+            f"{len(scene.points):,} points"
+        )
+        if device.type == "cpu":
+            keep_freed_memory()
+        trainer = Trainer(scene, config, device)
+        session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
+        if resume:
+            session.resume()
+        else:
+            session.check_room()
+            if self.resume:
+                console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
+        with self._viewer(trainer, run, source.name, console) as viewer:
+            if not resume:
+                create_run(run, source, config, device.type)
+            session.train(viewer)
+            model = session.finish()
+            if viewer is not None:
+                viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
+                show_until_interrupted(viewer, console)
+
+    def _check(self) -> None:
+        """Raise SettingError for flags that do not make sense, before the photos are read."""
+        if self.checkpoint_every is not None and self.checkpoint_every < 1:
+            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
+        if self.downscale < 1:
+            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
+        if self.tensorboard:
+            check_tensorboard()
+        if self.view:
+            from nexwarp.viewer import check_server
+
+            check_server(self.host, self.port)
+
+    def _with_background(self, config: Config, scene: Scene, resume: bool) -> Config:
+        """Take the background that the scene's photos are put on, unless the run has one already."""
+        if scene.background is None or resume:
+            return config
+        if "background" in parse_settings(self.settings):
+            raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
+        return dataclasses.replace(config, background=scene.background)
+
+    def _viewer(
+        self, trainer: Trainer, run: Path, title: str, console: Console
+    ) -> AbstractContextManager["Viewer | None"]:
+        """A context with the viewer of a training, or with None."""
+        if not self.view:
+            return nullcontext()
+        from nexwarp.viewer import Viewer
+
+        sets = {"train": trainer.scene.train, "test": trainer.scene.test}
+        viewer = Viewer(
+            trainer.model,
+            {group: {view.name: view.camera for view in views} for group, views in sets.items()},
+            near=trainer.scene.train[0].camera.near,
+            title=title,
+            host=self.host,
+            port=self.port,
+            photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
+            total=trainer.config.iterations,
+            save_path=partial(keep_camera_path, run),
+        )
+        console.print(f"viewer: {viewer.url}")
+        return viewer
+
+    def _source(self) -> SceneSource:
+        """The scene that the flags ask for."""
+        return SceneSource(
+            self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
+        )
+
+    def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
+        """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
+        old, config, _ = read_run(run)
+        for flag, default, given, expected in (
+            ("--downscale", 1, self.downscale, old.downscale),
+            ("--images", "images", self.images, old.images),
+            ("--masks", "masks", self.masks, old.masks),
+            ("--background", None, self.background, old.background),
+            ("--points", None, self.points and str(Path(self.points).resolve()), old.points),
+            ("--format", None, self.format, old.format),
+            ("--preset", "default", self.preset, config.preset),
+        ):
+            if given not in (default, expected):
+                raise SettingError(f"{flag}: expected {expected} as in the run to resume, got {given}")
+        return dataclasses.replace(old, path=source.path)
+
+    def _config(self, run: Path, resume: bool = False) -> Config:
+        """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
+        flags: dict[str, Json] = {
+            "iterations": self.iterations,
+            "max_surfels": self.max_surfels,
+            "max_hits": self.max_hits,
+            "seed": self.seed,
+            "mask_mode": self.mask_mode,
+            "deterministic": self.deterministic or None,
+        }
+        given: dict[str, Json] = {name: value for name, value in flags.items() if value is not None}
+        check_max_hits(self.max_hits)
+        settings = self._settings(given)
+        if resume:
+            return self._resumed_config(run, given, settings)
+        base = preset(self.preset)
+        if self.scene == DEMO:
+            base = with_settings(base, DEMO_SETTINGS)
+        return with_flag_settings(with_settings(base, given), settings)
+
+    def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
+        """Settings of the run to resume; SettingError names a given one that differs."""
+        config = read_run(run)[1]
+        for name, value in given.items():
+            if getattr(config, name) != value:
+                flag = f"--{name.replace('_', '-')}"
+                raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
+        changed = with_flag_settings(config, settings)
+        for name in settings:
+            old, new = setting(config, name), setting(changed, name)
+            if name == "cuda_graphs":  # the one setting that does not change a run's results
+                config = dataclasses.replace(config, cuda_graphs=changed.cuda_graphs)
+            elif old != new:
+                raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
+        return config
+
+    def _settings(self, given: dict[str, Json]) -> dict[str, Json]:
+        """What --set asks for; a setting that has a flag of its own must not be there."""
+        try:
+            settings = parse_settings(self.settings)
+        except ValueError as error:
+            raise SettingError(f"--set: {error}") from None
+        for name in settings:
+            if name == "preset" or name in given:
+                flag = f"--{name.replace('_', '-')}"
+                raise SettingError(f"--set: {name}: expected {flag} alone, got {name} with --set")
+        return settings

@@ -1,0 +1,55 @@
+"""`nexwarp view`."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli.device import pick_device
+from nexwarp.cli.options import Device_, Host_, Port_, Run_
+from nexwarp.model.model_file import load
+from nexwarp.run.folder import CAMERAS_FILE, keep_camera_path, read_run
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
+
+
+@dataclass
+class View:
+    """Show a run in the browser: every pass, from anywhere, and camera paths for render (extra `viewer`)."""
+
+    run: Run_
+    """Run folder."""
+    host: Host_ = "127.0.0.1"
+    """Where to listen; 0.0.0.0 lets other machines look."""
+    port: Port_ = 8080
+    """Port to listen on; 0 takes any free one."""
+    device: Device_ = None
+    """Where to compute."""
+
+    def __call__(self, console: Console) -> None:
+        """Listen until Ctrl-C."""
+        from nexwarp.viewer import Viewer
+
+        source, _, _ = read_run(self.run)
+        model = load(self.run).to(pick_device(self.device))
+        with Viewer(
+            lambda: model,
+            load_cameras(self.run / CAMERAS_FILE),
+            near=near if isinstance(near := model.meta.get("near"), float) else 0.01,
+            title=source.name,
+            host=self.host,
+            port=self.port,
+            save_path=partial(keep_camera_path, self.run),
+        ) as viewer:
+            show_until_interrupted(viewer, console)
+
+
+def show_until_interrupted(viewer: "Viewer", console: Console) -> None:
+    """Show a model that no longer changes."""
+    console.print(f"viewer: {viewer.url} (Ctrl-C ends it)")
+    with suppress(KeyboardInterrupt):
+        viewer.show()

@@ -1,0 +1,1 @@
+"""From trained surfels to a finished model."""

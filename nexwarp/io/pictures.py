@@ -1,0 +1,224 @@
+"""Pictures: files written whole or not at all (PNG, OpenEXR), error maps, strips with captions."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nexwarp.checks import check_finite, check_range
+from nexwarp.errors import FormatError, MissingError, StorageError
+from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.json_files import parse_json
+
+
+def to_uint8(image: torch.Tensor) -> torch.Tensor:
+    """Clamp a float image to [0, 1] and round it to 8 bits; an 8-bit image comes back as it is.
+
+    Raises:
+        TypeError: `image` is neither uint8 nor floating.
+        ValueError: `image` holds NaN or infinity.
+    """
+    if image.dtype == torch.uint8:
+        return image
+    if not image.is_floating_point():
+        raise TypeError(f"image: expected uint8 or a floating dtype, got {image.dtype}")
+    check_finite("image", image)
+    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+ERROR_SCALE = 0.25
+CAPTION_HEIGHT = 16
+METADATA = "nexwarp"
+MAX_SIDE = 2**16  # pixels
+MAX_RATIO = 1100  # of zlib: pixels to bytes
+
+
+def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
+    """Write an (H, W, 3) image, uint8 or float in [0, 1], to a temporary name, then rename it to `path`.
+
+    The folder is made if need be; a file already at `path` stays as it is when anything fails.
+    """
+    from PIL import Image
+
+    pixels = _to_uint8("image", image).numpy()
+    with written_aside(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+def save_exr(
+    path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write tensors as the named parts of one OpenEXR file, exactly: float32 as FLOAT, int32 as UINT.
+
+    Args:
+        path: where to; written aside, then renamed.
+        parts: name -> (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (channel Y; -1
+            becomes 4294967295).
+        metadata: what JSON can hold, kept as the text attribute `nexwarp` of the first part; `parts` is added to it.
+
+    Raises:
+        TypeError, ValueError: no parts, or one whose shape or dtype does not fit; OSError: `path` cannot be written.
+    """
+    import OpenEXR
+
+    if not parts:
+        raise ValueError("parts: expected at least one, got none")
+    files = []
+    for name, tensor in parts.items():
+        if tensor.dtype not in (torch.float32, torch.int32):
+            raise TypeError(f"parts[{name!r}]: expected float32 or int32, got {tensor.dtype}")
+        if not (tensor.ndim == 2 or (tensor.ndim == 3 and tensor.shape[2] == 3)):
+            raise ValueError(f"parts[{name!r}]: expected shape (H, W) or (H, W, 3), got {tuple(tensor.shape)}")
+        values = tensor.detach().cpu().numpy()
+        if values.dtype == np.int32:
+            values = np.ascontiguousarray(values).view(np.uint32)
+        planes = [values[..., i] for i in range(3)] if values.ndim == 3 else [values]
+        channels = {c: np.ascontiguousarray(x) for c, x in zip("RGB" if len(planes) == 3 else "Y", planes, strict=True)}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        if not files:
+            header[METADATA] = json.dumps({"parts": list(parts), **(metadata or {})})
+        files.append(OpenEXR.Part(header, channels, name))
+    with written_aside(path) as temporary:
+        temporary.touch()  # an error of the operating system says more than OpenEXR's
+        try:
+            OpenEXR.File(files).write(str(temporary))
+        except RuntimeError as error:  # a full disk, for one
+            reason = str(error).replace(str(temporary), str(path))
+            raise StorageError(f"{path}: cannot be written ({reason})") from None
+
+
+def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read what `save_exr` wrote, bit for bit.
+
+    Returns:
+        The parts by name, on the CPU, and the metadata, with the list `parts` of their names.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is no OpenEXR file, it is damaged, or its channels are not those of `save_exr`.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file():
+        raise MissingError(f"{path}: no such file, expected an OpenEXR file")
+    parts, text = {}, ""
+    try:
+        _check_size(path)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts:
+                text = str(part.header.get(METADATA, text))
+                planes = {name: channel.pixels for name, channel in part.channels.items()}
+                parts[part.name()] = (set(planes), [planes[name] for name in "RGBY" if name in planes])
+    except Exception as error:  # OpenEXR raises bare RuntimeErrors, and others
+        raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
+    try:
+        metadata = dict(parse_json("metadata", text.encode("utf-8", "replace"))) if text else {"parts": list(parts)}
+        names = list(metadata["parts"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({one_line(error)})"
+        ) from None
+    # OpenEXR leaves out, with no more than a message, the parts that it cannot read.
+    if not parts or names != list(parts):
+        raise FormatError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
+    tensors = {}
+    for name, (names, planes) in parts.items():
+        if names not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
+            kinds = ", ".join(sorted(names))
+            raise FormatError(
+                f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {one_line(kinds, 60)} in part {name!r}"
+            )
+        planes = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
+        tensors[name] = torch.stack(planes, dim=-1) if len(planes) == 3 else planes[0]
+    return tensors, metadata
+
+
+def _check_size(path: Path) -> None:
+    """Raise ValueError when the headers announce more pixels than the file can hold."""
+    import OpenEXR
+
+    total = 0
+    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+        for part in file.parts:
+            low, high = part.header["dataWindow"]
+            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+                raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+            total += width * height * 4 * len(part.header["channels"])
+    limit = MAX_RATIO * path.stat().st_size
+    if total > limit:
+        raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
+
+
+def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Colour the absolute error, averaged over channels, of two (H, W, 3) images: (H, W, 3) uint8.
+
+    The colours are viridis over 0 (dark violet) to 0.25 (yellow), in 256 steps; larger errors are yellow too.
+    """
+    a, b = _to_uint8("image", image), _to_uint8("target", target)
+    if a.shape != b.shape:
+        raise ValueError(f"target: expected shape {tuple(a.shape)}, got {tuple(b.shape)}")
+    error = (a.int() - b.int()).abs().float().mean(-1) / 255.0
+    return _viridis()[(error / ERROR_SCALE * 255.0).round().clamp(max=255.0).long()]
+
+
+def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequence[str] | None = None) -> torch.Tensor:
+    """Join (H, W_i, 3) images of one height, uint8 or float in [0, 1], into one uint8 strip with white gaps.
+
+    Args:
+        images: from left to right.
+        gap: white pixels between two neighbours.
+        captions: one for each image, printed on a white band above it that is 16 pixels high.
+
+    Returns:
+        (H, sum of W_i + gaps, 3), or 16 pixels higher with captions.
+    """
+    check_range("gap", gap, 0)
+    if not images:
+        raise ValueError("images: expected at least one, got none")
+    panels = [_to_uint8(f"images[{i}]", image) for i, image in enumerate(images)]
+    if len({len(panel) for panel in panels}) > 1:
+        raise ValueError(f"images: expected images of one height, got heights {[len(panel) for panel in panels]}")
+    if captions is not None:
+        if len(captions) != len(panels):
+            raise ValueError(f"captions: expected {len(panels)}, one for each image, got {len(captions)}")
+        panels = [
+            torch.cat([_caption(text, panel.shape[1]), panel]) for text, panel in zip(captions, panels, strict=True)
+        ]
+    white = torch.full((len(panels[0]), gap, 3), 255, dtype=torch.uint8)
+    return torch.cat([part for panel in panels for part in (white, panel)][1:], dim=1)
+
+
+def _caption(text: str, width: int) -> torch.Tensor:
+    """(CAPTION_HEIGHT, width, 3) uint8, black text on white, cut off at the right."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    band = Image.new("RGB", (width, CAPTION_HEIGHT), "white")
+    ImageDraw.Draw(band).text((2, 2), text, fill="black", font=ImageFont.load_default())
+    return torch.from_numpy(np.array(band))
+
+
+@lru_cache(maxsize=1)
+def _viridis() -> torch.Tensor:
+    """(256, 3) uint8."""
+    from kornia.color import ColorMap
+
+    return (ColorMap("viridis", 256).colors.T * 255.0).round().to(torch.uint8)
+
+
+def _to_uint8(name: str, image: torch.Tensor) -> torch.Tensor:
+    """Check an (H, W, 3) image and return it in 8 bits on the CPU; NaN becomes 0, so that it shows."""
+    if not isinstance(image, torch.Tensor) or not (image.dtype == torch.uint8 or image.is_floating_point()):
+        raise TypeError(
+            f"{name}: expected a uint8 or floating torch.Tensor, got {getattr(image, 'dtype', type(image))}"
+        )
+    if image.ndim != 3 or image.shape[-1] != 3:
+        raise ValueError(f"{name}: expected shape (H, W, 3), got {tuple(image.shape)}")
+    image = image.detach().cpu()
+    return image if image.dtype == torch.uint8 else (image.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)

@@ -1,0 +1,103 @@
+"""Videos: H.264 (VP9 for .webm) through PyAV, written whole or not at all."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import torch
+
+from nexwarp.checks import check_range
+from nexwarp.errors import SettingError
+from nexwarp.io.files import written_aside
+
+# Suffix -> container, its options, encoder, its options: constant quality, at which no artefact is seen.
+H264 = ("libx264", {"crf": "16", "preset": "medium"})
+
+KINDS = {
+    ".mp4": ("mp4", {"movflags": "faststart"}, *H264),  # so that a browser plays it while it loads
+    ".mov": ("mov", {"movflags": "faststart"}, *H264),
+    ".mkv": ("matroska", {}, *H264),
+    ".webm": ("webm", {}, "libvpx-vp9", {"crf": "24", "b": "0"}),
+}
+
+LARGEST_SIDE = 16384
+BT709, LIMITED_RANGE = 1, 1  # of ISO/IEC 23091-2
+
+FASTEST = 1000.0
+
+
+def check_video(path: str | os.PathLike[str], fps: float) -> None:
+    """Raise ValueError unless `path` and `fps` suit a video, and PyAV is there to write it."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in KINDS:
+        raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
+    if not 0 < fps <= FASTEST:
+        raise SettingError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        raise SettingError(f"{path}: videos need PyAV, which is not installed: pip install 'nexwarp[video]'") from None
+
+
+@contextmanager
+def video_writer(
+    path: str | os.PathLike[str], width: int, height: int, fps: float = 30.0
+) -> Iterator[Callable[[torch.Tensor], None]]:
+    """Yield a function that appends an (H, W, 3) uint8 frame; the video becomes `path` when the block ends.
+
+    H.264 in BT.709 colours with 4:2:0 chroma, which everything plays. That has even sides: of an odd one, the last
+    column or row is cropped.
+
+    Args:
+        path: .mp4, .mov, .mkv or .webm (VP9); written aside, then renamed.
+        width: of the frames, pixels.
+        height: likewise.
+        fps: frames a second.
+
+    Raises:
+        ValueError: a suffix, size or rate that does not fit, no PyAV (extra `video`), a block without frames.
+        OSError: `path` cannot be written.
+    """
+    check_video(path, fps)
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
+    check_range("width", width, 2, LARGEST_SIDE)
+    check_range("height", height, 2, LARGEST_SIDE)
+    container_name, container_options, encoder, options = KINDS[Path(path).suffix.lower()]
+    even = (height // 2 * 2, width // 2 * 2)
+    count = 0
+    with written_aside(path) as temporary:
+        temporary.touch()  # an error of the operating system says more than FFmpeg's
+        with av.open(str(temporary), "w", format=container_name, options=container_options) as container:
+            rate = Fraction(fps).limit_denominator(1001)
+            stream = container.add_stream(encoder, rate=rate, options=options)
+            stream.width, stream.height, stream.pix_fmt = even[1], even[0], "yuv420p"
+            context = stream.codec_context
+            context.color_primaries = context.color_trc = context.colorspace = BT709
+            context.color_range = LIMITED_RANGE
+
+            def append(frame: torch.Tensor) -> None:
+                nonlocal count
+                if frame.dtype != torch.uint8 or tuple(frame.shape) != (height, width, 3):
+                    raise ValueError(
+                        f"frame: expected uint8 of shape ({height}, {width}, 3), got {frame.dtype} of "
+                        f"{tuple(frame.shape)}"
+                    )
+                pixels = frame[: even[0], : even[1]].cpu().contiguous().numpy()
+                picture = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(
+                    format="yuv420p",
+                    dst_colorspace=Colorspace.ITU709,
+                    src_color_range=ColorRange.JPEG,
+                    dst_color_range=ColorRange.MPEG,
+                )
+                picture.pts, picture.time_base = count, 1 / rate
+                container.mux(stream.encode(picture))
+                count += 1
+
+            yield append
+            if not count:
+                raise ValueError(f"{path}: expected at least one frame, got none")
+            container.mux(stream.encode())

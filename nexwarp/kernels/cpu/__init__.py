@@ -1,0 +1,1 @@
+"""SIMD forms of two stages, for the CPU."""

@@ -1,0 +1,485 @@
+"""Collection pass for CPUs: a thread walks with a row of pixels of a tile, whose lanes are those of SIMD registers.
+
+The same as `collect`, line by line, with vectors for what pixels differ in and masks for which of them something holds;
+a test compares the two. What misses the whole row is culled before any of it.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from nexwarp.kernels.native.simd import lane_functions, slot_functions
+from nexwarp.kernels.surfel import frame_functions, hit_functions
+from nexwarp.kernels.types import types
+from nexwarp.kernels.walk import overflowed, surfel_at, walk
+
+
+def row_lanes(tile_size: int) -> int:
+    """Pixels that a thread takes: as many as AVX-512 has lanes for float32, where tiles are that wide."""
+    return 16 if tile_size % 16 == 0 else 8
+
+
+@functools.cache
+def row_functions(real: type, tile_size: int) -> SimpleNamespace:
+    """Which row of pixels a thread has, and where its rays go; `rows` is the number of rows of a tile."""
+    t = types(real)
+    vec2, vec4, HALF = t.vec2, t.vec4, t.HALF
+    lanes = row_lanes(tile_size)
+    lane = lane_functions(real, lanes).lane
+    rows = tile_size * tile_size // lanes
+    across = tile_size // lanes
+    # Half of the distance between the outer pixel centres, and a little.
+    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+
+    @wp.func
+    def row_of(thread: int, tile_columns: int):
+        """First pixel, (column, row)."""
+        tile = thread // rows
+        local = thread % rows
+        return wp.vec2i(
+            (tile % tile_columns) * tile_size + (local % across) * lanes,
+            (tile // tile_columns) * tile_size + local // across,
+        )
+
+    @wp.func
+    def rays_of(xy: wp.vec2i, intrinsics: vec4):
+        """Directions of the row's pixels: x of each, the y of all; z is 1."""
+        dx = lane()
+        for l in range(wp.static(lanes)):
+            dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / intrinsics[0]
+        return dx, (real(float(xy[1])) + HALF - intrinsics[3]) / intrinsics[1]
+
+    @wp.func
+    def middle_of(xy: wp.vec2i, y: real, intrinsics: vec4):
+        """Direction through the middle of the row."""
+        return vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / intrinsics[0], y)
+
+    @wp.func
+    def half_row(intrinsics: vec4):
+        return vec2(HALF_ROW / intrinsics[0], SLIVER / intrinsics[1])
+
+    return SimpleNamespace(row_of=row_of, rays_of=rays_of, middle_of=middle_of, half_row=half_row, rows=rows)
+
+
+@functools.cache
+def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
+    """Make the forward kernel."""
+    t = types(real)
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
+    lanes = row_lanes(tile_size)
+    h = hit_functions(real, low_pass, lanes)
+    f = lane_functions(real, lanes)
+    lane, word, integer = f.lane, f.word, f.integer
+    s = slot_functions(real, lanes, max(max_hits, 1))
+    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
+    view = row_functions(real, tile_size)
+    rows = view.rows
+    ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
+
+    # The loop over pixels is not unrolled, that would be most of the kernel's code. Its arguments are copies, so that
+    # what the walk works on is never indexed by a variable and stays in registers.
+    @wp.func
+    def write(
+        xy: wp.vec2i,
+        size: wp.vec2i,
+        red: lane,
+        green: lane,
+        blue: lane,
+        transmittance: lane,
+        stop: word,
+        buffer_red: lanes_by_slot,
+        buffer_green: lanes_by_slot,
+        buffer_blue: lanes_by_slot,
+        buffer_weights: lanes_by_slot,
+        buffer_ids: words_by_slot,
+        buffer_depths: lanes_by_slot,
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+    ):
+        for l in range(wp.min(lanes, size[0] - xy[0])):
+            p = xy[1] * size[0] + xy[0] + l
+            plain[p] = vec3(red[l], green[l], blue[l])
+            kept = vec3()
+            for j in range(wp.static(max_hits)):
+                kept += vec3(buffer_red[j, l], buffer_green[j, l], buffer_blue[j, l]) * buffer_weights[j, l]
+                ids[p, j] = wp.int32(buffer_ids[j, l])
+                depths[p, j] = buffer_depths[j, l]
+                weights[p, j] = buffer_weights[j, l]
+            base[p] = kept
+            alphas[p] = ONE - transmittance[l]
+            stops[p] = wp.int32(stop[l])
+
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+    )
+    def collect_rows(
+        first: wp.int32,
+        records: wp.array2d(dtype=vec4),
+        centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
+        surfel_ids: wp.array(dtype=wp.int32),
+        tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        size: wp.vec2i,
+        tile_columns: wp.int32,
+        Ks: wp.array(dtype=mat33),
+        near: real,
+        reaches: wp.array(dtype=vec2),
+        # outputs
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+    ):
+        thread = first + wp.tid()
+        xy = view.row_of(thread, tile_columns)
+        if xy[0] >= size[0] or xy[1] >= size[1]:
+            return
+        intrinsics = intrinsics_of(Ks)
+        focal = vec2(intrinsics[0], intrinsics[1])
+        dx, y = view.rays_of(xy, intrinsics)
+        alive = word()
+        for l in range(wp.static(lanes)):
+            if xy[0] + l < size[0]:
+                alive[l] = integer(-1)
+        middle = view.middle_of(xy, y, intrinsics)
+        half = view.half_row(intrinsics)
+        one = lane(ONE)
+        transmittance = lane(ONE)
+        red = lane()
+        green = lane()
+        blue = lane()
+        buffer_ids = words_by_slot(integer(-1))
+        buffer_weights = lanes_by_slot()
+        buffer_depths = lanes_by_slot()
+        buffer_red = lanes_by_slot()
+        buffer_green = lanes_by_slot()
+        buffer_blue = lanes_by_slot()
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // rows, tile_offsets, ends, overflow)
+        stop = word(integer(bounds[0]))
+        for k in range(bounds[0], bounds[1]):
+            i = surfel_at(k, surfel_ids, order, overflow)
+            ra = records[i, 0]
+            rb = records[i, 1]
+            rn = records[i, 2]
+            rc = records[i, 3]
+            center = vec3()
+            if wp.static(low_pass):
+                center = centers[i]
+            if h.misses_block(ra, rb, rn, rc[3], reaches[i], limits[i], center, middle, half, focal):
+                continue
+            u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
+            alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
+            seen = f.both(f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False)), alive)
+            if not f.any_of(seen):
+                continue
+            alpha = f.pick(seen, alpha, lane())
+            out_weight = f.times(alpha, transmittance)
+            transmittance = f.times(transmittance, one - alpha)
+            stop = f.pick_words(seen, word(integer(k + 1)), stop)
+            # Pixels without a hit insert the weight 0, which displaces nothing and adds nothing.
+            displaced = word()
+            out_id = word(integer(i))
+            out_depth = depth
+            out_red = lane(rc[0])
+            out_green = lane(rc[1])
+            out_blue = lane(rc[2])
+            for j in range(wp.static(max_hits)):
+                w_ = s.lane_at(buffer_weights, j)
+                displaced = f.either(displaced, f.below(w_, out_weight))
+                i_ = s.word_at(buffer_ids, j)
+                d_ = s.lane_at(buffer_depths, j)
+                r_ = s.lane_at(buffer_red, j)
+                g_ = s.lane_at(buffer_green, j)
+                b_ = s.lane_at(buffer_blue, j)
+                buffer_weights = s.with_lane(buffer_weights, j, f.pick(displaced, out_weight, w_))
+                buffer_ids = s.with_word(buffer_ids, j, f.pick_words(displaced, out_id, i_))
+                buffer_depths = s.with_lane(buffer_depths, j, f.pick(displaced, out_depth, d_))
+                buffer_red = s.with_lane(buffer_red, j, f.pick(displaced, out_red, r_))
+                buffer_green = s.with_lane(buffer_green, j, f.pick(displaced, out_green, g_))
+                buffer_blue = s.with_lane(buffer_blue, j, f.pick(displaced, out_blue, b_))
+                out_weight = f.pick(displaced, w_, out_weight)
+                out_id = f.pick_words(displaced, i_, out_id)
+                out_depth = f.pick(displaced, d_, out_depth)
+                out_red = f.pick(displaced, r_, out_red)
+                out_green = f.pick(displaced, g_, out_green)
+                out_blue = f.pick(displaced, b_, out_blue)
+            red += f.times(out_red, out_weight)
+            green += f.times(out_green, out_weight)
+            blue += f.times(out_blue, out_weight)
+            alive = f.both(alive, f.above(transmittance, lane(TRANSMITTANCE_MIN), True))
+            if not f.any_of(alive):
+                break
+        write(
+            xy,
+            size,
+            red,
+            green,
+            blue,
+            transmittance,
+            stop,
+            buffer_red,
+            buffer_green,
+            buffer_blue,
+            buffer_weights,
+            buffer_ids,
+            buffer_depths,
+            plain,
+            base,
+            ids,
+            depths,
+            weights,
+            alphas,
+            stops,
+        )
+
+    return collect_rows
+
+
+@functools.cache
+def collect_rows_backward_kernel(
+    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False
+) -> wp.Kernel:
+    """Make the backward kernel; with `watch` it also adds up weight * error a row of gradients."""
+    t = types(real)
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
+    intrinsics_of = frame_functions(real).intrinsics_of
+    lanes = row_lanes(tile_size)
+    h = hit_functions(real, low_pass, lanes)
+    hit_dot = h.hit_dot
+    f = lane_functions(real, lanes)
+    lane, word, integer, inner = f.lane, f.word, f.integer, f.inner
+    s = slot_functions(real, lanes, max(max_hits, 1))
+    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
+    view = row_functions(real, tile_size)
+    rows_a_tile = view.rows
+    ALPHA_MIN, ONE = t.ALPHA_MIN, t.ONE
+
+    # Apart from the walk for the reasons that `write` is.
+    @wp.func
+    def read(
+        xy: wp.vec2i,
+        size: wp.vec2i,
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+        grad_plain: wp.array(dtype=vec3),
+        grad_base: wp.array(dtype=vec3),
+        grad_depths: wp.array2d(dtype=real),
+        grad_weights: wp.array2d(dtype=real),
+        grad_alphas: wp.array(dtype=real),
+        errors: wp.array(dtype=real),
+    ):
+        stop = word()
+        last = int(0)
+        grad_red = lane()
+        grad_green = lane()
+        grad_blue = lane()
+        base_red = lane()
+        base_green = lane()
+        base_blue = lane()
+        grad_alpha_sum = lane()
+        rest = lane()
+        error = lane()
+        slots = words_by_slot(integer(-1))
+        gw = lanes_by_slot()
+        gd = lanes_by_slot()
+        for l in range(wp.min(lanes, size[0] - xy[0])):
+            p = xy[1] * size[0] + xy[0] + l
+            stop[l] = integer(stops[p])
+            last = wp.max(last, stops[p])
+            gn = grad_plain[p]
+            grad_red[l] = gn[0]
+            grad_green[l] = gn[1]
+            grad_blue[l] = gn[2]
+            gb = grad_base[p]
+            base_red[l] = gb[0]
+            base_green[l] = gb[1]
+            base_blue[l] = gb[2]
+            grad_alpha_sum[l] = grad_alphas[p]
+            total = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + grad_alphas[p] * alphas[p]
+            for j in range(wp.static(max_hits)):
+                slots[j, l] = integer(ids[p, j])
+                gw[j, l] = grad_weights[p, j]
+                gd[j, l] = grad_depths[p, j]
+                total += grad_weights[p, j] * weights[p, j]
+            rest[l] = total
+            if wp.static(watch):
+                error[l] = errors[p]
+        return (
+            stop,
+            last,
+            grad_red,
+            grad_green,
+            grad_blue,
+            base_red,
+            base_green,
+            base_blue,
+            grad_alpha_sum,
+            rest,
+            error,
+            slots,
+            gw,
+            gd,
+        )
+
+    @wp.kernel(
+        enable_backward=False,
+        grid_stride=False,
+        module="unique",
+    )
+    def collect_rows_backward(
+        first: wp.int32,
+        records: wp.array2d(dtype=vec4),
+        centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
+        surfel_ids: wp.array(dtype=wp.int32),
+        tile_offsets: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        size: wp.vec2i,
+        tile_columns: wp.int32,
+        Ks: wp.array(dtype=mat33),
+        near: real,
+        reaches: wp.array(dtype=vec2),
+        rows: wp.array(dtype=wp.int32),
+        plain: wp.array(dtype=vec3),
+        base: wp.array(dtype=vec3),
+        ids: wp.array2d(dtype=wp.int32),
+        weights: wp.array2d(dtype=real),
+        alphas: wp.array(dtype=real),
+        stops: wp.array(dtype=wp.int32),
+        grad_plain: wp.array(dtype=vec3),
+        grad_base: wp.array(dtype=vec3),
+        grad_depths: wp.array2d(dtype=real),
+        grad_weights: wp.array2d(dtype=real),
+        grad_alphas: wp.array(dtype=real),
+        errors: wp.array(dtype=real),
+        # outputs
+        grad_records: wp.array2d(dtype=vec4),
+        grad_centers: wp.array(dtype=vec3),
+        error_sums: wp.array(dtype=real),
+    ):
+        thread = first + wp.tid()
+        xy = view.row_of(thread, tile_columns)
+        if xy[0] >= size[0] or xy[1] >= size[1]:
+            return
+        intrinsics = intrinsics_of(Ks)
+        focal = vec2(intrinsics[0], intrinsics[1])
+        dx, y = view.rays_of(xy, intrinsics)
+        (
+            stop,
+            last,
+            grad_red,
+            grad_green,
+            grad_blue,
+            base_red,
+            base_green,
+            base_blue,
+            grad_alpha_sum,
+            rest,
+            error,
+            slots,
+            gw,
+            gd,
+        ) = read(
+            xy,
+            size,
+            plain,
+            base,
+            ids,
+            weights,
+            alphas,
+            stops,
+            grad_plain,
+            grad_base,
+            grad_depths,
+            grad_weights,
+            grad_alphas,
+            errors,
+        )
+        middle = view.middle_of(xy, y, intrinsics)
+        half = view.half_row(intrinsics)
+        one = lane(ONE)
+        transmittance = lane(ONE)
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // rows_a_tile, tile_offsets, ends, overflow)
+        for k in range(bounds[0], wp.min(bounds[1], last)):
+            i = surfel_at(k, surfel_ids, order, overflow)
+            ra = records[i, 0]
+            rb = records[i, 1]
+            rn = records[i, 2]
+            rc = records[i, 3]
+            center = vec3()
+            if wp.static(low_pass):
+                center = centers[i]
+            if h.misses_block(ra, rb, rn, rc[3], reaches[i], limits[i], center, middle, half, focal):
+                continue
+            u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
+            alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
+            seen = f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False))
+            seen = f.both(seen, f.below_words(word(integer(k)), stop))
+            if not f.any_of(seen):
+                continue
+            alpha = f.pick(seen, alpha, lane())
+            weight = f.times(alpha, transmittance)
+            q = grad_alpha_sum
+            gt = lane()
+            buffered = word()
+            for j in range(wp.static(max_hits)):
+                same = f.equal_words(s.word_at(slots, j), word(integer(i)))
+                q += f.pick(same, s.lane_at(gw, j), lane())
+                gt = f.pick(same, s.lane_at(gd, j), gt)
+                buffered = f.either(buffered, same)
+            red_ = f.pick(buffered, base_red, grad_red)
+            green_ = f.pick(buffered, base_green, grad_green)
+            blue_ = f.pick(buffered, base_blue, grad_blue)
+            q += red_ * rc[0] + green_ * rc[1] + blue_ * rc[2]
+            rest -= f.times(q, weight)
+            grad_alpha = f.times(transmittance, q) - f.over(rest, one - alpha)
+            transmittance = f.times(transmittance, one - alpha)
+            # Lanes without a hit are differentiated along, by 0.
+            g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
+                ra,
+                rb,
+                rn,
+                rc[3],
+                center,
+                dx,
+                y,
+                focal,
+                near,
+                f.pick(seen, grad_alpha, lane()),
+                f.pick(seen, gt, lane()),
+            )
+            row = int(i)
+            if k < rows.shape[0]:
+                row = rows[k]
+            wp.atomic_add(grad_records, row, 0, g0)
+            wp.atomic_add(grad_records, row, 1, g1)
+            wp.atomic_add(grad_records, row, 2, g2)
+            colors = vec4(inner(red_, weight), inner(green_, weight), inner(blue_, weight), gm)
+            wp.atomic_add(grad_records, row, 3, colors)
+            if wp.static(low_pass):
+                wp.atomic_add(grad_centers, row, gc)
+            if wp.static(watch):
+                wp.atomic_add(error_sums, row, inner(weight, error))
+
+    return collect_rows_backward

@@ -1,0 +1,1 @@
+"""C++ snippets that Warp has no function for."""

@@ -1,0 +1,1 @@
+"""The trained scene: its value and its files."""

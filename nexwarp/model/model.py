@@ -1,0 +1,169 @@
+"""The model: a trained scene, and how it is rendered."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import overload
+
+import torch
+from torch import nn
+from typing_extensions import Unpack
+
+from nexwarp.camera import Camera
+from nexwarp.io.json_files import Json
+from nexwarp.model.options import RenderChanges, RenderOptions
+from nexwarp.render import Color, Rendering, render
+from nexwarp.representation.detail_limits import DetailLimits
+from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import NeuralTexture
+
+
+class Model(nn.Module):
+    """A trained scene: what was learned, what is known of the photos, and how to render it.
+
+    Attributes:
+        surfels: the N surfels, float32.
+        texture: the neural texture, float32; None where the scene has none.
+        exposures: gains of the training photos and their lens's falloff; None renders at the mean exposure.
+        detail_limits: of the N surfels; None limits nothing.
+        options: how the model is rendered.
+        meta: what else is known of it, JSON values: `near` [world units], `scene_scale` [world units], `preset`,
+            `iteration`, and of a finished model `smooth_sh`.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+
+    surfels: Surfels
+    texture: NeuralTexture | None
+    exposures: Exposures | None
+    detail_limits: DetailLimits | None
+
+    def __init__(
+        self,
+        surfels: Surfels,
+        texture: NeuralTexture | None,
+        exposures: Exposures | None = None,
+        detail_limits: DetailLimits | None = None,
+        options: RenderOptions | None = None,
+        meta: Mapping[str, Json] | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(surfels, Surfels):
+            raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
+        if options is not None and not isinstance(options, RenderOptions):
+            raise TypeError(f"options: expected a nexwarp.RenderOptions, got {type(options).__name__}")
+        for name, value, kind in (
+            ("texture", texture, NeuralTexture),
+            ("exposures", exposures, Exposures),
+            ("detail_limits", detail_limits, DetailLimits),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"{name}: expected a {kind.__name__} or None, got {type(value).__name__}")
+        if detail_limits is not None and len(detail_limits) != len(surfels):
+            raise ValueError(f"detail_limits: expected limits of {len(surfels)} surfels, got {len(detail_limits)}")
+        self.surfels = surfels
+        self.texture = texture
+        self.exposures = exposures
+        self.detail_limits = detail_limits
+        self.options = RenderOptions() if options is None else options
+        self.meta: dict[str, Json] = dict(meta or {})
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the surfels."""
+        return self.surfels.device
+
+    @overload
+    def render(
+        self,
+        camera: Camera,
+        *,
+        background: Color | None = ...,
+        depth_jitter: float | torch.Tensor = ...,
+        generator: torch.Generator | None = ...,
+        **changes: Unpack[RenderChanges],
+    ) -> Rendering: ...
+
+    @overload
+    def render(
+        self,
+        camera: Sequence[Camera],
+        *,
+        background: Color | None = ...,
+        depth_jitter: float | torch.Tensor = ...,
+        generator: torch.Generator | None = ...,
+        **changes: Unpack[RenderChanges],
+    ) -> list[Rendering]: ...
+
+    def render(
+        self,
+        camera: Camera | Sequence[Camera],
+        *,
+        background: Color | None = None,
+        depth_jitter: float | torch.Tensor = 0.0,
+        generator: torch.Generator | None = None,
+        **changes: Unpack[RenderChanges],
+    ) -> Rendering | list[Rendering]:
+        """Render the scene as `nexwarp render` shows it: with exposures and detail limits. Differentiable.
+
+        Args:
+            camera: one camera, or several of any sizes; moved to the model's device.
+            background: as `nexwarp.render` takes it; None is the options' background.
+            depth_jitter: for training, as `nexwarp.render` takes it.
+            generator: of the jitter's random numbers.
+            changes: fields of `RenderOptions` to change for this rendering, such as `exposure="mean"`.
+
+        Returns:
+            The rendering of the camera, or a list with one rendering for each camera.
+
+        Raises:
+            TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+        """
+        if isinstance(camera, Sequence):
+            return [
+                self.render(each, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
+                for each in camera
+            ]
+        if not isinstance(camera, Camera):
+            raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
+        options = self.options.changed(**changes) if changes else self.options
+        return render(
+            self.surfels,
+            self.texture if options.max_hits else None,
+            camera if camera.device == self.device else camera.to(self.device),
+            options.max_hits,
+            options.background if background is None else background,
+            options.sh_degree,
+            options.low_pass,
+            options.clamp_texture,
+            depth_jitter,
+            generator,
+            exposures=self.exposures if options.exposure == "photos" else None,
+            detail_limits=self.detail_limits if options.detail_limits else None,
+        )
+
+    def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
+        """Return a model of the same surfels alone, without texture, exposures and detail limits.
+
+        Args:
+            changes: fields of `RenderOptions` to change.
+        """
+        return Model(self.surfels, None, options=self.options.changed(**changes), meta=self.meta)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the model; `nexwarp.load` reads it.
+
+        Args:
+            path: a file that ends in `.safetensors`, or a folder, made if need be, which gets a `model.safetensors`.
+
+        Returns:
+            The file.
+
+        Raises:
+            OSError: it cannot be written; what was there is as it was.
+        """
+        from nexwarp.model.model_file import save_model
+
+        return save_model(path, self)

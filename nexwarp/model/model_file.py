@@ -1,0 +1,200 @@
+"""Models on disk: one safetensors file with JSON metadata, written aside, then renamed. See docs/format.md."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from nexwarp.checks import check_finite, check_range, check_tensors
+from nexwarp.errors import FormatError, MissingError
+from nexwarp.io.files import one_line, write_atomically
+from nexwarp.io.json_files import Json, parse_json
+from nexwarp.model.model import Model
+from nexwarp.model.options import RenderOptions
+from nexwarp.representation.detail_limits import NEVER, DetailLimits
+from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import LARGEST_RESOLUTION, NeuralTexture
+
+FORMAT_VERSION = 1
+SUFFIX = ".safetensors"
+MODEL_FILE = "model.safetensors"
+FRAME = "COLMAP world, cameras x right, y down, z forward"
+DTYPES = ("F16", "F32")
+
+LARGEST_LENGTH = 1e15
+ROUNDING = 1 + 1e-6
+# Attributes of DetailLimits by the names of their tensors in the file, which are older.
+DETAIL_LIMITS = {"nearest": "footprints", "farthest": "far_footprints"}
+# Options that files of version 0.1 do not have.
+LATER_OPTIONS = ("exposure", "detail_limits")
+
+
+def save_model(path: str | os.PathLike[str], model: Model) -> Path:
+    """Write a model: surfels, exposures and detail limits in float32, grid and MLP in half precision.
+
+    Args:
+        path: a file that ends in `.safetensors`, or a folder, made if need be, which gets a `model.safetensors`.
+        model: what to write.
+
+    Returns:
+        The file.
+    """
+    from safetensors.torch import save
+
+    tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
+    if model.texture is not None:
+        for name, x in model.texture.state_dict().items():
+            tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
+    if model.detail_limits is not None:
+        tensors |= {stored: getattr(model.detail_limits, name) for name, stored in DETAIL_LIMITS.items()}
+    if model.exposures is not None:
+        tensors |= {f"exposures.{name}": x for name, x in model.exposures.state_dict().items()}
+    tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
+    meta = {
+        **model.meta,
+        **dataclasses.asdict(model.options),
+        "format_version": FORMAT_VERSION,
+        "frame": FRAME,
+        "texture": None if model.texture is None else model.texture.config,
+    }
+    file = Path(path)
+    if file.suffix != SUFFIX or file.is_dir():
+        file = file / MODEL_FILE
+    write_atomically(file, save(tensors, {"nexwarp": json.dumps(meta)}))
+    return file
+
+
+def load(path: str | os.PathLike[str]) -> Model:
+    """Load a trained scene, on the CPU; needs neither the photos nor the training set.
+
+    Args:
+        path: a run folder or a `model.safetensors`.
+
+    Raises:
+        FileNotFoundError: nothing there.
+        ValueError: not a nexwarp model, of another format version, damaged, or tensors that do not fit.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    path = Path(path)
+    if path.is_dir():
+        path = path / MODEL_FILE
+    if not path.is_file():
+        raise MissingError(f"{path}: expected a run folder with a {MODEL_FILE}, or such a file")
+    try:
+        with safe_open(path, "pt") as file:
+            text = (file.metadata() or {}).get("nexwarp")
+            kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in file.keys()}
+            header = _read_header(path, text, kinds)
+            tensors = {name: file.get_tensor(name) for name in kinds}
+    except (SafetensorError, OSError) as error:
+        raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
+    try:
+        return _make_model(header, tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
+        raise _no_model(path, error) from None
+
+
+@dataclass(frozen=True)
+class _Header:
+    """A model file's metadata: how to render, the arguments of `NeuralTexture` or None, and the rest."""
+
+    options: RenderOptions
+    texture: dict[str, Json] | None
+    meta: dict[str, Json]
+
+
+def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
+    """Make the model of a file's tensors; whatever does not fit raises."""
+    surfels = Surfels(_part(tensors, "surfels."))
+    limits = None
+    if any(stored in tensors for stored in DETAIL_LIMITS.values()):
+        for stored in DETAIL_LIMITS.values():
+            if stored in tensors:
+                check_tensors({stored: (tensors[stored], (len(surfels),))}, dtype=torch.float32)
+        # Files of older versions may have one of them alone.
+        nearest = tensors.get(DETAIL_LIMITS["nearest"], surfels.means.new_zeros(len(surfels)))
+        farthest = tensors.get(DETAIL_LIMITS["farthest"], surfels.means.new_full((len(surfels),), NEVER))
+        limits = DetailLimits(nearest.detach(), farthest.detach())
+    parts = _part(tensors, "exposures.")
+    exposures = Exposures(**parts) if parts else None
+    for name, x in tensors.items():
+        check_finite(name, x)
+    texture = None
+    if header.texture is not None:
+        texture = NeuralTexture(**header.texture)  # type: ignore[arg-type]  # the constructor checks the types
+        texture.load_state_dict(_part(tensors, "texture."))
+        check_range("texture.resolutions", float(texture.resolutions.min()), 0.0)
+        check_range("texture.resolutions", float(texture.resolutions.max()), 0.0, LARGEST_RESOLUTION * ROUNDING)
+    return Model(surfels, texture, exposures, limits, header.options, header.meta)
+
+
+def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Tensors whose names begin with a prefix, by the rest of their names, as float32."""
+    return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
+
+
+def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, list[int]]]) -> _Header:
+    """Read the metadata, and check it against dtypes and shapes before anything is allocated."""
+    if text is None:
+        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
+    try:
+        meta = parse_json(f"{path}: nexwarp metadata", text.encode("utf-8", "surrogatepass"))
+    except ValueError:
+        meta = None
+    if not isinstance(meta, dict):
+        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {text[:40]!r}")
+    if meta.get("format_version") != FORMAT_VERSION:
+        raise FormatError(
+            f"{path}: expected format version {FORMAT_VERSION}, got {one_line(meta.get('format_version'))}"
+        )
+    try:
+        options = _read_options(meta)
+        texture = meta.pop("texture")
+        if not isinstance(texture, (dict, type(None))):
+            raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
+        expected = {}
+        if texture is not None:
+            with torch.device("meta"):  # shapes without memory, whatever sizes the metadata names
+                state = NeuralTexture(**texture).state_dict()
+            expected = {f"texture.{name}": list(x.shape) for name, x in state.items()}
+        for name, (dtype, shape) in kinds.items():
+            if dtype not in DTYPES:
+                raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
+            if name.startswith("texture.") and expected.get(name) != shape:
+                raise ValueError(f"{name}: expected shape {expected.get(name)}, got {shape}")
+        missing = sorted(expected.keys() - kinds.keys())
+        if missing:
+            raise ValueError(f"expected the tensor {missing[0]}, found none")
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise _no_model(path, error) from None
+    return _Header(options, texture, meta)
+
+
+def _no_model(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: the tensors do not make a model ({one_line(error)})")
+
+
+def _read_options(meta: dict[str, Json]) -> RenderOptions:
+    """Take the options out of the metadata; raise ValueError or TypeError where a value is not as expected."""
+    names = [field.name for field in dataclasses.fields(RenderOptions)]
+    missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
+    if missing:
+        raise ValueError(f"no {missing[0]} in the metadata")
+    values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
+    if isinstance(color := values["background"], list):
+        values["background"] = tuple(color)
+    for name in ("near", "scene_scale", "smooth_sh"):
+        if name in meta:
+            value = meta[name]
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{name}: expected a number, got {value!r:.60}")
+            check_range(name, value, 0.0, LARGEST_LENGTH)
+    return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types

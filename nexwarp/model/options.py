@@ -1,0 +1,79 @@
+"""How a model is rendered."""
+
+import dataclasses
+import numbers
+from dataclasses import dataclass
+from typing import Literal, TypedDict, get_args
+
+from typing_extensions import Unpack
+
+from nexwarp.checks import check_range
+from nexwarp.kernels.types import MAX_HITS
+
+Exposure = Literal["photos", "mean"]
+LARGEST_COLOR = 1e6
+
+
+class RenderChanges(TypedDict, total=False):
+    """Fields of `RenderOptions`, but for the background, to change for one rendering."""
+
+    max_hits: int
+    sh_degree: int
+    low_pass: bool
+    clamp_texture: bool
+    exposure: Exposure
+    detail_limits: bool
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a model is rendered; a model keeps the options that it was trained with.
+
+    Attributes:
+        max_hits: K, how many hits a pixel textures, 0 to 8.
+        background: sRGB colour behind everything, seen through what is left of the transmittance.
+        sh_degree: 0 to 3, limits the degree of both appearances.
+        low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
+        clamp_texture: limit textured colours to >= 0; not for residual textures.
+        exposure: "photos" renders with the gains and the lens's falloff that the training photos around the camera
+            predict; "mean" renders all cameras with the photos' mean exposure.
+        detail_limits: limit the texture's detail, and blur surfels, outside the range of distances that the training
+            views had.
+
+    Raises:
+        TypeError, ValueError: naming the field.
+    """
+
+    max_hits: int = 2
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sh_degree: int = 3
+    low_pass: bool = False
+    clamp_texture: bool = False
+    exposure: Exposure = "photos"
+    detail_limits: bool = True
+
+    def __post_init__(self) -> None:
+        for name, high in (("max_hits", MAX_HITS), ("sh_degree", 3)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise TypeError(f"{name}: expected an int, got {value!r:.60}")
+            check_range(name, value, 0, high)
+        for name in ("low_pass", "clamp_texture", "detail_limits"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name}: expected True or False, got {getattr(self, name)!r:.60}")
+        if self.exposure not in get_args(Exposure):
+            raise ValueError(f"exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r:.60}")
+        if not isinstance(self.background, tuple) or len(self.background) != 3:
+            raise ValueError(f"background: expected three numbers, got {self.background!r:.60}")
+        for value in self.background:
+            if isinstance(value, bool) or not isinstance(value, numbers.Real):
+                raise TypeError(f"background: expected three numbers, got {self.background!r:.60}")
+            check_range("background", float(value), -LARGEST_COLOR, LARGEST_COLOR)
+
+    def changed(self, **changes: Unpack["RenderChanges"]) -> "RenderOptions":
+        """Return these options with other values; TypeError and ValueError name the field."""
+        known = [field.name for field in dataclasses.fields(self)]
+        for name in changes:
+            if name not in known:
+                raise TypeError(f"{name}: expected one of the options {', '.join(known)}")
+        return dataclasses.replace(self, **changes)

@@ -1,0 +1,139 @@
+"""Surfels as Gaussians for renderers that project each Gaussian as if perspective were linear across it.
+
+That holds as long as a Gaussian is small beside its distance. A large surfel becomes a grid of smaller, overlapping
+Gaussians in its plane whose blended alpha is the surfel's.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+
+from nexwarp.camera import Camera
+
+SPACING = 1.4
+
+"""Between neighbouring pieces, in their standard deviations: the ripple that it leaves is below 2 %."""
+
+MOST_STEPS = 16
+
+"""Pieces on either side of a surfel's centre, at most, along one axis."""
+
+LEVELS = 128
+
+"""Opacities that grids are fitted for; others take the nearest one's, times a factor."""
+
+LARGEST_ALPHA, LEAST_ALPHA = 0.99, 1.0 / 255.0  # of a surfel's hit
+
+FITTING_STEPS = 40
+WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Gaussians that M surfels, or pieces of surfels, become.
+
+    Attributes:
+        ids: (M,) int64 which surfel.
+        offsets: (M, 2) of the centre along the surfel's two axes, world units.
+        scales: (M, 2) standard deviations along them, world units.
+        opacities: (M,).
+        whole: how many come first that are surfels as they are.
+    """
+
+    ids: torch.Tensor
+    offsets: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    whole: int
+
+
+@torch.no_grad()
+def split_large(
+    means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, cameras: Sequence[Camera], max_extent: float
+) -> Pieces:
+    """Split surfels, taken with gamma = 1, that are large beside their distance from the nearest camera.
+
+    Args:
+        means: (N, 3) world.
+        scales: (N, 2) standard deviations, world units.
+        opacities: (N,) in [0, 1].
+        cameras: those to look right from; without any nothing is split.
+        max_extent: the standard deviation to allow, as a share of the distance; > 0, infinite for no splitting.
+
+    Returns:
+        The surfels that are small enough as they are, in order, then the pieces of the others.
+    """
+    limit = means.new_full((len(means),), math.inf)
+    for camera in cameras:
+        position = camera.position.to(means)
+        limit = torch.minimum(limit, max_extent * (means - position).norm(dim=1))
+    peak = opacities.clamp(max=LARGEST_ALPHA)
+    level = (peak * LEVELS).round().clamp(1, LEVELS - 1)
+    reach = _reach(level / LEVELS)
+    steps = (reach[:, None] * scales / (SPACING * limit[:, None])).ceil().clamp(0, MOST_STEPS)
+    steps = torch.where(scales > limit[:, None], steps.clamp(min=1), torch.zeros_like(steps)).long()
+    whole = (steps == 0).all(dim=1) | (peak < LEAST_ALPHA)
+    ids = [whole.nonzero()[:, 0]]
+    offsets, sizes, alphas = [means.new_zeros(len(ids[0]), 2)], [scales[whole]], [opacities[whole]]
+    large = (~whole).nonzero()[:, 0]
+    kinds, kind = torch.unique(torch.cat([steps[large], level[large, None].long()], dim=1), dim=0, return_inverse=True)
+    for index, (across, along, grade) in enumerate(kinds.tolist()):
+        members = large[kind == index]
+        grid, size, alpha = (x.to(means) for x in _grid(across, along, grade))
+        ids.append(members.repeat_interleave(len(grid)))
+        offsets.append((scales[members, None] * grid).flatten(0, 1))
+        sizes.append((scales[members, None] * size).expand(-1, len(grid), 2).flatten(0, 1))
+        alphas.append((peak[members, None] * LEVELS / grade * alpha).clamp(max=LARGEST_ALPHA).flatten())
+    return Pieces(torch.cat(ids), torch.cat(offsets), torch.cat(sizes), torch.cat(alphas), len(ids[0]))
+
+
+def _reach(peak: torch.Tensor) -> torch.Tensor:
+    """How far from the centre, in standard deviations, a hit's alpha is at least 1/255."""
+    return (2 * (peak / LEAST_ALPHA).log().clamp(min=0)).sqrt()
+
+
+@lru_cache(4096)
+def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Centres (P, 2), standard deviations (2,), both in those of the surfel, and opacities (P,) of its pieces.
+
+    Optical depths -log(1 - alpha) add up where alphas blend; those of the pieces are scaled, each by the share that
+    is lacking at its centre, until their sum is the surfel's.
+    """
+    peak = torch.tensor(level / LEVELS, dtype=torch.float64)
+    reach = float(_reach(peak))
+    spacing = [reach / n if n else 0.0 for n in (across, along)]
+    steps = [torch.arange(-n, n + 1, dtype=torch.float64) for n in (across, along)]
+    grid = torch.cartesian_prod(*steps) * torch.tensor(spacing, dtype=torch.float64)
+    grid = grid[_falloff(grid) * peak >= LEAST_ALPHA / 2]
+    side = torch.linspace(-reach, reach, 41, dtype=torch.float64)
+    places = torch.cartesian_prod(side, side)
+    wanted = peak * _falloff(places)
+    best = math.inf
+    # Across a row of pieces, opaque ones blend to a profile that is wider than theirs.
+    for narrower in WIDTHS if 0.0 in spacing else (1.0,):
+        tried = torch.tensor([step / SPACING if step else narrower for step in spacing], dtype=torch.float64)
+        fitted = _fitted(grid, tried, peak)
+        falloff = _falloff((places[:, None] - grid) / tried)
+        error = float((1 - (1 - fitted * falloff).prod(1) - wanted).square().mean())
+        if error < best:
+            best, size, alpha = error, tried, fitted
+    kept = alpha >= LEAST_ALPHA
+    return grid[kept], size, alpha[kept]
+
+
+def _falloff(apart: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-0.5 * apart.square().sum(-1))
+
+
+def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
+    """Opacities (P,) with which pieces of one size add up to the surfel's optical depth at each one's centre."""
+    wanted = -torch.log1p(-peak * _falloff(grid))
+    falloff = _falloff((grid[:, None] - grid) / size)
+    depths = wanted / falloff.sum(1)
+    for _ in range(FITTING_STEPS):
+        total = -torch.log1p(torch.expm1(-depths) * falloff).sum(1)
+        depths = depths * (wanted / total).clamp(0.25, 4.0)
+    return -torch.expm1(-depths)

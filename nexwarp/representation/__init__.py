@@ -1,0 +1,1 @@
+"""What is learned: surfels, texture, exposures."""

@@ -1,0 +1,207 @@
+"""The neural texture: one field shared by all surfels, a hash grid and a small MLP (paper Sec. 3.1)."""
+
+import itertools
+
+import torch
+from torch import nn
+
+from nexwarp import ops
+from nexwarp.checks import check_range, check_tensors
+
+GRID_INIT = 0.01
+
+# Cells are indexed by int32: finer grids wrap around at once.
+LARGEST_RESOLUTION = 1e9
+
+# A focal length in pixels at which every cell is larger than a pixel.
+NO_FOOTPRINT = 1e12
+
+
+class NeuralTexture(nn.Module):
+    """World-space field F(x) = G(Delta H(x)) that gives spherical harmonics coefficients (paper Eq. 1 and 2).
+
+    Parameters: `grid` (levels, table_size, features), float32, in table order; `mlp`, a torch module without biases
+    whose `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, geometric.
+
+    On CUDA the lookup and the MLP run in half precision on a copy made for each call, with float32 parameters and
+    gradient sums; set `half_precision` to False to keep float32.
+    """
+
+    resolutions: torch.Tensor
+
+    def __init__(
+        self,
+        levels: int = 16,
+        table_size: int = 2**20,
+        features: int = 2,
+        min_resolution: float = 16.0,
+        max_resolution: float = 256.0,
+        width: int = 64,
+        hidden_layers: int = 2,
+        sh_degree: int = 3,
+        residual: bool = False,
+        down_weighting: bool = True,
+    ) -> None:
+        """Make a fresh field.
+
+        Args:
+            levels: L, resolution levels.
+            table_size: T, entries a level, a power of two.
+            features: F, features an entry: 1, 2, 4 or 8.
+            min_resolution: of the coarsest level, cells per world unit.
+            max_resolution: of the finest level.
+            width: of the hidden layers.
+            hidden_layers: number of hidden layers.
+            sh_degree: of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
+            residual: colours are added to the surfels' plain ones instead of replacing them, so that a field of 0, as
+                it is where no photo looked, leaves those.
+            down_weighting: fade levels whose cells are smaller than a pixel (Delta of paper Eq. 2).
+
+        Raises:
+            ValueError: naming the argument that is out of its range.
+        """
+        super().__init__()
+        _check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
+        _check_resolutions(min_resolution, max_resolution)
+        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected True or False, got {flag!r}")
+        self.config = {
+            "levels": levels,
+            "table_size": table_size,
+            "features": features,
+            "min_resolution": float(min_resolution),
+            "max_resolution": float(max_resolution),
+            "width": width,
+            "hidden_layers": hidden_layers,
+            "sh_degree": sh_degree,
+            "residual": residual,
+            "down_weighting": down_weighting,
+        }
+        self.sh_degree = sh_degree
+        self.residual, self.down_weighting = residual, down_weighting
+        self.half_precision = True
+        self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
+        ends = torch.tensor([min_resolution, max_resolution], dtype=torch.float64).log()
+        steps = torch.linspace(0.0, 1.0, levels, dtype=torch.float64)
+        resolutions = (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
+        self.register_buffer("resolutions", resolutions)
+        sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in itertools.pairwise(sizes):
+            # Linear's own initial values are U(+-1/sqrt(fan_in)), as the method wants.
+            layers += [nn.Linear(fan_in, fan_out, bias=False), nn.ReLU()]
+        self.mlp = nn.Sequential(*layers[:-1])
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.grid.device
+
+    def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
+        """Return the field's spherical harmonics coefficients.
+
+        Args:
+            positions: (..., 3) world.
+            depths: (...) z-depths at which the points are seen, world units; 0 marks a point to skip.
+            focal: focal length in pixels, a number or a tensor of one element.
+
+        Returns:
+            (..., (sh_degree + 1)^2, 3) coefficients, differentiable in positions, depths and the parameters.
+        """
+        if not isinstance(depths, torch.Tensor):
+            raise TypeError(f"depths: expected a torch.Tensor, got {type(depths).__name__}")
+        expected = {"depths": (depths, tuple(depths.shape)), "positions": (positions, (*depths.shape, 3))}
+        check_tensors(expected, dtype=self.grid.dtype, device=self.grid.device)
+        out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)
+        return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
+
+    def colors(
+        self,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        directions: torch.Tensor,
+        focal: float | torch.Tensor,
+        *,
+        sh_degree: int = 3,
+        clamp: bool = False,
+    ) -> torch.Tensor:
+        """Return the textured colours 0.5 + SH(direction) of hits; SH(direction) alone when `residual`.
+
+        Args:
+            positions: (..., K, 3) hit points, world.
+            depths: (..., K) their z-depths, 0 in empty slots.
+            directions: (..., 3) unit ray directions, world.
+            focal: focal length in pixels, a number or a tensor of one element.
+            sh_degree: limits the degree that is evaluated.
+            clamp: limit colours to >= 0.
+
+        Returns:
+            (..., K, 3) colours.
+        """
+        degree = min(sh_degree, self.sh_degree)
+        flat = directions.reshape(-1, 3)
+        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp)
+        return colors.view(positions.shape)
+
+    def _evaluate(
+        self,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        focal: float | torch.Tensor,
+        degree: int,
+        directions: torch.Tensor | None = None,
+        clamp: bool = False,
+    ) -> torch.Tensor:
+        *hidden, last = self.mlp.parameters()
+        if not self.down_weighting:
+            focal = NO_FOOTPRINT
+        if isinstance(focal, torch.Tensor):
+            if focal.numel() != 1:
+                raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
+            focal = focal.detach().to(self.grid).reshape(1)
+        elif isinstance(focal, bool) or not isinstance(focal, (int, float)):
+            raise TypeError(f"focal: expected a number or a tensor, got {type(focal).__name__}")
+        else:
+            focal = self.grid.new_full((1,), float(focal))
+        return ops.texture(
+            positions,
+            depths,
+            self.grid,
+            [*hidden, last[: 3 * (degree + 1) ** 2]],
+            self.resolutions.to(self.grid.dtype),
+            focal,
+            directions=directions,
+            offset=0.0 if self.residual else 0.5,
+            clamp=clamp,
+            half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
+        )
+
+
+def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
+    """Raise TypeError or ValueError unless each size of a field is an int in its range."""
+    for name, value, low, high in (
+        ("levels", levels, 1, 64),
+        ("table_size", table_size, 1, 2**30),
+        ("width", width, 1, 4096),
+        ("hidden_layers", hidden_layers, 0, 64),
+        ("sh_degree", sh_degree, 0, 3),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, low, high)
+    if table_size & (table_size - 1):
+        raise ValueError(f"table_size: expected a power of two, got {table_size}")
+    if isinstance(features, bool) or not isinstance(features, int):
+        raise TypeError(f"features: expected an int, got {type(features).__name__}")
+    if features not in (1, 2, 4, 8):
+        raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
+
+
+def _check_resolutions(min_resolution: float, max_resolution: float) -> None:
+    """Raise TypeError or ValueError unless the resolutions are numbers in their ranges."""
+    for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+    check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)

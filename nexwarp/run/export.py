@@ -1,0 +1,57 @@
+"""A run's files for other programs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nexwarp.camera import resized
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
+from nexwarp.errors import RunError, SettingError
+from nexwarp.model.model_file import load
+from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
+from nexwarp.run.folder import CAMERAS_FILE, read_run
+
+FORMATS = ("ply", "cameras")
+
+
+def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
+    """Write a run's files for other programs into a folder (see docs/outputs.md) and return them.
+
+    Args:
+        run: run folder.
+        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
+        folder: made if need be.
+        max_extent: of the Gaussians in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+
+    Raises:
+        ValueError, OSError: naming what is not as expected.
+    """
+    if not max_extent > 0:
+        raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
+    if kind not in FORMATS:
+        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+    source, _, _ = read_run(run)
+    if kind == "ply":
+        model = load(run)
+        files = [folder / "surfels.ply", folder / "splats.ply"]
+        save_surfels_ply(files[0], model.surfels)
+        # A training that was broken off leaves a model without cameras.
+        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
+        every = [camera for members in groups for camera in members.values()]
+        degree = model.options.sh_degree
+        save_splats_ply(files[1], model.surfels, degree, cameras=every, max_extent=max_extent)
+        return files
+    sets = load_cameras(run / CAMERAS_FILE)
+    # Named as from the scene's folder: a transforms.json lies there.
+    named = {
+        group: {f"{source.images}/{name}": camera for name, camera in members.items()}
+        for group, members in sets.items()
+    }
+    cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
+    if not cameras:
+        raise RunError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
+    files = [folder / "transforms.json", folder / "camera_path.json"]
+    save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
+    first = next(iter(cameras.values()))
+    save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
+    return files

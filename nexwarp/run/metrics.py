@@ -1,0 +1,133 @@
+"""Image metrics as this field reports them: from 8-bit images, to compare with published numbers."""
+
+import warnings
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from nexwarp.io.pictures import to_uint8
+
+PIXELS_PER_DEGREE = 67.02064514160156  # what FLIP's authors assume: 0.7 m from a display of 0.7 m and 3840 pixels
+CONVENTION = (
+    "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
+    "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
+    "C2 = 0.03^2, mean over all pixels and channels. PSNR and SSIM only over the pixels that count, where there is a "
+    "mask. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the "
+    "map. A set's figure is the mean over its images."
+)
+
+
+def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two (H, W, 3) images, uint8 or float in [0, 1]; inf if equal.
+
+    Args:
+        image: what is judged.
+        target: what it should be.
+        mask: (H, W) bool, True where pixels count; None is everywhere.
+    """
+    image, target = _unit_images(image, target)
+    error = _counting((image.double() - target.double()).square(), mask).mean()
+    return (-10.0 * torch.log10(error)).item()
+
+
+def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1]; `mask` as in `psnr`.
+
+    Windows of pixels that count reach into those that do not, where the image is taken to be the target.
+    """
+    if mask is not None:
+        image, target = _unit_images(image, target)
+        image = torch.where(_check_mask(mask, image)[..., None], image, target)
+    return _counting(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
+
+
+def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """(H, W, 3) float32 map whose mean is `ssim`."""
+    x, y = (picture.permute(2, 0, 1) for picture in _unit_images(image, target))
+    mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2.0 * mx * my + c1) / (mx * mx + my * my + c1)
+    structure = (2.0 * (xy - mx * my) + c2) / ((xx - mx * mx) + (yy - my * my) + c2)
+    return (luminance * structure).permute(1, 2, 0)
+
+
+def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
+    """LPIPS (VGG, v0.1) of two (H, W, 3) images, or None, with one warning, when it is not available.
+
+    It needs the `lpips` package (`pip install nexwarp[lpips]`), which fetches the VGG weights on first use.
+    """
+    x, y = _unit_images(image, target)
+    network = _lpips_network(x.device)
+    if network is None:
+        return None
+    with torch.no_grad():
+        return network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False).item()
+
+
+def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
+    """Mean LDR-FLIP error, 0 to 1, of two (H, W, 3) sRGB images at 67 pixels per degree, or None where not available.
+
+    It needs the `flip-evaluator` package (`pip install nexwarp[flip]`).
+    """
+    test, reference = _unit_images(image, target)
+    try:
+        from flip_evaluator import evaluate
+    except ImportError as missing:
+        warnings.warn(f"FLIP is left out: {missing} (pip install nexwarp[flip])", RuntimeWarning, stacklevel=2)
+        return None
+    pair = (x.cpu().contiguous().numpy() for x in (reference, test))
+    _, error, _ = evaluate(*pair, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})
+    return float(error)
+
+
+@lru_cache(maxsize=2)
+def _lpips_network(device: torch.device) -> Any:
+    try:
+        import lpips
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
+            return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+    except (ImportError, OSError, RuntimeError) as error:
+        warnings.warn(f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3)
+        return None
+
+
+def _unit_images(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Check two images and return them as float32 multiples of 1/255."""
+    for name, tensor in (("image", image), ("target", target)):
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
+        if tensor.ndim != 3 or tensor.shape[-1] != 3:
+            raise ValueError(f"{name}: expected shape (H, W, 3), got {tuple(tensor.shape)}")
+    if target.shape != image.shape:
+        raise ValueError(f"target: expected shape {tuple(image.shape)}, got {tuple(target.shape)}")
+    if target.device != image.device:
+        raise ValueError(f"target: expected a tensor on {image.device}, got one on {target.device}")
+    return to_uint8(image).float() / 255.0, to_uint8(target).float() / 255.0
+
+
+def _check_mask(mask: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    if mask.dtype != torch.bool or mask.shape != image.shape[:2]:
+        expected = f"bool of shape {tuple(image.shape[:2])}"
+        raise ValueError(f"mask: expected {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
+    if not bool(mask.any()):
+        raise ValueError("mask: expected pixels that count, got none")
+    return mask.to(image.device)
+
+
+def _counting(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """The values (H, W, C) of the pixels that count."""
+    return values if mask is None else values[_check_mask(mask, values)]
+
+
+def _blur(planes: torch.Tensor) -> torch.Tensor:
+    """Blur (C, H, W) planes with an 11 x 11 Gaussian of sigma 1.5, zeros outside."""
+    offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
+    window = torch.exp(-(offset**2) / (2.0 * 1.5**2))
+    count = len(planes)
+    row = (window / window.sum()).to(planes).expand(count, 1, 1, 11)
+    planes = F.conv2d(planes[None], row, padding=(0, 5), groups=count)
+    return F.conv2d(planes, row.transpose(2, 3), padding=(5, 0), groups=count)[0]

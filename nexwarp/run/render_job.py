@@ -1,0 +1,216 @@
+"""What a finished run gives: still views, camera paths, videos, passes, files for other programs."""
+
+import math
+import re
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import torch
+
+from nexwarp.buffers import render_buffers, save_buffers
+from nexwarp.camera import Camera, resized
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path
+from nexwarp.cameras.paths import ellipse, interpolate, spiral
+from nexwarp.errors import RunError, SettingError
+from nexwarp.io.pictures import save_png, to_uint8
+from nexwarp.io.video import check_video, video_writer
+from nexwarp.model.model import Model
+from nexwarp.model.options import Exposure
+from nexwarp.run.folder import CAMERAS_FILE, read_run
+
+FRAMES, FPS = 120, 30.0
+
+PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
+
+SETS = {"test": ("test",), "train": ("train",), "all": ("train", "test"), None: ()}
+
+
+LARGEST_SIDE = 16384
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture to render: its PNG file, its camera, whether it is a frame of the path, whether its passes go too."""
+
+    file: Path
+    camera: Camera
+    is_frame: bool
+    buffers: bool
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Pictures to render, in order, the video that their frames make, and the exposure of all (see `RenderOrder`)."""
+
+    pictures: list[Picture]
+    video: Path | None
+    fps: float
+    exposure: Exposure = "photos"
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the path."""
+        return sum(picture.is_frame for picture in self.pictures) / self.fps
+
+    @torch.no_grad()
+    def render(self, model: Model, done: Callable[[], Any] = lambda: None) -> None:
+        """Render and write everything; `done` is called after each picture. A broken-off video leaves nothing."""
+        frames = [picture for picture in self.pictures if picture.is_frame]
+        with ExitStack() as stack:
+            append = None
+            if self.video is not None:  # before the work: where it cannot be written, nothing is
+                size = (frames[0].camera.width, frames[0].camera.height)
+                append = stack.enter_context(video_writer(self.video, *size, self.fps))
+            for picture in self.pictures:
+                camera = picture.camera
+                if picture.buffers:
+                    buffers = render_buffers(model, camera, exposure=self.exposure)
+                    save_buffers(picture.file.with_suffix(".exr"), buffers)
+                    image = buffers.image
+                else:
+                    image = model.render(camera, exposure=self.exposure).image
+                pixels = to_uint8(image).cpu()
+                save_png(picture.file, pixels)
+                if append is not None and picture.is_frame:
+                    append(pixels)
+                done()
+        if frames:
+            _remove_frames(frames[0].file.parent, len(frames))
+
+
+@dataclass(frozen=True)
+class RenderOrder:
+    """What `nexwarp render` is asked for, in the terms of its options.
+
+    Attributes:
+        path: "ellipse", "interpolate", "spiral" or a JSON file; None for no path.
+        video: file to write the path's frames to.
+        frames: of the path; None for 120, or as many as the file has.
+        fps: of the video; None for 30, or what the file says.
+        views: "test", "train", "all", or None for no still views.
+        buffers: also write passes: of the still views or, where there are none, of the frames.
+        size: "WIDTHxHEIGHT", or None for that of the cameras.
+        scale: factor on the size of the cameras.
+        exposure: "photos", that of the photos around each camera, or "mean", one for all.
+
+    Raises:
+        ValueError: naming the option that is not as expected, in `prepare` too.
+    """
+
+    path: str | None
+    video: Path | None = None
+    frames: int | None = None
+    fps: float | None = None
+    views: str | None = None
+    buffers: bool = False
+    size: str | None = None
+    scale: float = 1.0
+    exposure: str = "photos"
+
+    def __post_init__(self) -> None:
+        if self.views not in SETS:
+            raise SettingError(f"--set: expected test, train or all, got {self.views!r}")
+        if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
+            raise SettingError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
+        if self.frames is not None and self.frames < 0:
+            raise SettingError(f"--frames: expected at least 0, got {self.frames}")
+        if self.frames == 0 and (self.video is not None or self.views is None):
+            raise SettingError("--frames: expected at least 1 for a path or a video, got 0")
+        if self.path is None and self.frames:
+            raise SettingError("--frames: expected with --path or --video, got it with --set alone")
+        if self.fps is not None and self.video is None:
+            raise SettingError("--fps: expected with --video, got it without")
+        if self.exposure not in get_args(Exposure):
+            raise SettingError(f"--exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r}")
+        self._size()
+        if self.video is not None:
+            _check_video(self.video, FPS if self.fps is None else self.fps)
+
+    def prepare(self, run: Path) -> RenderJob:
+        """Choose the cameras; writes nothing.
+
+        Raises:
+            ValueError, FileNotFoundError: naming the option or file that is not as expected.
+        """
+        size = self._size()
+        read_run(run)
+        cameras = load_cameras(run / CAMERAS_FILE)
+        renders, pictures = run / "renders", []
+        for group in SETS[self.views]:
+            for name, camera in cameras.get(group, {}).items():
+                file = renders / group / f"{Path(name).with_suffix('')}.png"
+                pictures.append(Picture(file, size(camera), False, self.buffers))
+        fps = FPS
+        if self.path is not None and self.frames != 0:
+            folder, path, fps = self._path(cameras, renders)
+            first = size(path[0])
+            for i, camera in enumerate(path):
+                camera = resized(size(camera), first.width, first.height)
+                pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+        if not pictures:
+            raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
+        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure, self.exposure))
+
+    def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
+        """Folder of the frames, cameras, frames a second."""
+        assert self.path is not None
+        near = next((c.near for group in cameras.values() for c in group.values()), 0.01)
+        if self.path not in PATHS:
+            file = Path(self.path)
+            if self.frames is not None:
+                raise SettingError(f"--frames: expected none with {file}, which says it itself, got {self.frames}")
+            path = load_camera_path(file, near)
+            return renders / f"path_{file.stem}", path.cameras, path.fps or FPS
+        count = FRAMES if self.frames is None else self.frames
+        known = cameras.get("train", {})
+        if self.path == "interpolate":
+            known = dict(sorted((known | cameras.get("test", {})).items()))
+        try:
+            return renders / self.path, PATHS[self.path](list(known.values()), count), FPS
+        except ValueError as error:
+            hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
+            raise SettingError(f"--path {self.path}: {error}{hint}") from None
+
+    def _size(self) -> Callable[[Camera], Camera]:
+        """Function that gives a camera the size asked for."""
+        if not 0 < self.scale < math.inf:
+            raise SettingError(f"--scale: expected a number above 0, got {self.scale:g}")
+        if self.size is None:
+            return self._scaled
+        if self.scale != 1.0:
+            raise SettingError("--size, --scale: expected at most one of them, got both")
+        match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
+        sides = tuple(int(side) for side in match.groups()) if match else ()
+        if not sides or not all(1 <= side <= LARGEST_SIDE for side in sides):
+            raise SettingError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
+        return lambda camera: resized(camera, sides[0], sides[1])
+
+    def _scaled(self, camera: Camera) -> Camera:
+        sides = [max(round(side * self.scale), 1) for side in (camera.width, camera.height)]
+        if max(sides) > LARGEST_SIDE:
+            raise SettingError(
+                f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {sides[0]}x{sides[1]} with {self.scale:g}"
+            )
+        return resized(camera, *sides)
+
+
+def _check_video(path: Path, fps: float) -> None:
+    try:
+        check_video(path, fps)
+    except ValueError as error:
+        option = "--fps" if str(error).startswith("fps: ") else "--video"
+        raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
+
+
+def _remove_frames(folder: Path, count: int) -> None:
+    """Remove what a longer path left in its folder: frames numbered `count` and up."""
+    for file in folder.iterdir():
+        if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= count:
+            file.unlink()

@@ -1,0 +1,1 @@
+"""The training loop of paper Sec. 4.3."""

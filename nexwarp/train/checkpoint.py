@@ -1,0 +1,111 @@
+"""Checkpoints on disk: safetensors and JSON; every file is written aside, then renamed."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nexwarp.errors import CheckpointError, MissingError
+from nexwarp.io.files import sync, write_atomically
+from nexwarp.io.json_files import READ_ERRORS, read_json
+
+CHECKPOINT_VERSION = 1
+
+# Newest first. The last one is there only while others are renamed.
+CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
+
+
+def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
+    """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all.
+
+    The one before stays, as `run/checkpoint.old`. A kill or a power cut at any moment leaves at least one whole.
+
+    Raises:
+        OSError: it cannot be written; what was there is as it was.
+    """
+    from safetensors.torch import save
+
+    newest, old, older = (run / name for name in CHECKPOINTS)
+    aside = run / "checkpoint.tmp"
+    shutil.rmtree(aside, ignore_errors=True)
+    try:
+        aside.mkdir()
+        content = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()})
+        write_atomically(aside / "tensors.safetensors", content)
+        record = {**state, "format_version": CHECKPOINT_VERSION, "tensors_sha256": hashlib.sha256(content).hexdigest()}
+        write_atomically(aside / "state.json", json.dumps({**record, "sha256": _digest(record)}).encode())
+        if newest.exists():  # else a kill came between the renames, and the others are all there is
+            if old.exists():
+                shutil.rmtree(older, ignore_errors=True)
+                old.rename(older)
+            newest.rename(old)
+        aside.rename(newest)
+        sync(run)
+    except BaseException:  # whatever comes next may need the room
+        shutil.rmtree(aside, ignore_errors=True)
+        raise
+    shutil.rmtree(older, ignore_errors=True)
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether there is a checkpoint, whole or not."""
+    return any((run / name).is_dir() for name in CHECKPOINTS)
+
+
+def load_checkpoint(
+    run: Path, warn: Callable[[str], None] = lambda _: None
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read the newest whole one of what `save_checkpoint` wrote, on the CPU.
+
+    Args:
+        run: run folder.
+        warn: is told of a damaged one that is passed over.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: all there are are damaged, or of another version.
+    """
+    damaged: list[CheckpointError] = []
+    for folder in (run / name for name in CHECKPOINTS):
+        if not folder.is_dir():
+            continue
+        try:
+            tensors, state = _read_checkpoint(folder)
+        except CheckpointError as error:
+            damaged.append(error)
+            continue
+        for error in damaged:
+            warn(f"{error}; going back to the one before it, {folder.name}")
+        return tensors, state
+    if damaged:
+        raise damaged[0]
+    raise MissingError(f"{run}: expected a checkpoint to resume from, found none")
+
+
+def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        record = read_json(folder / "state.json")
+        version = record.get("format_version") if isinstance(record, dict) else None
+        if version != CHECKPOINT_VERSION:
+            raise ValueError(f"expected format version {CHECKPOINT_VERSION}, got {version}")
+        if record.pop("sha256", None) != _digest(record):
+            raise ValueError("state.json: its checksum does not agree")
+        content = (folder / "tensors.safetensors").read_bytes()
+        if hashlib.sha256(content).hexdigest() != record.pop("tensors_sha256"):
+            raise ValueError("tensors.safetensors: its checksum does not agree")
+        del record["format_version"]
+        return load(content), record
+    except (*READ_ERRORS, SafetensorError) as error:  # bad JSON and bad UTF-8 are ValueErrors
+        raise CheckpointError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    """Checksum of what JSON makes of a record, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,163 @@
+"""Adaptive density control (paper Sec. 3.3): split where the blended error is, prune what is transparent."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from nexwarp.checks import check_range
+from nexwarp.representation.surfels import Surfels
+
+PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When and how surfels are split and pruned; iterations are those of a run of 30,000."""
+
+    start: int = 500
+    """Iteration of the first round (exclusive)."""
+    stop: int = 25_000
+    """Iteration of the last round (exclusive)."""
+    every: int = 100
+    """Iterations between rounds."""
+    fraction: float = 0.05
+    """Fraction of the surfels that a round splits, as far as the budget allows."""
+    prune_opacity: float = 0.005
+    """Surfels with less opacity than this are removed."""
+    prune_at_cap: bool = True
+    """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    floaters: bool = True
+    """Remove floaters: surfels that training views, or views between them, show at less than 0.6 times the depth of the
+    nearest points."""
+
+    def __post_init__(self) -> None:
+        check_range("every", self.every, 1)
+        check_range("fraction", self.fraction, 0.0, 1.0)
+        check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
+
+
+class Densifier:
+    """Sums of each surfel's blended error since the last split, and the rounds that use them up."""
+
+    def __init__(self, config: DensifyConfig, surfels: Surfels, max_surfels: int) -> None:
+        """Start with zero sums.
+
+        Args:
+            config: when and how.
+            surfels: that will be densified, in place.
+            max_surfels: the budget; never exceeded.
+        """
+        check_range("max_surfels", max_surfels, 1)
+        self.config = config
+        self.max_surfels = max_surfels
+        self.errors = torch.zeros_like(surfels.logit_opacities.detach())
+
+    def active(self, iteration: int) -> bool:
+        """Whether errors seen in this iteration can still lead to a split."""
+        return iteration < self.config.stop
+
+    def due(self, iteration: int) -> bool:
+        """Whether a round follows this iteration (counted from 1)."""
+        c = self.config
+        return c.start < iteration < c.stop and iteration % c.every == 0
+
+    def accumulate(self, errors: torch.Tensor) -> None:
+        """Add the blended errors (N,) of one view."""
+        self.errors += errors
+
+    def step(self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> tuple[int, int]:
+        """Split, then prune, in place; children start with zero Adam moments.
+
+        Args:
+            surfels: to change.
+            optimizer: holds their parameters; its state follows.
+            generator: for the choice, on the CPU.
+
+        Returns:
+            How many surfels were split and how many pruned.
+        """
+        count = len(surfels)
+        room = min(self.max_surfels, int((1 + self.config.fraction) * count)) - count
+        chosen = self._choose(min(room, count), generator) if room > 0 and count else None
+        split = 0 if chosen is None else len(chosen)
+        if chosen is not None and split:
+            split_surfels(surfels, optimizer, chosen)
+            self.errors = torch.zeros_like(surfels.logit_opacities.detach())
+        pruned = 0
+        if split or self.config.prune_at_cap:
+            opacities = surfels.opacities.detach()
+            pruned = self.remove(surfels, optimizer, opacities < self.config.prune_opacity)
+        return split, pruned
+
+    def remove(self, surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> int:
+        """Remove, in place, the chosen (N,) bool surfels but for the most opaque ones of all; return how many.
+
+        A scene without surfels has no gradient to recover by.
+        """
+        opacities = surfels.opacities.detach()
+        keep = ~chosen | (opacities == opacities.max())
+        removed = int((~keep).sum())
+        if removed:
+            kept = keep.nonzero()[:, 0]
+            replace_rows(surfels, optimizer, kept)
+            self.errors = self.errors[kept]
+        return removed
+
+    def _choose(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Draw surfels without replacement, with probability proportional to their blended error."""
+        errors = torch.nan_to_num(self.errors.double().cpu(), 0.0, 0.0, 0.0).clamp_min(0)
+        candidates = int((errors > 0).sum())
+        if candidates == 0:
+            return torch.empty(0, dtype=torch.long, device=self.errors.device)
+        # Keys u^(1/p) are those of weighted sampling without replacement; -log keeps them exact (Efraimidis, Spirakis).
+        keys = torch.empty_like(errors).exponential_(generator=generator) / errors
+        chosen = keys.topk(min(count, candidates), largest=False).indices.sort().values
+        return chosen.to(self.errors.device)
+
+
+@torch.no_grad()
+def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> None:
+    """Replace each chosen surfel by two halves along its longer axis: scale / 2, centres at +-scale / 2.
+
+    The first child takes the parent's row, the second is appended.
+    """
+    quats, log_scales = surfels.quats[chosen], surfels.log_scales[chosen]
+    axis = log_scales.argmax(dim=1)
+    rows = torch.arange(len(chosen), device=chosen.device)
+    w, x, y, z = quats.unbind(-1)
+    # First two columns of the rotation matrix.
+    x_axis = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
+    y_axis = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
+    offset = torch.where(axis[:, None] == 0, x_axis, y_axis) * (log_scales[rows, axis].exp() / 2)[:, None]
+    halved = log_scales.clone()
+    halved[rows, axis] -= torch.log(torch.tensor(2.0)).item()
+    means = surfels.means[chosen]
+    count = len(surfels)
+    everyone = torch.arange(count, device=chosen.device)
+    replace_rows(surfels, optimizer, torch.cat([everyone, chosen]))
+    surfels.means[chosen], surfels.means[count:] = means - offset, means + offset
+    surfels.log_scales[chosen], surfels.log_scales[count:] = halved, halved
+    for name in PARAMETERS:
+        state = optimizer.state.get(getattr(surfels, name), {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key][chosen] = 0
+                state[key][count:] = 0
+
+
+@torch.no_grad()
+def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor) -> None:
+    """Make the surfels the given rows (M,) of themselves, optimizer state included."""
+    for name in PARAMETERS:
+        old = getattr(surfels, name)
+        new = nn.Parameter(old.detach()[rows].contiguous())
+        setattr(surfels, name, new)
+        for group in optimizer.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        state = optimizer.state.pop(old, None)
+        if state is not None:
+            for key in ("exp_avg", "exp_avg_sq"):
+                if key in state:
+                    state[key] = state[key][rows].contiguous()
+            optimizer.state[new] = state

@@ -1,0 +1,119 @@
+"""What a run starts from: surfels on points of the cloud, and a texture as fine as the photos."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from nexwarp.data import Scene, initial_points
+from nexwarp.kernels.sh import BAND_0
+from nexwarp.representation.surfels import Surfels
+from nexwarp.train.config import Config
+
+INITIAL_OPACITY = 0.1
+INITIAL_RAW_GAMMA = -5.0
+NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
+USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
+TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
+
+
+def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
+    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 3.3)."""
+    points = initial_points(
+        scene.points,
+        scene.colors,
+        max(config.max_surfels // 2, 1),
+        track_lengths=scene.track_lengths,
+        errors=scene.reprojection_errors,
+        filter_outliers=config.filter_points,
+    )
+    count = len(points.means)
+    quats = torch.randn(count, 4, generator=generator)
+    raw = {
+        "means": points.means,
+        "raw_quats": quats_towards(points.normals, quats) if config.orient_points else quats,
+        "log_scales": points.scales.log()[:, None].repeat(1, 2),
+        "logit_opacities": torch.logit(torch.full((count,), INITIAL_OPACITY)),
+        "raw_gammas": torch.full((count, 2), INITIAL_RAW_GAMMA),
+        "sh0": ((points.colors - 0.5) / BAND_0)[:, None],
+        "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
+    }
+    return Surfels(raw)
+
+
+def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
+    """Turn rotations by the least angle so that their z axes lie along normals.
+
+    Args:
+        normals: (N, 3) unit.
+        quats: (N, 4) wxyz, any length but zero.
+
+    Returns:
+        (N, 4) unit, wxyz.
+    """
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+    normals = torch.where((axis * normals).sum(-1, keepdim=True) < 0, -normals, normals)
+    # Half-way quaternion from axis to normal; their angle is at most 90 degrees, so it is never 0.
+    turn = torch.cat([1 + (axis * normals).sum(-1, keepdim=True), torch.linalg.cross(axis, normals)], dim=-1)
+    a, b, c, d = torch.nn.functional.normalize(turn, dim=-1).unbind(-1)
+    return torch.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        dim=-1,
+    )
+
+
+def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
+    """Arguments of `NeuralTexture`, with resolutions that follow the scene when the config leaves them open.
+
+    The finest level's cells are as small as the pixels of nearly all training views at the points they see (95th
+    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing. The table is as
+    large as the photos can fill: with more numbers than pixels, it learns each photo by heart.
+    """
+    shape = dataclasses.asdict(config.texture)
+    if shape["sh_degree"] is None:
+        shape["sh_degree"] = config.sh_degree
+    if shape["table_size"] is None:
+        shape["table_size"] = _table_size(scene, shape["levels"] * shape["features"])
+    if shape["max_resolution"] is None:
+        shape["max_resolution"] = _pixel_resolution(scene)
+    if shape["min_resolution"] is None:
+        shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
+    return shape
+
+
+def cells_unit(scene: Scene, config: Config) -> float:
+    """World units in which the grid's loss counts its cells: a scene's own where the grid follows the scene.
+
+    Scenes of `USUAL_SCALE` keep the loss as the paper has it.
+    """
+    return scene.scale / USUAL_SCALE if config.texture.max_resolution is None else 1.0
+
+
+def _table_size(scene: Scene, width: int) -> int:
+    """Entries of tables of `width` numbers an entry, a power of two, that hold `NUMBERS_A_PIXEL`."""
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    power = round(math.log2(NUMBERS_A_PIXEL * pixels / width))
+    return 2 ** min(max(power, TABLE_POWERS[0]), TABLE_POWERS[1])
+
+
+def _pixel_resolution(scene: Scene) -> float:
+    """95th percentile, over training views and the points in them, of pixels per world unit."""
+    densities = []
+    for view in scene.train:
+        camera = view.camera
+        pixel, depth = camera.project(scene.points)
+        size = torch.tensor([camera.width, camera.height])
+        seen = (depth > camera.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
+        densities.append(camera.focal / depth[seen])
+    density = torch.cat(densities)
+    if density.numel() == 0:
+        raise ValueError(f"{scene.path}: expected points in front of the training cameras, found none")
+    return float(np.quantile(density.numpy(), 0.95))

@@ -1,0 +1,211 @@
+"""The training losses of the paper's section "Optimization", one function a term, each a scalar tensor.
+
+Images are (H, W, 3) with values in [0, 1] (others are allowed). `weights` (H, W, K) holds the blending
+weights W of the K textured hits of each pixel, empty slots 0, and `textured` (H, W, 3) is sum_k W_k T_k.
+Terms of images are differentiable once; a `target` gets no gradient, and one that requires it is refused.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from nexwarp.checks import check_range, check_tensors
+from nexwarp.kernels.photometric import WEIGHT_EPSILON
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.photometric import photometric_terms
+from nexwarp.ops.ssim import weighted_dssim
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Factors of the terms of the training loss; a term with factor 0 is not computed."""
+
+    dssim: float = 0.2
+    """Share of D-SSIM in the image loss; L1 has the rest."""
+    alpha: float = 0.005
+    """Penalty on blending weight that is not textured."""
+    alpha_hits: int = 2
+    """Of the textured hits, how many of the heaviest count for that."""
+    texture: float = 0.5
+    """L1 between the un-premultiplied texture and the photograph."""
+    opacity: float = 0.01
+    """Mean opacity of the surfels, for sparsity."""
+    grid: float = 0.01
+    """Squared values of the hash grid, each level over its resolution cubed."""
+
+    empty: float = 0.1
+    """Opacity where a mask says that there is nothing."""
+    depth: float = 0.1
+    """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
+    border: float = 0.1
+    """Image loss beyond the frame, where the photo's edge goes on."""
+
+    def __post_init__(self) -> None:
+        check_range("dssim", self.dssim, 0.0, 1.0)
+        check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
+            check_range(name, getattr(self, name), 0.0)
+
+
+def training_losses(
+    *,
+    image: torch.Tensor,
+    textured: torch.Tensor,
+    weights: torch.Tensor,
+    target: torch.Tensor,
+    opacities: torch.Tensor,
+    grid: torch.Tensor | None,
+    resolutions: torch.Tensor | None,
+    loss_weights: LossWeights,
+    mask: torch.Tensor | None = None,
+    empty: torch.Tensor | None = None,
+) -> dict[str, torch.Tensor]:
+    """Return the terms of the training loss, already multiplied by their factors: their sum is the loss.
+
+    Args:
+        image: (H, W, 3), the rendering with its background.
+        textured: (H, W, 3), sum_k W T.
+        weights: (H, W, K), W; with K = 0 there is no texture and no alpha term.
+        target: (H, W, 3), the photograph.
+        opacities: (N,) in [0, 1].
+        grid: (L, T, F), hash-grid values; None without a texture: no grid term.
+        resolutions: (L,), cells per world unit; may be None when `grid` is.
+        loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
+        mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
+            and the texture are 0. None is True everywhere.
+        empty: (H, W) bool, True where nothing is to be seen but `target`, which is the background there: the terms of
+            the texture and of its weight do not count.
+
+    Returns:
+        Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
+    """
+    factors, has_slots = loss_weights, weights.shape[-1] > 0
+    if mask is not None:
+        check_tensors({"mask": (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
+        image, textured, weights = _masked(image, textured, weights, target, mask)
+    if empty is not None:
+        check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
+        _, textured, weights = _masked(image, textured, weights, target, ~empty)
+    # With all of K = 4 test views came out worse than with K = 2: benchmarks/NOTES.md.
+    all_count = weights.shape[-1] <= factors.alpha_hits
+    l1_term, texture_term, alpha_term = photometric_terms(
+        image,
+        textured,
+        weights,
+        target,
+        l1=1.0 - factors.dssim,
+        texture=factors.texture * has_slots,
+        alpha=factors.alpha * (has_slots and all_count),
+    )
+    if not all_count and factors.alpha > 0.0:
+        alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
+    terms = {
+        "l1": l1_term,
+        "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,
+        "texture": texture_term,
+        "alpha": alpha_term,
+        "opacity": factors.opacity * opacity_loss(opacities) if factors.opacity > 0.0 else None,
+        "grid": factors.grid * grid_loss(grid, resolutions) if factors.grid > 0.0 and grid is not None else None,
+    }
+    return {name: term for name, term in terms.items() if term is not None}
+
+
+def _masked(
+    image: torch.Tensor, textured: torch.Tensor, weights: torch.Tensor, target: torch.Tensor, mask: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Put the photograph, without a gradient, where the mask is False."""
+    seen = mask[..., None]
+    fixed = weights.detach()
+    perfect = target * (fixed.sum(-1, keepdim=True) + WEIGHT_EPSILON)
+    return (
+        torch.where(seen, image, target),
+        torch.where(seen, textured, perfect),
+        torch.where(seen, weights, fixed),
+    )
+
+
+def l1(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """L_1: mean absolute difference of two (H, W, 3) images."""
+    return photometric_terms(image, None, None, target, l1=1.0)[0]
+
+
+def dssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """L_D-SSIM = 1 - SSIM of two (H, W, 3) images; differentiable once, and with respect to `image` only.
+
+    SSIM with a Gaussian window of 11 x 11 pixels and sigma 1.5 on each channel, zeros outside the image
+    ("same" padding), C1 = 0.01^2 and C2 = 0.03^2, averaged over all pixels and channels.
+
+    Raises:
+        ValueError: `target` requires a gradient, which it would not get.
+    """
+    return weighted_dssim(image, target)
+
+
+def image_loss(image: torch.Tensor, target: torch.Tensor, weight: float = 0.2) -> torch.Tensor:
+    """L_image = (1 - weight) L_1 + weight L_D-SSIM of two (H, W, 3) images."""
+    check_range("weight", weight, 0.0, 1.0)
+    return (1.0 - weight) * l1(image, target) + weight * dssim(image, target)
+
+
+def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """L_texture: L1 between `target` and the un-premultiplied texture, sum_k W T / (sum_k W + 1e-6).
+
+    Args:
+        textured: (H, W, 3), sum_k W T.
+        weights: (H, W, K), W.
+        target: (H, W, 3).
+    """
+    return photometric_terms(None, textured, weights, target, texture=1.0)[1]
+
+
+def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
+    """L_alpha: mean over the pixels of 1 - sum_k W, for (H, W, K) weights."""
+    return photometric_terms(None, None, weights, None, alpha=1.0)[2]
+
+
+def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor) -> torch.Tensor:
+    """Sum over the pixels `beyond` (H, W) the frame of the L1 of (H, W, 3) images, over the number of all pixels."""
+    shape = ("H", "W", 3)
+    check_tensors({"image": (image, shape), "target": (target, shape)})
+    check_tensors({"beyond": (beyond, image.shape[:2])}, dtype=torch.bool, device=image.device)
+    return ((image - target).abs().mean(-1) * beyond).mean()
+
+
+def depth_loss(
+    depths: torch.Tensor, weights: torch.Tensor, places: torch.Tensor, expected: torch.Tensor
+) -> torch.Tensor:
+    """Mean over points of |expected depth of their pixel's hits / their depth - 1|.
+
+    Args:
+        depths: (H, W, K) z-depths of the textured hits, world units.
+        weights: (H, W, K), W.
+        places: (M,) int64, row * W + column of the points' pixels; see `visible_points`.
+        expected: (M,) their z-depths, > 0; what has 0 there is no point, and does not count. 0 without any.
+    """
+    check_tensors({"depths": (depths, ("H", "W", "K")), "weights": (weights, depths.shape)})
+    check_tensors({"places": (places, ("M",))}, dtype=torch.int64, device=depths.device)
+    check_tensors({"expected": (expected, places.shape)}, device=depths.device)
+    # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
+    shares, found = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
+    means = (shares * found).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
+    known = expected > 0
+    errors = (means / torch.where(known, expected, 1) - 1).abs() * known
+    return errors.sum() / known.sum().clamp_min(1)
+
+
+def opacity_loss(opacities: torch.Tensor) -> torch.Tensor:
+    """L_opacity: mean of (N,) opacities."""
+    check_tensors({"opacities": (opacities, ("N",))})
+    return opacities.mean()
+
+
+def grid_loss(grid: torch.Tensor, resolutions: torch.Tensor) -> torch.Tensor:
+    """L_grid = sum_l sum(H_l^2) / s_l^3. The paper prints H without its square; the square is meant.
+
+    Args:
+        grid: (L, T, F), H.
+        resolutions: (L,), s in cells per world unit.
+    """
+    check_tensors({"grid": (grid, ("L", "T", "F")), "resolutions": (resolutions, ("L",))})
+    # A norm: its forward pass makes no (L, T, F) temporary, its backward pass only the gradient itself.
+    return (torch.linalg.vector_norm(grid, dim=(1, 2)).square() / resolutions**3).sum()

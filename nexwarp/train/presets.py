@@ -1,0 +1,115 @@
+"""The presets, and settings read back from a run's config.json."""
+
+import dataclasses
+from typing import Any, get_args, get_origin, get_type_hints
+
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.train.config import LARGEST_NUMBER, Config, LearningRates, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.losses import LossWeights
+
+# The demo is small enough for two CPU cores: a short run, so its steps are larger.
+DEMO_SETTINGS: dict[str, Any] = {
+    "iterations": 1200,
+    "max_surfels": 3000,
+    "coarse": 0.4,
+    "depth_jitter": 0.5,
+    "texture.levels": 12,
+    "texture.table_size": 2**15,
+    "texture.features": 2,
+    "texture.width": 32,
+    "rates.means": (5e-4, 5e-6),
+    "rates.quats": 5e-3,
+    "rates.scales": 2.5e-2,
+    "rates.opacities": 0.05,
+    "rates.gammas": 5e-3,
+    "rates.sh0": 1.25e-2,
+    "rates.shN": 6e-4,
+    "rates.grid": (2e-2, 2e-4),
+    "rates.mlp": (3e-3, 3e-4),
+}
+
+PARTS = ("losses", "rates", "texture", "densify")
+
+
+def _part(base: Any, data: Any, where: str) -> Any:
+    """A part of the settings."""
+    return dataclasses.replace(base, **_checked(type(base), _tuples(data), where))
+
+
+class KindError(ValueError):
+    """A setting's value is not of its type."""
+
+
+def _tuples(data: dict[str, Any]) -> dict[str, Any]:
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+
+
+def _checked(cls: type, data: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return settings whose values have their fields' types; numbers are finite."""
+    types = get_type_hints(cls)
+    for name, value in data.items():
+        if name in types and not _fits(value, types[name]):
+            kind = getattr(types[name], "__name__", types[name]) if not get_args(types[name]) else types[name]
+            raise KindError(f"{where}: {name}: expected {kind}, got {value!r:.60}")
+    return data
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_fits, value, kinds))
+    if get_args(kind):  # a union
+        return any(_fits(value, one) for one in get_args(kind))
+    if isinstance(value, bool) or kind not in (int, float):
+        return isinstance(value, kind)
+    if not isinstance(value, int if kind is int else (int, float)):
+        return False
+    return abs(value) <= LARGEST_NUMBER
+
+
+PRESETS: dict[str, Config] = {
+    "default": Config(),
+    "paper": Config(
+        preset="paper",
+        more_hits_from=0,
+        background=(0.0, 0.0, 0.0),
+        border=0.0,
+        depth_jitter=0.0,
+        footprints=False,
+        smooth_sh=0.0,
+        exposures=False,
+        metering=False,
+        vignetting=False,
+        clamp_image=True,
+        filter_points=False,
+        orient_points=False,
+        rates=LearningRates(mlp=(1e-3, 1e-3)),
+        texture=TextureConfig(
+            levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
+        ),
+        losses=LossWeights(depth=0.0, alpha_hits=MAX_HITS),
+        densify=DensifyConfig(prune_at_cap=False, floaters=False),
+    ),
+}
+
+
+def preset(name: str) -> Config:
+    """Return a preset; ValueError lists the known ones."""
+    if name not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(sorted(PRESETS))}, got {name!r}")
+    return PRESETS[name]
+
+
+def config_from_dict(data: dict[str, Any]) -> Config:
+    """Rebuild a config from `Config.as_dict`; ValueError names an unknown key.
+
+    Settings that an older version did not write are those of the preset that the run started from.
+    """
+    try:
+        preset = data.get("preset")
+        base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else Config()
+        data = {k: _part(getattr(base, k), v, k) if k in PARTS else v for k, v in data.items()}
+        return dataclasses.replace(base, **_checked(Config, _tuples(data), "config"))
+    except (TypeError, AttributeError, KindError) as error:
+        raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None

@@ -1,0 +1,146 @@
+"""The photos that training looks at, on the device that it runs on."""
+
+import copy
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.data import View
+from nexwarp.representation.exposures import Exposures
+
+# Photos stay on the GPU when they take less than this share of its free memory.
+PHOTO_SHARE = 0.25
+AHEAD = 2  # photos to fetch meanwhile where they do not
+
+
+class TrainingViews:
+    """Training views on the device they are used on; photos stay 8-bit.
+
+    On a GPU they lie there when they are few. Else they stay in the host's memory as they are, and those that come
+    next are copied while a step runs: by a thread into pinned memory, and from there on a stream of their own.
+    """
+
+    def __init__(
+        self,
+        views: list[View],
+        device: torch.device,
+        gains: torch.Tensor | None = None,
+        lens: Exposures | None = None,
+    ) -> None:
+        """Take the views to a device; their photos, as `get` gives them, are over `gains` (V, 3) and the falloff."""
+        self.device = device
+        self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
+        self.lens = None if lens is None else copy.deepcopy(lens).to(device)
+        self.names = [view.name for view in views]
+        self.cameras = [view.camera.to(device) for view in views]
+        self.photos = [view.image for view in views]
+        self.masks = [view.mask for view in views]
+        self.alphas = [view.alpha for view in views]
+        self.reduced: dict[tuple[int, int], Camera] = {}
+        self.pool: ThreadPoolExecutor | None = None
+        self.coming: dict[int, Future] = {}
+        if device.type == "cuda":
+            free, _ = torch.cuda.mem_get_info(device)
+            if sum(p.numel() for p in self.photos) < PHOTO_SHARE * free:
+                self.photos = [p.to(device) for p in self.photos]
+            else:
+                self.pool = ThreadPoolExecutor(1, "photos")
+                self.stream = torch.cuda.Stream(device)
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+    def fingerprint(self) -> str:
+        """Digest of the names and cameras, to know the same views again."""
+        digest = hashlib.sha256()
+        for name, camera in zip(self.names, self.cameras, strict=True):
+            values = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), camera.width, camera.height]
+            digest.update(f"{name} {values}\n".encode())
+        return digest.hexdigest()
+
+    def get(self, index: int, factor: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
+        """Camera and photo (H, W, 3) float, reduced by a factor; what does not fill a pixel is cut off.
+
+        `ahead` are the indices of the views to come, the next one first: up to two are fetched meanwhile.
+        """
+        photo = self._on_device(index)
+        self._fetch(ahead[:AHEAD])
+        scale = self.scales if isinstance(self.scales, float) else self.scales[index]
+        photo = photo.float() / scale
+        falloff = None if self.lens is None else self.lens.falloff_of(self.cameras[index])
+        if falloff is not None:
+            photo /= falloff
+        return self._camera(index, factor), self._reduce(photo, index, factor)
+
+    def mask(self, index: int, factor: int) -> torch.Tensor | None:
+        """Mask (H, W) bool of the photo that `get` gives: a reduced pixel counts where all of its pixels do."""
+        mask = self.masks[index]
+        if mask is None:
+            return None
+        share = self._reduce(mask.to(self.device, non_blocking=True).float()[:, :, None], index, factor)
+        return share[:, :, 0] == 1.0
+
+    def alpha(self, index: int, factor: int) -> torch.Tensor | None:
+        """Alpha (H, W) float in [0, 1] of the photo that `get` gives; None where it is opaque."""
+        alpha = self.alphas[index]
+        if alpha is None:
+            return None
+        return self._reduce(alpha.to(self.device, non_blocking=True).float()[:, :, None] / 255.0, index, factor)[
+            :, :, 0
+        ]
+
+    def _on_device(self, index: int) -> torch.Tensor:
+        coming = self.coming.pop(index, None)
+        if coming is None:
+            return self.photos[index].to(self.device)
+        photo, copied = coming.result()
+        here = torch.cuda.current_stream(self.device)
+        here.wait_event(copied)
+        photo.record_stream(here)
+        return photo
+
+    def _fetch(self, ahead: Sequence[int]) -> None:
+        if self.pool is None:
+            return
+        self.coming = {index: future for index, future in self.coming.items() if index in ahead}
+        for index in ahead:
+            if index not in self.coming:
+                self.coming[index] = self.pool.submit(self._copy, index)
+
+    def _copy(self, index: int) -> tuple[torch.Tensor, torch.cuda.Event]:
+        pinned = self.photos[index].pin_memory()
+        with torch.cuda.stream(self.stream):
+            photo = pinned.to(self.device, non_blocking=True)
+            copied = torch.cuda.Event()
+            copied.record()
+        return photo, copied
+
+    def _camera(self, index: int, factor: int) -> Camera:
+        camera = self.cameras[index]
+        if factor == 1 or min(camera.width, camera.height) < factor:
+            return camera
+        if (index, factor) not in self.reduced:
+            K = camera.K.clone()
+            K[:2] /= factor
+            size = (camera.width // factor, camera.height // factor)
+            self.reduced[index, factor] = Camera(camera.viewmat, K, *size, near=camera.near)
+        return self.reduced[index, factor]
+
+    def _reduce(self, pixels: torch.Tensor, index: int, factor: int) -> torch.Tensor:
+        """Average blocks of pixels (H, W, C) as `_camera` reduces the camera."""
+        camera = self.cameras[index]
+        if factor == 1 or min(camera.width, camera.height) < factor:
+            return pixels
+        small = torch.nn.functional.avg_pool2d(pixels.permute(2, 0, 1), factor)
+        return small.permute(1, 2, 0).contiguous()
+
+
+def mean_color(views: list[View]) -> tuple[float, float, float]:
+    """Mean sRGB colour in [0, 1] of all pixels of the photos."""
+    sums = torch.stack([view.image.sum((0, 1), dtype=torch.int64) for view in views]).sum(0).double()
+    pixels = sum(view.image.shape[0] * view.image.shape[1] for view in views)
+    red, green, blue = (sums / pixels / 255).tolist()
+    return red, green, blue
