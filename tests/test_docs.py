@@ -32,7 +32,7 @@ from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
-from nexwarp.model.model_file import save_model
+from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
@@ -375,36 +375,40 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     with torch.no_grad():  # more to be seen than after so few steps
         model.texture.grid.normal_(0, 2)
         model.surfels.log_scales += 0.7
-        model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
-        model.surfels.far_footprints = torch.rand(len(model.surfels)) * 0.4
-        model.surfels.exposures = Exposures.of(
-            torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others, (-0.3, -0.4, 0.15)
-        )
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)
+    count = len(model.surfels)
+    model.detail_limits = DetailLimits(torch.rand(count) * 0.2, torch.rand(count) * 0.4)  # within, and beyond
+    gains = torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]])
+    model.exposures = Exposures.of(gains, others, (-0.3, -0.4, 0.15))
     pixels = [(3, 5), (24, 18), (40, 30), (47, 0), (11, 27), (30, 9)]
-    # As trained; with the texture in place of the plain colours; with a K of 1; and where the texture is not used.
-    for changes in (
-        {},
-        {"residual": False},
-        {"residual": False, "clamp_texture": True},
-        {"max_hits": 1},
-        {"max_hits": 0},
+    # As trained; with the texture in place of the plain colours; and with each option that a file may hold.
+    for residual, changes in (
+        (True, {}),
+        (False, {}),
+        (False, {"clamp_texture": True}),
+        (True, {"max_hits": 1}),
+        (True, {"max_hits": 0}),
+        (True, {"exposure": "mean"}),
+        (True, {"detail_limits": False}),
+        (None, {}),  # without a texture
     ):
-        changes = {"residual": True, "clamp_texture": False, "max_hits": 2} | changes
-        model.texture.residual = model.texture.config["residual"] = changes.pop("residual")
-        model.meta |= changes
-        file = save_model(tmp_path, model)
+        if residual is None:
+            model.texture = None
+        else:
+            model.texture.residual = model.texture.config["residual"] = residual
+        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7)).changed(**changes)
+        file = model.save(tmp_path)
         stored = nw.load(file)
         tensors, meta = reader["read"](file)
         drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        plain = nw.Model(stored.surfels, None, stored.exposures, stored.detail_limits, stored.options)
         with torch.no_grad():
-            image = nw.render(stored.surfels, stored.texture, camera, **stored.render_options).image
-            plain = nw.render(stored.surfels, None, camera, **stored.render_options).image
-        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in (image, plain))
+            images = [x.render(camera).image for x in (stored, plain)]
+        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in images)
         np.testing.assert_allclose(drawn, expected, atol=2e-4)
-        assert (abs(expected - untextured).max() > 0.05) == (changes["max_hits"] > 0)
+        assert (abs(expected - untextured).max() > 0.01) == (stored.options.max_hits > 0 and residual is not None)
 
 
 def test_json_files(run):
