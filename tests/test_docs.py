@@ -143,10 +143,12 @@ either is not in the publication; `paper` turns it off, or it has no effect ther
 def field_docs(owner: type) -> dict[str, str]:
     """Docstrings of a dataclass's fields, on one line each."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
+    assert isinstance(definition, ast.ClassDef)
     docs = {}
     for line, following in itertools.pairwise(definition.body):
         if isinstance(line, ast.AnnAssign) and isinstance(following, ast.Expr):
-            docs[line.target.id] = " ".join(following.value.value.split())
+            assert isinstance(line.target, ast.Name) and isinstance(following.value, ast.Constant)
+            docs[line.target.id] = " ".join(str(following.value.value).split())
     return docs
 
 
@@ -157,6 +159,7 @@ def options(command: type) -> Iterator[tuple[str, str, str]]:
         extras = getattr(hints[f.name], "__metadata__", ())
         parts = [p for p in (f.type, getattr(hints[f.name], "__origin__", None)) if dataclasses.is_dataclass(p)]
         if parts:
+            assert isinstance(parts[0], type)
             yield from options(parts[0])
             continue
         (shown,) = [e for e in extras if hasattr(e, "metavar")] or [None]
@@ -371,10 +374,12 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
+    texture = model.texture
+    assert texture is not None
     others = list(load_cameras(run / "cameras.json")["train"].values())[:3]
     with torch.no_grad():  # more to be seen than after so few steps
-        model.texture.grid.normal_(0, 2)
-        model.surfels.log_scales += 0.7
+        texture.grid.normal_(0, 2)
+        model.surfels.log_scales.add_(0.7)
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)
@@ -397,7 +402,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         if residual is None:
             model.texture = None
         else:
-            model.texture.residual = model.texture.config["residual"] = residual
+            texture.residual = texture.config["residual"] = residual
         model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7)).changed(**changes)
         file = model.save(tmp_path)
         stored = nw.load(file)
