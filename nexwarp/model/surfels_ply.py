@@ -128,7 +128,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
     """
     path = Path(path)
     if not path.is_file():
-        raise MissingError(f"{path}: expected a PLY file of surfels, found no file")
+        raise MissingError(f"{path}: no such file, expected surfels as PLY")
     with open(path, "rb") as file:
         count, dtype, start = _header(path, file.read(LONGEST_HEADER))
         size = path.stat().st_size
