@@ -153,7 +153,7 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"cut\.exr: expected a whole OpenEXR file"):
             load_exr(tmp_path / "cut.exr")
     save_exr(tmp_path / "other.exr", {"image": torch.zeros(3, 4, 3)})
-    with pytest.raises(ValueError, match=r"other\.exr: expected the passes of a nexwarp rendering"):
+    with pytest.raises(ValueError, match=r"other\.exr: expected the buffers of a nexwarp rendering"):
         load_buffers(tmp_path / "other.exr")
 
 

@@ -108,7 +108,7 @@ def test_footprints_come_back_exactly(tmp_path, name):
     assert torch.equal(getattr(loaded.surfels, name), values)
     assert getattr(loaded.surfels.to(torch.float64), name).dtype == torch.float64
     setattr(model.surfels, name, torch.rand(len(model.surfels) + 1))
-    with pytest.raises(ValueError, match=rf"the tensors do not make a model \({name}: expected shape"):
+    with pytest.raises(ValueError, match=rf"expected the tensors of a nexwarp model \({name}: expected shape"):
         nw.load(save_model(tmp_path, model))
 
 
@@ -121,7 +121,7 @@ def test_exposures_come_back_exactly(tmp_path):
         assert torch.equal(loaded.surfels.exposures.tensors()[name], value), name
     assert loaded.surfels.to(torch.float64).exposures.lengths.dtype == torch.float64
     model.surfels.exposures.positions = torch.rand(4, 3)
-    with pytest.raises(ValueError, match=r"the tensors do not make a model \(positions: expected shape"):
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(positions: expected shape"):
         nw.load(save_model(tmp_path, model))
 
 

@@ -150,7 +150,7 @@ def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "finish", full)
         assert cli.main(command) == 2
-    told = "out of memory: it needed 2.00 GiB; the training is done and kept: --resume finishes the run"
+    told = "out of memory: needed 2.00 GiB; training is complete and saved: --resume finishes the run"
     assert capsys.readouterr().err == f"nexwarp: error: {told}\n"
     assert cli.main([*command, "--resume"]) == 0
     assert "resumed at iteration 20" in capsys.readouterr().out
@@ -374,7 +374,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tm
         (run / "checkpoint.tmp" / "tensors.safetensors").write_bytes(b"\x10")
     command = ["train", str(scene), "--run", str(run), *FLAGS, "--resume"]
     assert cli.main(command) == 0
-    assert f"{run}: no checkpoint yet, so training starts anew" in capsys.readouterr().out
+    assert f"{run}: no checkpoint yet, training starts from the beginning" in capsys.readouterr().out
     assert {f.name for f in run.iterdir()} == RUN_FILES
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
 
@@ -693,7 +693,7 @@ def test_a_run_may_not_replace_its_own_scene(scene, tmp_path, capsys):
     shutil.copytree(scene, folder / "scene")
     (folder / "config.json").write_text("{}")
     assert cli.main(["train", str(folder / "scene"), "--run", str(folder), "--overwrite"]) == 2
-    assert "--run: expected a folder that does not hold the scene" in capsys.readouterr().err
+    assert "--run: expected a folder that does not contain the scene" in capsys.readouterr().err
     assert (folder / "scene" / "images").is_dir()
 
 

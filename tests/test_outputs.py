@@ -297,8 +297,8 @@ def refuses(run: Path, capsys: pytest.CaptureFixture) -> Callable[..., None]:
         (["--path", "ellipse", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
         (["--video", "a.mp4", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
         (["--frames", "-1"], ["--frames: expected at least 0, got -1"]),
-        (["--set", "test", "--frames", "5"], ["--frames: expected with --path or --video"]),
-        (["--fps", "30"], ["--fps: expected with --video"]),
+        (["--set", "test", "--frames", "5"], ["--frames: expected together with --path or --video"]),
+        (["--fps", "30"], ["--fps: expected together with --video"]),
         (["--video", "a.mp4", "--fps", "0"], ["--fps: expected more than 0"]),
         (["--video", "a.avi"], ["--video: a.avi: expected a video ending in .mp4"]),
         (["--size", "100"], ["--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100'"]),
@@ -320,7 +320,7 @@ def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
     path.write_text("{")
     refuses(["render", "--path", path], str(path), "expected JSON")
     save_camera_path(path, ring(2))
-    refuses(["render", "--path", path, "--frames", "3"], "--frames: expected none with", "got 3")
+    refuses(["render", "--path", path, "--frames", "3"], "--frames: expected no value with", "got 3")
     data = json.loads(path.read_text())
     data["camera_path"][1]["camera_to_world"] = [0.0] * 15 + [1.0]
     path.write_text(json.dumps(data))
