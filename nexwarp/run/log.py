@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from nexwarp.io.files import written_aside
-from nexwarp.train.trainer import Progress, Trainer
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
 
 LOG_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
@@ -113,7 +114,7 @@ class TrainingLog:
         self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
         self.last, self.written = self.trainer.iteration, time.perf_counter()
 
-    def __call__(self, step: Progress) -> None:
+    def __call__(self, step: StepReport) -> None:
         """Observe a step."""
         # From 1 on: steps that are multiples of something often do more than others, such as to look beyond the frame.
         if (step.iteration - 1) % self.every and step.iteration != self.trainer.config.iterations:
@@ -126,7 +127,7 @@ class TrainingLog:
                 self.writer.add_scalar(tag, value, step.iteration)
             self.writer.flush()
 
-    def _line(self, step: Progress) -> dict[str, Any]:
+    def _line(self, step: StepReport) -> dict[str, Any]:
         # One transfer for all terms; it waits for the step, so the time is taken after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr, now = step.psnr(), time.perf_counter()
