@@ -185,9 +185,9 @@ def scene_digest(scene: Scene, texture: NeuralTexture) -> str:
     for view in scene.train:
         for values in (view.image, view.mask, view.alpha, view.points):
             if values is not None:  # CRC: photos are many, and nobody forges them
-                digest.update(zlib.crc32(values.contiguous().numpy()).to_bytes(4, "little"))
+                digest.update(zlib.crc32(values.contiguous().numpy().data).to_bytes(4, "little"))
     for values in (scene.points, scene.colors):
-        digest.update(values.contiguous().numpy())
+        digest.update(values.contiguous().numpy().data)
     return digest.hexdigest()
 
 

@@ -15,6 +15,7 @@ from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
+from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -108,6 +109,7 @@ class Trainer:
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds = 0, 0.0
         self.order: list[int] = []
+        self.exposures: Exposures | None
         self.exposures, gains = calibrate_exposures(scene, config)
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train)
