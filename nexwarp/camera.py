@@ -1,7 +1,6 @@
 """Pinhole cameras, with OpenCV axes as in COLMAP: x right, y down, z forward."""
 
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -24,7 +23,11 @@ class Camera:
         width: image width in pixels.
         height: image height in pixels.
         near: hits with a z-depth of at most this are ignored, world units.
-        fx, fy, cx, cy: entries of `K` as numbers, pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels, the numbers in `K`.
+
+    Args:
+        checked: fx, fy, cx and cy of matrices that have been checked before: these are not checked again, which would
+            wait for a GPU. None checks `viewmat` and `K` and takes the numbers from `K`.
 
     Raises:
         TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
@@ -37,12 +40,19 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    checked: InitVar[tuple[float, float, float, float] | None] = field(default=None, kw_only=True)
     fx: float = field(init=False)
     fy: float = field(init=False)
     cx: float = field(init=False)
     cy: float = field(init=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
+        numbers = self._check() if checked is None else checked
+        for name, value in zip(("fx", "fy", "cx", "cy"), numbers, strict=True):
+            object.__setattr__(self, name, value)
+
+    def _check(self) -> tuple[float, float, float, float]:
+        """Return fx, fy, cx and cy; raise TypeError or ValueError where a field does not fit."""
         viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -57,8 +67,7 @@ class Camera:
         _check_rigid(viewmat)
         _check_intrinsics(intrinsics)
         (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
-        for name, value in zip(("fx", "fy", "cx", "cy"), (fx, fy, cx, cy), strict=True):
-            object.__setattr__(self, name, value)
+        return fx, fy, cx, cy
 
     @property
     def focal(self) -> float:
@@ -87,15 +96,48 @@ class Camera:
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
-        camera = copy(self)  # skips __post_init__: checking again would wait for the GPU
-        changes = {"K": K, "width": width, "height": height, "cx": self.cx - left, "cy": self.cy - top}
-        for name, value in changes.items():
-            object.__setattr__(camera, name, value)
-        return camera
+        checked = (self.fx, self.fy, self.cx - left, self.cy - top)
+        return replace(self, K=K, width=width, height=height, checked=checked)
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """Return a copy with `viewmat` and `K` moved or converted; arguments as of `torch.Tensor.to`."""
         return Camera(self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near)
+
+
+@dataclass(frozen=True)
+class StagedCamera(Camera):
+    """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
+
+    Attributes:
+        focal_length: (1,) `Camera.focal` of the camera that was copied last, on the device of `viewmat`; `fx` to `cy`
+            are those of the first one.
+    """
+
+    focal_length: torch.Tensor = field(kw_only=True)
+
+    @classmethod
+    def of(cls, camera: Camera) -> "StagedCamera":
+        """Copy a camera into tensors of its own."""
+        return cls(
+            camera.viewmat.clone(),
+            camera.K.clone(),
+            camera.width,
+            camera.height,
+            camera.near,
+            checked=(camera.fx, camera.fy, camera.cx, camera.cy),
+            focal_length=camera.viewmat.new_full((1,), camera.focal),
+        )
+
+    @property
+    def focal(self) -> torch.Tensor:  # type: ignore[override]  # a graph reads the number from the device
+        """(1,) focal length in pixels, on the device."""
+        return self.focal_length
+
+    def copy_(self, camera: Camera) -> None:
+        """Overwrite the tensors with those of another camera of the same size and near depth."""
+        self.viewmat.copy_(camera.viewmat)
+        self.K.copy_(camera.K)
+        self.focal_length.fill_(camera.focal)
 
 
 def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:

@@ -21,6 +21,7 @@ from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import FORMAT_VERSION, MODEL_FILE, save_model, write_atomically
 from nexwarp.representation.exposures import Exposures
+from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
@@ -338,7 +339,7 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
         if stage == "tensors":
             patch.setattr(safetensors.torch, "save", fail)
         elif stage == "state":
-            patch.setattr("nexwarp.train.checkpoint.write_atomically", fail)
+            patch.setattr(checkpoint, "write_atomically", fail)
         else:
             patch.setattr(Path, "rename", rename)
         if (stage, after_kill) != ("second rename", True):  # there is only one rename then

@@ -100,8 +100,8 @@ def test_a_window_sees_what_the_camera_sees_there(scene: Scene) -> None:
 def test_beyond_the_frame_the_photos_edge_goes_on(scene: Scene) -> None:
     trainer = make_trainer(scene, border=0.25)
     for _ in range(20):
-        view = trainer._view(0, 1)
-        shifted = trainer._beyond_the_frame(view)
+        view = trainer.targets.from_view(0, 1)
+        shifted = trainer.targets.shifted(view)
         left = round(view.camera.cx - shifted.camera.cx)
         top = round(view.camera.cy - shifted.camera.cy)
         assert abs(left) <= 12 and abs(top) <= 9
@@ -121,7 +121,7 @@ def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
     hidden = dataclasses.replace(scene, train=[dataclasses.replace(v, mask=mask) for v in scene.train])
     trainer = make_trainer(hidden, border=0.25)
     for _ in range(10):
-        shifted = trainer._beyond_the_frame(trainer._view(0, 1))
+        shifted = trainer.targets.shifted(trainer.targets.from_view(0, 1))
         left = round(scene.train[0].camera.cx - shifted.camera.cx)
         column = 47 - max(left, 0)  # shows the photo's last column
         if left <= 0:
@@ -148,7 +148,7 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
     random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
     trainer = make_trainer(random)
-    seen = [trainer._view(0, 1) for _ in range(3)]
+    seen = [trainer.targets.from_view(0, 1) for _ in range(3)]
     assert len({tuple(view.background.tolist()) for view in seen}) == 3
     photo = views[0].image.float() / 255
     for view in seen:
@@ -211,7 +211,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
         trainer = make_trainer(halves, iterations=60, mask_mode=mode, border=0.0)
         trainer.run()
         with torch.no_grad():
-            view = trainer._view(0, 1)
+            view = trainer.targets.from_view(0, 1)
             options = trainer.render_options()
             outs = [nw.render(trainer.surfels, trainer.texture, v.camera, **options) for v in scene.train]
         alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()

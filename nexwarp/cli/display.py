@@ -19,7 +19,7 @@ from rich.table import Table
 
 from nexwarp.model.model import Model
 from nexwarp.run.log import peak_memory
-from nexwarp.train import trainer
+from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
@@ -78,7 +78,7 @@ class TrainingDisplay:
     def __exit__(self, *_: object) -> None:
         self.progress.stop()
 
-    def __call__(self, step: trainer.Progress) -> None:
+    def __call__(self, step: StepReport) -> None:
         """Show a step; its numbers are fetched from the device only when they are shown."""
         now = time.perf_counter()
         if self.console.is_terminal:

@@ -21,7 +21,8 @@ from nexwarp.run.folder import CAMERAS_FILE, check_room, tidy_run
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.health import needed_memory
-from nexwarp.train.trainer import Progress, Trainer
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -85,7 +86,7 @@ class TrainingSession:
         log = TrainingLog(self.run, trainer, tensorboard=self.tensorboard)
         with progress_display, log, deferred_stop() as stop_signal:
 
-            def observe(step: Progress) -> None:
+            def observe(step: StepReport) -> None:
                 progress_display(step)
                 with self._model_kept():
                     log(step)
@@ -188,5 +189,5 @@ class TrainingSession:
         return model
 
 
-def _describe(step: Progress) -> str:
+def _describe(step: StepReport) -> str:
     return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, TextIO, TypedDict
 import torch
 
 from nexwarp.io.files import written_aside
-from nexwarp.train.trainer import Progress, Trainer
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -131,7 +132,7 @@ class TrainingLog:
         self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
         self.last, self.written = self.trainer.iteration, time.perf_counter()
 
-    def __call__(self, step: Progress) -> None:
+    def __call__(self, step: StepReport) -> None:
         """Write a line if one is due after this step."""
         # Lines at 1, 1 + every, ...: steps at round numbers are often special, such as border steps.
         if (step.iteration - 1) % self.every and step.iteration != self.trainer.config.iterations:
@@ -145,7 +146,7 @@ class TrainingLog:
                 self.writer.add_scalar(tag, value, step.iteration)
             self.writer.flush()
 
-    def _line(self, step: Progress) -> LogLine:
+    def _line(self, step: StepReport) -> LogLine:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr, now = step.psnr(), time.perf_counter()
