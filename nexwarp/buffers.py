@@ -96,9 +96,9 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
     """Write one multi-part OpenEXR file: a part a pass, and a slot of it where there are K.
 
     Parts: `image`, `plain`, `textured`, `normals`, `colors.0` to `colors.K-1` (channels R, G, B); `alpha`,
-    `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty slots). Camera,
-    background and K are in the text attribute `nexwarp`, as JSON; a background of one colour a pixel is a part
-    `background` (R, G, B), and null there.
+    `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty
+    slots). Camera, background and K are in the text attribute `nexwarp`, as JSON; a background of one colour a pixel is
+    a part `background` (R, G, B), and null there.
 
     Raises:
         TypeError: buffers that are not float32; OSError: `path` cannot be written.

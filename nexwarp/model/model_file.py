@@ -183,7 +183,7 @@ def _no_model(path: Path, error: Exception) -> FormatError:
 
 
 def _read_options(meta: dict[str, Json]) -> RenderOptions:
-    """Take the options out of the metadata; raise ValueError or TypeError unless they and the other numbers are sound."""
+    """Take the options out of the metadata; raise ValueError or TypeError unless they and other numbers are sound."""
     names = [field.name for field in dataclasses.fields(RenderOptions)]
     missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
     if missing:
