@@ -137,10 +137,8 @@ def test_a_file_of_version_0_1_renders_as_before(tmp_path: Path, stored: tuple[s
     rewrite(file, age)
     loaded = nw.load(file)
     assert loaded.options == OPTIONS and loaded.exposures is not None
-    values = dict(zip(("footprints", "far_footprints"), limits, strict=True))
-    kept = [
-        values[name] if name in stored else torch.full((24,), x) for name, x in zip(values, (0, NEVER), strict=True)
-    ]
+    nearest = limits[0] if "footprints" in stored else torch.zeros(24)
+    farthest = limits[1] if "far_footprints" in stored else torch.full((24,), NEVER)
     expected = nw.render(
         loaded.surfels,
         loaded.texture,
