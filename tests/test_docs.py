@@ -28,6 +28,7 @@ from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
 from nexwarp.model.model_file import save_model
+from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
@@ -325,9 +326,9 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     with torch.no_grad():  # more to be seen than after so few steps
         model.texture.grid.normal_(0, 2)
         model.surfels.log_scales += 0.7
-        model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
-        model.surfels.far_footprints = torch.rand(len(model.surfels)) * 0.4
-        model.surfels.exposures = Exposures.of(
+        nearest = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
+        model.detail_limits = DetailLimits(nearest, torch.rand(len(model.surfels)) * 0.4)
+        model.exposures = Exposures.of(
             torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others, (-0.3, -0.4, 0.15)
         )
         model.surfels.raw_gammas.uniform_(-3, 1)
@@ -344,17 +345,18 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     ):
         changes = {"residual": True, "clamp_texture": False, "max_hits": 2} | changes
         model.texture.residual = model.texture.config["residual"] = changes.pop("residual")
-        model.meta |= changes
+        model.options = model.options.changed(**changes)
         file = save_model(tmp_path, model)
         stored = nw.load(file)
         tensors, meta = reader["read"](file)
         drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        untextured = nw.Model(stored.surfels, None, stored.exposures, stored.detail_limits, stored.options)
         with torch.no_grad():
-            image = nw.render(stored.surfels, stored.texture, camera, **stored.render_options).image
-            plain = nw.render(stored.surfels, None, camera, **stored.render_options).image
-        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in (image, plain))
+            image = stored.render(camera).image
+            plain = untextured.render(camera).image
+        expected, without = (np.array([x[row, column].tolist() for column, row in pixels]) for x in (image, plain))
         np.testing.assert_allclose(drawn, expected, atol=2e-4)
-        assert (abs(expected - untextured).max() > 0.05) == (changes["max_hits"] > 0)
+        assert (abs(expected - without).max() > 0.05) == (changes["max_hits"] > 0)
 
 
 def test_json_files(run):

@@ -57,7 +57,7 @@ def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
 
 def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Trainer], None]) -> list[int]:
     """Let a fault strike before Adam's step of some iterations, each time they come; returns those it struck."""
-    struck, made = [], trainer._make_optimizer
+    struck, made = [], trainer.make_optimizer
     trainers: list[Trainer] = []
     init = Trainer.__init__
 
