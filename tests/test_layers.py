@@ -10,8 +10,8 @@ import pytest
 
 LAYERS = [
     {"checks", "determinism", "errors"},
-    {"kernels", "tape"},
-    {"camera", "io", "ops"},
+    {"kernels"},
+    {"camera", "io", "ops", "tape"},
     {"cameras", "data", "representation"},
     {"render"},
     {"model"},
