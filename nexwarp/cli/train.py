@@ -280,12 +280,12 @@ def _train(
             if (number := asked()) is not None:
                 raise Stopped(number)
 
-        def warn(text: str) -> None:
+        def tell(text: str) -> None:
             warn(console, text)
             log.rewind()
 
         try:
-            trainer.run(observe, warn)
+            trainer.run(observe, tell)
         except DivergedError as error:
             # The trainer is in its last good state.
             report = {"message": str(error), **error.report}
