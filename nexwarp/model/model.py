@@ -120,7 +120,7 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
         """
-        if isinstance(camera, Sequence):
+        if isinstance(camera, Sequence) and not isinstance(camera, str):
             return [
                 self.render(each, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
                 for each in camera
