@@ -16,7 +16,7 @@ from nexwarp.render import Rendering, render
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

@@ -1,22 +1,19 @@
 """All passes of a rendering, those that follow from it too, and their OpenEXR file (see docs/outputs.md)."""
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
+from typing_extensions import Unpack
 
-from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
-from nexwarp.render import Rendering, limited_depths
+from nexwarp.model.options import RenderChanges
 
 FORMAT = 2
-# Passes that a rendering has itself.
-RENDERED = (
+PASSES = (
     "image",
     "plain",
     "textured",
@@ -24,6 +21,7 @@ RENDERED = (
     "ids",
     "depths",
     "weights",
+    "colors",
     "expected_depth",
     "median_depth",
     "top_depth",
@@ -74,22 +72,15 @@ class Buffers:
 
 
 @torch.no_grad()
-def render_buffers(model: Model, camera: Camera, **changes: object) -> Buffers:
+def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges]) -> Buffers:
     """Render every pass of a model; arguments and errors are those of `Model.render`."""
     camera = camera.to(model.device)
     out = model.render(camera, **changes)
-    options = model.options.changed(**changes)
-    background = torch.tensor(options.background).to(out.image)
-    colors = _slot_colors(model, options, camera, out)
-    if model.exposures is not None and options.exposure == "photos":
-        factors = model.exposures.factors(camera).to(out.image)
-        background, colors = background * factors, colors * (factors if factors.ndim == 1 else factors[:, :, None])
-    return Buffers(
-        **{name: getattr(out, name) for name in RENDERED},
-        colors=colors,
-        camera=camera,
-        background=background,
-    )
+    background = torch.tensor(model.options.background).to(out.image)
+    if (factors := out.intermediates.factors) is not None:
+        background = background * factors
+    passes = {name: getattr(out, name) for name in PASSES}
+    return Buffers(**passes, camera=camera, background=background)
 
 
 def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
@@ -103,13 +94,13 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
     Raises:
         TypeError: buffers that are not float32; OSError: `path` cannot be written.
     """
-    parts = {}
-    for field in fields(buffers):
-        value = getattr(buffers, field.name)
-        if field.name in SLOTS:
-            parts |= {f"{field.name}.{k}": value[:, :, k] for k in range(value.shape[2])}
-        elif field.name not in ("camera", "background"):
-            parts[field.name] = value
+    parts: dict[str, torch.Tensor] = {}
+    for name in PASSES:
+        value = getattr(buffers, name)
+        if name in SLOTS:
+            parts |= {f"{name}.{k}": value[:, :, k] for k in range(value.shape[2])}
+        else:
+            parts[name] = value
     camera, background = buffers.camera, buffers.background
     if background.ndim > 1:
         parts["background"] = background
@@ -140,12 +131,12 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
     try:
         if metadata["format"] != FORMAT:
             raise ValueError(f"format {metadata['format']}, expected {FORMAT}")
-        values: dict[str, Any] = dict(metadata["camera"])
-        matrices = {name: torch.tensor(values.pop(name), dtype=torch.float32) for name in ("viewmat", "K")}
-        camera = Camera(**matrices, **values)
+        known = metadata["camera"]
+        viewmat, K = (torch.tensor(known[name], dtype=torch.float32) for name in ("viewmat", "K"))
+        camera = Camera(viewmat, K, known["width"], known["height"], known["near"])
         slots = range(metadata["max_hits"])
-        found: dict[str, Any] = {}
-        for name in (f.name for f in fields(Buffers) if f.name not in ("camera", "background")):
+        found: dict[str, torch.Tensor] = {}
+        for name in PASSES:
             if name not in SLOTS:
                 found[name] = parts[name]
             elif slots:
@@ -158,23 +149,3 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: expected the passes of a nexwarp rendering ({error})") from None
     return Buffers(**found, camera=camera, background=background)
-
-
-def _slot_colors(model: Model, options: RenderOptions, camera: Camera, out: Rendering) -> torch.Tensor:
-    """(H, W, K, 3) what `render` multiplies the weights by, without exposures."""
-    empty = (out.ids < 0)[..., None]
-    colors = out.depths.new_zeros(*out.ids.shape, 3)
-    if bool(empty.all()):
-        return colors
-    surfels, texture, degree = model.surfels, model.texture, options.sh_degree
-    if texture is not None:
-        pinhole = ops.Pinhole(camera.K.to(out.depths), camera.width, camera.height, camera.near)
-        positions, rays = ops.unproject(out.depths, camera.viewmat, pinhole)
-        limits = model.detail_limits if options.detail_limits else None
-        depths = limited_depths(out.ids, out.depths, limits, camera.focal)
-        clamp = options.clamp_texture
-        colors = texture.colors(positions, depths, rays, camera.focal, sh_degree=degree, clamp=clamp)
-    if texture is None or texture.residual:
-        plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, degree)
-        colors = colors + plain[out.ids.clamp_min(0).long()]
-    return colors.masked_fill(empty, 0.0)

@@ -32,6 +32,9 @@ class Intermediates:
         pinhole: the image plane.
         viewmat: (4, 4) world to camera.
         low_pass: as given to `render`.
+        texels: (H, W, K, 3) the texture's colours of the hits; None without a texture.
+        residual: whether the texture's colours are added to the plain ones.
+        factors: (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure.
     """
 
     projection: ops.Projection
@@ -40,14 +43,17 @@ class Intermediates:
     pinhole: ops.Pinhole
     viewmat: torch.Tensor
     low_pass: bool
+    texels: torch.Tensor | None
+    residual: bool
+    factors: torch.Tensor | None
 
 
 @dataclass(frozen=True)
 class Rendering:
     """The buffers of one rendering.
 
-    Differentiable: all fields but `ids`. Computed on first access, from the same lists and without a second rendering:
-    `expected_depth`, `median_depth`, `top_depth` and `normals`, which are not differentiable.
+    Differentiable: all fields but `ids`. Computed on first access, without a second rendering: `expected_depth`,
+    `median_depth`, `top_depth`, `normals` and `colors`; the first four are not differentiable.
 
     Attributes:
         image: (H, W, 3) = plain + textured + (1 - alpha) background; not clamped.
@@ -95,6 +101,17 @@ class Rendering:
         Each hit's normal is taken on the side that faces the camera; 0 where nothing is hit.
         """
         return self._surface.normals
+
+    @cached_property
+    def colors(self) -> torch.Tensor:
+        """(H, W, K, 3) colours of the K hits, so that textured = sum over k of weights * colors; 0 in empty slots."""
+        made, empty = self.intermediates, (self.ids < 0)[..., None]
+        colors = self.weights.new_zeros(*self.ids.shape, 3) if made.texels is None else made.texels
+        if (made.texels is None or made.residual) and len(made.projection.records):
+            colors = colors + made.projection.records[:, 3, :3][self.ids.clamp_min(0).long()]
+        if made.factors is not None:
+            colors = colors * (made.factors if made.factors.ndim == 1 else made.factors[:, :, None])
+        return colors.masked_fill(empty, 0.0)
 
     @cached_property
     def _surface(self) -> ops.Surface:
@@ -161,33 +178,34 @@ def render(
     Raises:
         TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
-    background = _check(
-        surfels, texture, camera, max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, detail_limits
-    )
+    _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
+    background = _background(background, surfels.means)
+    _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
     shape = antialiased(surfels, camera, detail_limits)
     pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
-    if texture is None:
-        texels, weights = hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
-    else:
-        weights, looked_up = hits.weights, hits.depths
+    texels = None
+    if texture is not None:
         if not isinstance(depth_jitter, torch.Tensor) and depth_jitter > 0:
-            depth_jitter = jitter_factors(camera, max_hits, depth_jitter, looked_up.dtype, generator)
-        if isinstance(depth_jitter, torch.Tensor):
-            looked_up = looked_up * depth_jitter
+            depth_jitter = jitter_factors(camera, max_hits, depth_jitter, hits.depths.dtype, generator)
+        looked_up = hits.depths * depth_jitter if isinstance(depth_jitter, torch.Tensor) else hits.depths
         positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
         depths = limited_depths(hits.ids, hits.depths, detail_limits, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
-    base = hits.base if texture is None or texture.residual else None
+    residual = texture is not None and texture.residual
+    base = hits.base if texture is None or residual else None
     plain = hits.plain
-    image, textured = ops.compose(plain, texels, weights, hits.alpha, background, base)
-    if exposures is not None:
-        factors = exposures.factors(camera).to(image)
+    blended = (hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0])
+    if texels is not None:
+        blended = (texels, hits.weights)
+    image, textured = ops.compose(plain, *blended, hits.alpha, background, base)
+    factors = None if exposures is None else exposures.factors(camera).to(image)
+    if factors is not None:
         image, plain, textured = image * factors, plain * factors, textured * factors
-    made = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass)
+    made = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
     return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, made)
 
 
@@ -256,60 +274,74 @@ def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
     """Return the background as a (3,) tensor; a tensor keeps its graph."""
     if isinstance(background, torch.Tensor):
         return background.expand(3) if background.ndim == 0 else background
+    values: Sequence[object]
     if isinstance(background, numbers.Real):
-        background = [background] * 3
-    if not isinstance(background, Iterable) or isinstance(background, str):
+        values = [background] * 3
+    elif isinstance(background, Iterable) and not isinstance(background, str):
+        values = list(background)
+    else:
         raise TypeError(f"background: expected numbers or a tensor, got {type(background).__name__}")
-    values = list(background)
     if len(values) != 3:
         raise ValueError(f"background: expected 3 values, got {len(values)}")
-    if not all(isinstance(x, numbers.Real) for x in values):
+    numbers_ = [float(x) for x in values if isinstance(x, numbers.Real)]
+    if len(numbers_) != 3:
         raise TypeError(f"background: expected three numbers or a tensor, got {values}")
-    return torch.stack([like.new_full((), float(x)) for x in values])
+    return torch.stack([like.new_full((), x) for x in numbers_])
 
 
-def _check(
+def _check_types(
     surfels: Surfels,
     texture: NeuralTexture | None,
     camera: Camera,
     max_hits: int,
-    background: Color,
     sh_degree: int,
     low_pass: bool,
     clamp_texture: bool,
     depth_jitter: float | torch.Tensor,
-    detail_limits: DetailLimits | None,
-) -> torch.Tensor:
-    """Check types, shapes and devices only, so as never to wait for a GPU; return the background as a tensor."""
-    for name, value, kind in (("surfels", surfels, Surfels), ("camera", camera, Camera)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: expected a nexwarp.{kind.__name__}, got {type(value).__name__}")
+) -> None:
+    """Check the arguments' types and ranges."""
+    if not isinstance(surfels, Surfels):
+        raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
     if texture is not None and not isinstance(texture, NeuralTexture):
         raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
-    for name, value, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, 3)):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-        check_range(name, value, 0, high)
-    for name, value in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
-        if not isinstance(value, bool):
-            raise TypeError(f"{name}: expected True or False, got {type(value).__name__}")
+    for name, number, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, 3)):
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise TypeError(f"{name}: expected an int, got {type(number).__name__}")
+        check_range(name, number, 0, high)
+    for name, flag in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
+        if not isinstance(flag, bool):
+            raise TypeError(f"{name}: expected True or False, got {type(flag).__name__}")
     if not isinstance(depth_jitter, torch.Tensor):
         if isinstance(depth_jitter, bool) or not isinstance(depth_jitter, numbers.Real):
             raise TypeError(f"depth_jitter: expected a number or a tensor, got {type(depth_jitter).__name__}")
         check_range("depth_jitter", depth_jitter, 0.0, MAX_JITTER)
     if clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
-    means = surfels.means
-    if means.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"surfels: expected float32 or float64 parameters, got {means.dtype}")
-    background = _background(background, means)
-    others = {"camera.viewmat": (camera.viewmat, (4, 4)), "background": (background, (3,))}
+    if surfels.means.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"surfels: expected float32 or float64 parameters, got {surfels.means.dtype}")
+
+
+def _check_tensors(
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    camera: Camera,
+    max_hits: int,
+    background: torch.Tensor,
+    depth_jitter: float | torch.Tensor,
+    limits: DetailLimits | None,
+) -> None:
+    """Check shapes, dtypes and devices only, so as never to wait for a GPU."""
+    expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
+        "camera.viewmat": (camera.viewmat, (4, 4)),
+        "background": (background, (3,)),
+    }
     if isinstance(depth_jitter, torch.Tensor):
-        others["depth_jitter"] = (depth_jitter, (camera.height, camera.width, max_hits))
+        expected["depth_jitter"] = (depth_jitter, (camera.height, camera.width, max_hits))
     if texture is not None:
-        others["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
-    if detail_limits is not None:
-        others["detail_limits.nearest"] = (detail_limits.nearest, (len(surfels),))
-        others["detail_limits.farthest"] = (detail_limits.farthest, (len(surfels),))
-    check_tensors(others, dtype=means.dtype, device=means.device)
-    return background
+        expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
+    if limits is not None:
+        expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
+        expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
+    check_tensors(expected, dtype=surfels.means.dtype, device=surfels.means.device)

@@ -21,6 +21,9 @@ from nexwarp.model.model import Model
 from nexwarp.run.log import peak_memory
 from nexwarp.train import trainer
 
+REFRESH_SECONDS = 0.5
+LOG_LINES = 20
+
 
 def describe_exposures(model: Model) -> str:
     """How far the photos that a model was learned from differ."""
@@ -40,10 +43,6 @@ def device_name(device: torch.device) -> str:
 def warn(console: Console, text: str) -> None:
     """Print a warning."""
     console.print(f"warning: {text}", soft_wrap=True, markup=False, highlight=False)
-
-
-REFRESH_SECONDS = 0.5
-LOG_LINES = 20
 
 
 class TrainingDisplay:
@@ -100,12 +99,12 @@ def memory(device: torch.device) -> str:
 
 
 @contextmanager
-def counting(console: Console, title: str, total: int) -> Iterator:
+def counting(console: Console, title: str, total: int) -> Iterator[Callable[..., None]]:
     """Yield a function to call once an item is done."""
     columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(title, total=total)
-        yield lambda device_name=None: progress.advance(task)
+        yield lambda _name=None: progress.advance(task)
 
 
 @contextmanager
@@ -126,7 +125,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 
 
 @contextmanager
-def loading(console: Console) -> Iterator:
+def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
     """Yield a function to call with the number of photos read and their total."""
     columns = (TextColumn("reading photos"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:

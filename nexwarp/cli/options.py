@@ -17,15 +17,10 @@ def option(metavar: str, default: str | None = None) -> Any:
 
 
 Scene_ = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-
 Run_ = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-
 Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda where there is one, else cpu")]
-
 Preset_ = Annotated[str, option("{default,paper}")]
-
 Port_ = Annotated[int, option("PORT")]
-
 Host_ = Annotated[str, option("ADDRESS")]
 
 

@@ -1,54 +1,40 @@
 """`nexwarp train`."""
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 import tyro
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.device import keep_freed_memory, pick_device
-from nexwarp.cli.display import device_name, warn
-from nexwarp.cli.eval import evaluate_run, figures
+from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
-from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import show_until_interrupted
 from nexwarp.data import Scene
-from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, SettingError, StorageError
-from nexwarp.io.json_files import write_json
-from nexwarp.model.model import Model
-from nexwarp.model.model_file import load, save_model
+from nexwarp.errors import SettingError
+from nexwarp.io.json_files import Json
 from nexwarp.run.folder import (
-    CAMERAS_FILE,
     DEMO,
     SceneSource,
-    check_room,
     create_run,
     keep_camera_path,
     prepare_run,
     read_run,
-    tidy_run,
 )
-from nexwarp.run.log import TrainingLog, check_tensorboard
-from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
+from nexwarp.run.log import check_tensorboard
 from nexwarp.train.config import Config
-from nexwarp.train.health import needed_memory
 from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
-
-CHECKPOINTS_A_RUN = 10
-DIVERGED_FILE = "diverged.json"
 
 
 @dataclass
@@ -114,27 +100,15 @@ class Train:
         source = self._source()
         run = self.run or Path("runs") / source.name
         resume = prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
-        if self.checkpoint_every is not None and self.checkpoint_every < 1:
-            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if resume:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run, resume)
-        if self.tensorboard:
-            check_tensorboard()
-        if self.view:
-            from nexwarp.viewer import check_server
-
-            check_server(self.host, self.port)
-        if self.downscale < 1:
-            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
+        self._check()
         console.print(f"{source.name} on {device_name(device)}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = source.load(progress)
-        if scene.background is not None and not resume:
-            if "background" in parse_settings(self.settings):
-                raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
-            config = dataclasses.replace(config, background=scene.background)
+        config = self._with_background(config, scene, resume)
         size = scene.train[0].camera
         console.print(
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
@@ -143,35 +117,46 @@ class Train:
         if device.type == "cpu":
             keep_freed_memory()
         trainer = Trainer(scene, config, device)
-        kept = sum((run / name).is_dir() for name in CHECKPOINTS) if resume else 0
-        # While one is written, the last two are there too.
-        check_room(run, max(4 - kept, 1) * trainer.checkpoint_size())
+        session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
         if resume:
-            tidy_run(run)
-        if resume and has_checkpoint(run):
-            trainer.restore(run, partial(warn, console))
-            console.print(f"resumed at iteration {trainer.iteration:,}")
-        elif self.resume:
-            console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
+            session.resume()
+        else:
+            session.check_room()
+            if self.resume:
+                console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
         with self._viewer(trainer, run, source.name, console) as viewer:
             if not resume:
                 create_run(run, source, config, device.type)
-            _train(trainer, run, console, viewer, tensorboard=self.tensorboard, every=self.checkpoint_every)
-            try:
-                model = _finish(trainer, scene, run, device, console)
-            except OSError as error:
-                raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
-            except (MemoryError, RuntimeError) as error:
-                if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
-                    raise
-                raise OutOfMemoryError(
-                    f"out of memory: it needed {needed}; the training is done and kept: --resume finishes the run"
-                ) from error
+            session.train(viewer)
+            model = session.finish()
             if viewer is not None:
                 viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
                 show_until_interrupted(viewer, console)
 
-    def _viewer(self, trainer: Trainer, run: Path, title: str, console: Console) -> Any:
+    def _check(self) -> None:
+        """Raise SettingError for flags that do not make sense, before the photos are read."""
+        if self.checkpoint_every is not None and self.checkpoint_every < 1:
+            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
+        if self.downscale < 1:
+            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
+        if self.tensorboard:
+            check_tensorboard()
+        if self.view:
+            from nexwarp.viewer import check_server
+
+            check_server(self.host, self.port)
+
+    def _with_background(self, config: Config, scene: Scene, resume: bool) -> Config:
+        """Take the background that the scene's photos are put on, unless the run has one already."""
+        if scene.background is None or resume:
+            return config
+        if "background" in parse_settings(self.settings):
+            raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
+        return dataclasses.replace(config, background=scene.background)
+
+    def _viewer(
+        self, trainer: Trainer, run: Path, title: str, console: Console
+    ) -> AbstractContextManager["Viewer | None"]:
         """A context with the viewer of a training, or with None."""
         if not self.view:
             return nullcontext()
@@ -216,32 +201,42 @@ class Train:
 
     def _config(self, run: Path, resume: bool = False) -> Config:
         """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
-        given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic or None}
-        given = {name: value for name, value in given.items() if value is not None}
+        flags: dict[str, Json] = {
+            "iterations": self.iterations,
+            "max_surfels": self.max_surfels,
+            "max_hits": self.max_hits,
+            "seed": self.seed,
+            "mask_mode": self.mask_mode,
+            "deterministic": self.deterministic or None,
+        }
+        given: dict[str, Json] = {name: value for name, value in flags.items() if value is not None}
         check_max_hits(self.max_hits)
         settings = self._settings(given)
         if resume:
-            config = read_run(run)[1]
-            for name, value in given.items():
-                if getattr(config, name) != value:
-                    flag = f"--{name.replace('_', '-')}"
-                    raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
-            changed = with_flag_settings(config, settings)
-            for name in settings:
-                old, new = setting(config, name), setting(changed, name)
-                if name == "cuda_graphs":  # shapes nothing
-                    config = dataclasses.replace(config, cuda_graphs=new)
-                elif old != new:
-                    raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
-            return config
+            return self._resumed_config(run, given, settings)
         base = preset(self.preset)
         if self.scene == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
-        return with_flag_settings(dataclasses.replace(base, **given), settings)
+        return with_flag_settings(with_settings(base, given), settings)
 
-    def _settings(self, given: dict[str, Any]) -> dict[str, Any]:
-        """What --set asks for; a setting has one flag alone."""
+    def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
+        """Settings of the run to resume; SettingError names a given one that differs."""
+        config = read_run(run)[1]
+        for name, value in given.items():
+            if getattr(config, name) != value:
+                flag = f"--{name.replace('_', '-')}"
+                raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
+        changed = with_flag_settings(config, settings)
+        for name in settings:
+            old, new = setting(config, name), setting(changed, name)
+            if name == "cuda_graphs":  # the one setting that does not change a run's results
+                config = dataclasses.replace(config, cuda_graphs=changed.cuda_graphs)
+            elif old != new:
+                raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
+        return config
+
+    def _settings(self, given: dict[str, Json]) -> dict[str, Json]:
+        """What --set asks for; a setting that has a flag of its own must not be there."""
         try:
             settings = parse_settings(self.settings)
         except ValueError as error:
@@ -251,101 +246,3 @@ class Train:
                 flag = f"--{name.replace('_', '-')}"
                 raise SettingError(f"--set: {name}: expected {flag} alone, got {name} with --set")
         return settings
-
-
-def _train(
-    trainer: Trainer,
-    run: Path,
-    console: Console,
-    viewer: "Viewer | None" = None,
-    *,
-    tensorboard: bool = False,
-    every: int | None = None,
-) -> None:
-    """Run the loop with its display and log; keep checkpoints on the way and when a signal asks to stop."""
-    total = trainer.config.iterations
-    every = every or max(total // CHECKPOINTS_A_RUN, 1)
-    shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
-    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, deferred_stop() as asked:
-
-        def observe(step: Any) -> None:
-            shown(step)
-            with _rescued(trainer, run):
-                log(step)
-            if viewer is not None:
-                viewer.between_steps(step.iteration, partial(_describe, step), lambda: asked() is not None)
-            if step.iteration % every == 0 or step.iteration == total or asked() is not None:
-                with _rescued(trainer, run):
-                    trainer.save(run)
-            if (number := asked()) is not None:
-                raise Stopped(number)
-
-        def tell(text: str) -> None:
-            warn(console, text)
-            log.rewind()
-
-        try:
-            trainer.run(observe, tell)
-        except DivergedError as error:
-            # The trainer is in its last good state.
-            report = {"message": str(error), **error.report}
-            kept = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
-            try:
-                write_json(run / DIVERGED_FILE, report)
-                save_model(run, trainer.model())
-            except OSError as problem:
-                kept = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
-            raise DivergedError(f"{error}; {kept}", report) from None
-
-
-@contextmanager
-def _rescued(trainer: Trainer, run: Path) -> Iterator[None]:
-    """Where the disk takes no more in a block, keep at least the model, which is smaller than a checkpoint."""
-    try:
-        yield
-    except OSError as error:
-        try:
-            save_model(run, trainer.model())
-            model = "the model as it is now is saved"
-        except OSError:
-            model = "the model cannot be saved either"
-        rest = "the last checkpoint is kept, --resume continues from it" if has_checkpoint(run) else "no checkpoint yet"
-        raise StorageError(f"{error}; training stops at iteration {trainer.iteration:,}: {model}, {rest}") from error
-
-
-def _describe(step: Any) -> str:
-    return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"
-
-
-def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> Model:
-    """Write the model, evaluate what was written, and return that."""
-    with display.stages(console) as observe:
-        finished = trainer.finish(observe)
-    file = save_model(run, finished)
-    sets = {"train": scene.train, "test": scene.test}
-    save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
-    model = load(run).to(device)
-    rate = trainer.iteration / max(trainer.seconds, 1e-9)
-    facts = {
-        "preset": trainer.config.preset,
-        "iterations": trainer.iteration,
-        "surfels": len(model.surfels),
-        "megabytes": file.stat().st_size / 1e6,
-        "seconds": trainer.seconds,
-        "iterations_per_second": rate,
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-    }
-    rows = {}
-    if scene.test:
-        rows = figures(evaluate_run(model, scene, run, console, {"mask_mode": trainer.config.mask_mode}, facts))
-    rows |= {
-        "surfels": f"{facts['surfels']:,}",
-        "model file": f"{facts['megabytes']:.1f} MB",
-        "training": f"{facts['seconds']:.0f} s, {rate:.1f} it/s",
-        "run": str(run),
-    }
-    console.print(display.results_table(rows, f"{len(scene.test)} test views"))
-    if scene.test:
-        first = Path(scene.test[0].name).with_suffix("")
-        console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
-    return model

@@ -7,10 +7,11 @@ from typing import overload
 
 import torch
 from torch import nn
+from typing_extensions import Unpack
 
 from nexwarp.camera import Camera
 from nexwarp.io.json_files import Json
-from nexwarp.model.options import RenderOptions
+from nexwarp.model.options import RenderChanges, RenderOptions
 from nexwarp.render import Color, Rendering, render
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
@@ -79,10 +80,10 @@ class Model(nn.Module):
         self,
         camera: Camera,
         *,
-        background: Color | None = None,
-        depth_jitter: float | torch.Tensor = 0.0,
-        generator: torch.Generator | None = None,
-        **changes: object,
+        background: Color | None = ...,
+        depth_jitter: float | torch.Tensor = ...,
+        generator: torch.Generator | None = ...,
+        **changes: Unpack[RenderChanges],
     ) -> Rendering: ...
 
     @overload
@@ -90,10 +91,10 @@ class Model(nn.Module):
         self,
         camera: Sequence[Camera],
         *,
-        background: Color | None = None,
-        depth_jitter: float | torch.Tensor = 0.0,
-        generator: torch.Generator | None = None,
-        **changes: object,
+        background: Color | None = ...,
+        depth_jitter: float | torch.Tensor = ...,
+        generator: torch.Generator | None = ...,
+        **changes: Unpack[RenderChanges],
     ) -> list[Rendering]: ...
 
     def render(
@@ -103,7 +104,7 @@ class Model(nn.Module):
         background: Color | None = None,
         depth_jitter: float | torch.Tensor = 0.0,
         generator: torch.Generator | None = None,
-        **changes: object,
+        **changes: Unpack[RenderChanges],
     ) -> Rendering | list[Rendering]:
         """Render the scene as `nexwarp render` shows it: with exposures and detail limits. Differentiable.
 
@@ -143,7 +144,7 @@ class Model(nn.Module):
             detail_limits=self.detail_limits if options.detail_limits else None,
         )
 
-    def bare(self, **changes: object) -> "Model":
+    def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model of the same surfels alone, without texture, exposures and detail limits.
 
         Args:

@@ -183,14 +183,14 @@ def _no_model(path: Path, error: Exception) -> FormatError:
 
 
 def _read_options(meta: dict[str, Json]) -> RenderOptions:
-    """Take the options out of the metadata; raise ValueError or TypeError unless they and other numbers are sound."""
+    """Take the options out of the metadata; raise ValueError or TypeError where a value is not as expected."""
     names = [field.name for field in dataclasses.fields(RenderOptions)]
     missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
     if missing:
         raise ValueError(f"no {missing[0]} in the metadata")
-    values = {name: meta.pop(name) for name in names if name in meta}
-    if isinstance(values["background"], list):
-        values["background"] = tuple(values["background"])
+    values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
+    if isinstance(color := values["background"], list):
+        values["background"] = tuple(color)
     for name in ("near", "scene_scale", "smooth_sh"):
         if name in meta:
             value = meta[name]

@@ -3,13 +3,26 @@
 import dataclasses
 import numbers
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, get_args
+
+from typing_extensions import Unpack
 
 from nexwarp.checks import check_range
 from nexwarp.kernels.types import MAX_HITS
 
 Exposure = Literal["photos", "mean"]
 LARGEST_COLOR = 1e6
+
+
+class RenderChanges(TypedDict, total=False):
+    """Fields of `RenderOptions`, but for the background, to change for one rendering."""
+
+    max_hits: int
+    sh_degree: int
+    low_pass: bool
+    clamp_texture: bool
+    exposure: Exposure
+    detail_limits: bool
 
 
 @dataclass(frozen=True)
@@ -57,10 +70,10 @@ class RenderOptions:
                 raise TypeError(f"background: expected three numbers, got {self.background!r:.60}")
             check_range("background", float(value), -LARGEST_COLOR, LARGEST_COLOR)
 
-    def changed(self, **changes: object) -> "RenderOptions":
+    def changed(self, **changes: Unpack["RenderChanges"]) -> "RenderOptions":
         """Return these options with other values; TypeError and ValueError name the field."""
         known = [field.name for field in dataclasses.fields(self)]
         for name in changes:
             if name not in known:
                 raise TypeError(f"{name}: expected one of the options {', '.join(known)}")
-        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]  # checked by __post_init__
+        return dataclasses.replace(self, **changes)

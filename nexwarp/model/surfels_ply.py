@@ -138,10 +138,11 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
             raise FormatError(f"{path}: expected {start + count * dtype.itemsize} bytes, got {size}")
         file.seek(start)
         vertices = np.fromfile(file, dtype, count)
-    rest = sum(name.startswith("f_rest_") for name in dtype.names)
+    names = dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
     expected = ["x", "y", "z", *_names("f_dc", 3), *_names("f_rest", rest), "opacity", *_names("scale", 2)]
     expected += [*_names("rot", 4), *_names("gamma", 2)]
-    missing = [name for name in expected if name not in dtype.names]
+    missing = [name for name in expected if name not in names]
     if missing:
         raise FormatError(f"{path}: expected the properties of nexwarp surfels, found no {missing[0]}")
 

@@ -101,8 +101,15 @@ class Exposures(nn.Module):
             kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
             fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
             _, _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
-        tensors = (gains, positions, directions, coefficients.round(decimals=5), mean, torch.stack([size, length]))
-        return cls(*(x.float() for x in tensors), torch.tensor([float(x) for x in falloff or EVEN]))
+        return cls(
+            gains.float(),
+            positions.float(),
+            directions.float(),
+            coefficients.round(decimals=5).float(),
+            mean.float(),
+            torch.stack([size, length]).float(),
+            torch.tensor([float(x) for x in falloff or EVEN]),
+        )
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Its buffers by name; `Exposures(**tensors)` makes it again."""
@@ -151,7 +158,8 @@ def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
 def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Spread of cameras' positions (V, 3), and squares (V, V) of how far poses are apart."""
     size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
-    return size, torch.cdist(*[torch.cat([positions, size * directions], 1)] * 2).square()
+    poses = torch.cat([positions, size * directions], 1)
+    return size, torch.cdist(poses, poses).square()
 
 
 def _fit(

@@ -61,30 +61,11 @@ class NeuralTexture(nn.Module):
             ValueError: naming the argument that is out of its range.
         """
         super().__init__()
-        for name, value, low, high in (
-            ("levels", levels, 1, 64),
-            ("table_size", table_size, 1, 2**30),
-            ("width", width, 1, 4096),
-            ("hidden_layers", hidden_layers, 0, 64),
-            ("sh_degree", sh_degree, 0, 3),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-            check_range(name, value, low, high)
-        for name, value in (("residual", residual), ("down_weighting", down_weighting)):
-            if not isinstance(value, bool):
-                raise TypeError(f"{name}: expected True or False, got {value!r}")
-        if table_size & (table_size - 1):
-            raise ValueError(f"table_size: expected a power of two, got {table_size}")
-        if isinstance(features, bool) or not isinstance(features, int):
-            raise TypeError(f"features: expected an int, got {type(features).__name__}")
-        if features not in (1, 2, 4, 8):
-            raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
-        for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-        check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
-        check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
+        _check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
+        _check_resolutions(min_resolution, max_resolution)
+        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected True or False, got {flag!r}")
         self.config = {
             "levels": levels,
             "table_size": table_size,
@@ -195,3 +176,32 @@ class NeuralTexture(nn.Module):
             clamp=clamp,
             half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
         )
+
+
+def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
+    """Raise TypeError or ValueError unless each size of a field is an int in its range."""
+    for name, value, low, high in (
+        ("levels", levels, 1, 64),
+        ("table_size", table_size, 1, 2**30),
+        ("width", width, 1, 4096),
+        ("hidden_layers", hidden_layers, 0, 64),
+        ("sh_degree", sh_degree, 0, 3),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, low, high)
+    if table_size & (table_size - 1):
+        raise ValueError(f"table_size: expected a power of two, got {table_size}")
+    if isinstance(features, bool) or not isinstance(features, int):
+        raise TypeError(f"features: expected an int, got {type(features).__name__}")
+    if features not in (1, 2, 4, 8):
+        raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
+
+
+def _check_resolutions(min_resolution: float, max_resolution: float) -> None:
+    """Raise TypeError or ValueError unless the resolutions are numbers in their ranges."""
+    for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+    check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TypedDict, cast
 
 import torch
 
@@ -11,6 +11,26 @@ from nexwarp.data import View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
+
+
+class Evaluation(TypedDict, total=False):
+    """Metrics of held-out views: those asked for, each the mean over the views, and each view's own.
+
+    Attributes:
+        psnr: dB.
+        ssim: 0 to 1.
+        flip: 0 to 1, lower is better; None where its package is not there.
+        lpips: lower is better; None where its package is not there.
+        views: the same by the view's name.
+        convention: how the metrics are computed.
+    """
+
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    views: dict[str, dict[str, float | None]]
+    convention: str
 
 
 @torch.no_grad()
@@ -22,7 +42,7 @@ def evaluate(
     mask_mode: str = "ignore",
     metrics: Sequence[str] = ("psnr", "ssim"),
     progress: Callable[[str], None] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Render views and compare them with their photos.
 
     Args:
@@ -34,8 +54,8 @@ def evaluate(
             a mask ignores them, and None where their packages are not there.
         progress: called with each view's name when it is done.
 
-    Returns:
-        Each metric (PSNR in dB): mean over views; "views": name -> the same; "convention".
+    Raises:
+        ValueError: no views, or an unknown metric.
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
@@ -61,11 +81,12 @@ def evaluate(
         if progress is not None:
             progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
-    return {**means, "views": results, "convention": CONVENTION}
+    return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
 
 
 def _mean(values: list[float | None]) -> float | None:
-    return None if None in values else fmean(values)
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
 
 
 def _whole(metric: Callable[..., float | None]) -> Callable[..., float | None]:

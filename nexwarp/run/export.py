@@ -37,9 +37,9 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
         save_surfels_ply(files[0], model.surfels)
         # A training that was broken off leaves a model without cameras.
         groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
-        cameras = [camera for members in groups for camera in members.values()]
+        every = [camera for members in groups for camera in members.values()]
         degree = model.options.sh_degree
-        save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        save_splats_ply(files[1], model.surfels, degree, cameras=every, max_extent=max_extent)
         return files
     sets = load_cameras(run / CAMERAS_FILE)
     # Named as from the scene's folder: a transforms.json lies there.

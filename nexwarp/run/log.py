@@ -5,12 +5,15 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TextIO, TypedDict
 
 import torch
 
 from nexwarp.io.files import written_aside
 from nexwarp.train.trainer import Progress, Trainer
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 LOG_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
@@ -53,6 +56,20 @@ def peak_memory(device: torch.device) -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
+class LogLine(TypedDict):
+    """One line of the log, as `TrainingLog` describes it."""
+
+    iteration: int
+    loss: float
+    losses: dict[str, float]
+    psnr: float
+    surfels: int
+    iterations_per_second: float
+    seconds: float
+    memory_bytes: int | None
+    rates: dict[str, float]
+
+
 class TrainingLog:
     """Observes a training and writes `metrics.jsonl`, a JSON object a line, flushed at once.
 
@@ -82,8 +99,8 @@ class TrainingLog:
         total = trainer.config.iterations
         self.every = max(min(EVERY, total // MIN_LINES), 1)
         self.last = trainer.iteration
-        self.file: Any = None
-        self.writer: Any = None
+        self.file: TextIO | None = None
+        self.writer: SummaryWriter | None = None
 
     def __enter__(self) -> "TrainingLog":
         keep_lines(self.run / LOG_FILE, self.trainer.iteration)
@@ -108,6 +125,7 @@ class TrainingLog:
 
     def rewind(self) -> None:
         """Drop the lines beyond the trainer's iteration, after it has gone back."""
+        assert self.file is not None
         self.file.close()
         keep_lines(self.run / LOG_FILE, self.trainer.iteration)
         self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
@@ -118,6 +136,7 @@ class TrainingLog:
         # From 1 on: steps that are multiples of something often do more than others, such as to look beyond the frame.
         if (step.iteration - 1) % self.every and step.iteration != self.trainer.config.iterations:
             return
+        assert self.file is not None
         line = self._line(step)
         self.file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
         self.file.flush()
@@ -126,7 +145,7 @@ class TrainingLog:
                 self.writer.add_scalar(tag, value, step.iteration)
             self.writer.flush()
 
-    def _line(self, step: Progress) -> dict[str, Any]:
+    def _line(self, step: Progress) -> LogLine:
         # One transfer for all terms; it waits for the step, so the time is taken after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr, now = step.psnr(), time.perf_counter()
@@ -176,14 +195,14 @@ def _iteration(line: bytes) -> float:
     return iteration if type(iteration) is int else math.inf
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """The same with null for what JSON cannot express."""
     if isinstance(value, dict):
         return {name: _finite(x) for name, x in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _scalars(line: dict[str, Any]) -> list[tuple[str, float]]:
+def _scalars(line: LogLine) -> list[tuple[str, float]]:
     """Tags and values for TensorBoard."""
     tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
     tags |= {f"loss/{name}": value for name, value in line["losses"].items()}

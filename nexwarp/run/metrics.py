@@ -74,8 +74,8 @@ def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
     test, reference = _unit_images(image, target)
     try:
         from flip_evaluator import evaluate
-    except ImportError as error:
-        warnings.warn(f"FLIP is left out: {error} (pip install nexwarp[flip])", RuntimeWarning, stacklevel=2)
+    except ImportError as missing:
+        warnings.warn(f"FLIP is left out: {missing} (pip install nexwarp[flip])", RuntimeWarning, stacklevel=2)
         return None
     pair = (x.cpu().contiguous().numpy() for x in (reference, test))
     _, error, _ = evaluate(*pair, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})

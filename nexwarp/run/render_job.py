@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import torch
 
@@ -49,7 +49,7 @@ class RenderJob:
     pictures: list[Picture]
     video: Path | None
     fps: float
-    exposure: str = "photos"
+    exposure: Exposure = "photos"
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -156,7 +156,7 @@ class RenderOrder:
                 pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
-        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, self.exposure)
+        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure, self.exposure))
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
         """Folder of the frames, cameras, frames a second."""

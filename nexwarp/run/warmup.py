@@ -141,4 +141,4 @@ def tiny_scene() -> Scene:
 def cached_binaries() -> set[Path]:
     """Return what lies compiled in Warp's cache."""
     wp.init()  # finds out where the cache is
-    return {path for path in Path(wp.config.kernel_cache_dir).glob("*/*") if path.suffix in BINARIES}
+    return {path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in BINARIES}

@@ -11,6 +11,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
+from nexwarp.model.options import RenderChanges
 from nexwarp.render import Rendering
 from nexwarp.representation.surfels import Surfels
 
@@ -105,16 +106,16 @@ def draw(
         hits = MAX_HITS
     if settings.mode not in TEXTURED:
         model = Model(model.surfels, None, model.exposures, model.detail_limits, model.options)
-    options = model.options.changed(
-        max_hits=hits,
-        sh_degree=min(settings.sh_degree, model.options.sh_degree),
-        exposure="photos" if settings.photo_exposure else "mean",
-    )
+    changes: RenderChanges = {
+        "max_hits": hits,
+        "sh_degree": min(settings.sh_degree, model.options.sh_degree),
+        "exposure": "photos" if settings.photo_exposure else "mean",
+    }
     parts: list[torch.Tensor] = []
     for camera in bands:
         if parts and stale():
             return None
-        out = model.render(camera, **vars(options))
+        out = model.render(camera, **changes)
         parts.append(_values(out, model.surfels, camera, settings))
     colours, span = _colours(torch.cat(parts), settings.mode)
     pixels = (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
