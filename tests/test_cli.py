@@ -110,11 +110,11 @@ def test_the_model_is_that_of_the_last_iteration(trained):
     model = nw.load(trained)
     metrics = read(trained, "metrics.json")
     assert len(model.surfels) == metrics["surfels"] <= 100
-    assert model.meta["iteration"] == 20 and model.meta["preset"] == "default" and model.meta["sh_degree"] == 3
+    assert model.meta["iteration"] == 20 and model.meta["preset"] == "default" and model.options.sh_degree == 3
     cameras = load_cameras(trained / "cameras.json")
     assert list(cameras["test"]) == ["view_000.png", "view_008.png"] and len(cameras["train"]) == 8
     with torch.no_grad():
-        out = nw.render(model.surfels, model.texture, cameras["test"]["view_000.png"], **model.render_options)
+        out = model.render(cameras["test"]["view_000.png"])
     assert torch.equal(to_uint8(out.image), picture(trained / "renders" / "test" / "view_000.png"))
 
 
@@ -129,7 +129,7 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
         assert word in out, word
     settings = config_from_dict(read(run, "config.json")["config"])
     assert (settings.max_hits, settings.seed) == (0, 3)
-    assert nw.load(run).meta["max_hits"] == 0
+    assert nw.load(run).options.max_hits == 0
 
 
 def test_default_run_folder_is_named_after_the_scene(scene, tmp_path, monkeypatch):
@@ -717,7 +717,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
     given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
     assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given
     assert config["config"]["background"] == [0.0, 0.5, 1.0]
-    assert nw.load(run).meta["background"] == [0.0, 0.5, 1.0]
+    assert nw.load(run).options.background == (0.0, 0.5, 1.0)
     before = read(run, "metrics.json")["psnr"]
     assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
     assert read(run, "metrics.json")["psnr"] == pytest.approx(before, abs=1e-6)

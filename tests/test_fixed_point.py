@@ -79,9 +79,9 @@ def test_collection_in_fixed_point(low_pass: bool, max_hits: int, switched: Any)
     for fixed in (False, True):
         switched(fixed)
         passes = Passes(scene, low_pass=low_pass, max_hits=max_hits)
-        passes.hits.watch.errors = errors_of(scene)
+        passes.hits.error_request.errors = errors_of(scene)
         gradients, alone = passes.gradients(), passes.blended(errors_of(scene))
-        results.append(gradients | {"watched": passes.hits.watch.sums, "alone": alone})
+        results.append(gradients | {"watched": passes.hits.error_request.sums_after_backward, "alone": alone})
     for name, plain in results[0].items():
         assert plain.abs().max() > 0, name
         assert_close(results[1][name], plain, kind="gradient", name=name)
@@ -117,10 +117,10 @@ def test_gradients_repeat_bit_for_bit() -> None:
     try:
         for _ in range(5):
             out = nw.render(surfels, texture, camera)
-            watch = out.request_splat_error(out.alpha.detach())
+            request = out.request_splat_error(out.alpha.detach())
             parameters = [*surfels.parameters(), *texture.parameters()]
             grads = torch.autograd.grad(out.image.square().sum() + out.weights.square().sum(), parameters)
-            found.append([*grads, watch.sums, out.splat_error(out.alpha.detach())])
+            found.append([*grads, request.sums_after_backward, out.splat_error(out.alpha.detach())])
     finally:
         torch.use_deterministic_algorithms(False)
     for other in found[1:]:

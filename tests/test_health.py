@@ -278,7 +278,7 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     def fail(*_: Any, **__: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has 1 KiB free")
 
-    monkeypatch.setattr(trainer, "render", fail)
+    monkeypatch.setattr("nexwarp.model.model.render", fail)
     run = Trainer(scene, dataclasses.replace(SMALL, max_surfels=48), "cpu")
     with pytest.raises(OutOfMemoryError) as caught:
         run.run()

@@ -85,11 +85,11 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
     for count in (1, 2, 3):
         launch.set_num_threads(count)
         passes = Passes(scene, low_pass=low_pass)
-        watch = passes.hits.watch
-        watch.errors = errors
+        request = passes.hits.error_request
+        request.errors = errors
         results.append(passes.buffers() | {"blended": passes.blended(errors)})
         results[-1] |= {f"grad_{name}": grad for name, grad in passes.gradients().items()}
-        results[-1]["watched"] = watch.sums
+        results[-1]["watched"] = request.sums_after_backward
     assert len(launch.chunks(4 * 3 * 16**2)) > 3  # there was something to share out
     assert_identical(results)
 
@@ -204,9 +204,9 @@ def test_watching_the_backward_pass_gives_the_blended_error():
     scene = random_scene(40, seed=5)
     errors = errors_of(scene)
     passes = Passes(scene)
-    passes.hits.watch.errors = errors
+    passes.hits.error_request.errors = errors
     watched = passes.gradients()
-    assert_close(passes.hits.watch.sums, passes.blended(errors), kind="value", name="sums")
+    assert_close(passes.hits.error_request.sums_after_backward, passes.blended(errors), kind="value", name="sums")
     plain = Passes(scene).gradients()
     assert all(torch.equal(watched[name], plain[name]) for name in plain)
 

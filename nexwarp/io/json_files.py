@@ -10,7 +10,7 @@ from nexwarp.io.files import one_line, write_atomically
 # What reading a damaged file of ours may raise.
 READ_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
-Json: TypeAlias = Union[None, bool, int, float, str, list["Json"], dict[str, "Json"]]  # noqa: UP007  # recursive
+Json: TypeAlias = Union[bool, int, float, str, list["Json"], dict[str, "Json"], None]  # noqa: UP007  # recursive
 
 
 def write_json(path: Path, data: object) -> None:

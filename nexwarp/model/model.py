@@ -121,7 +121,7 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
-        if isinstance(camera, Sequence):
+        if isinstance(camera, Sequence) and not isinstance(camera, str):
             return [
                 self.render(item, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
                 for item in camera
