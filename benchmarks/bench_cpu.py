@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, cloud, geometry, outputs, random_like
+from benchmarks.scenes import SurfelScene, cloud, geometry, outputs, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, ratio
 from nexwarp import ops
@@ -25,7 +25,7 @@ def run(options: Options) -> list[Measurement]:
     return collection(cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320), options)
 
 
-def collection(scene: Scene, options: Options) -> list[Measurement]:
+def collection(scene: SurfelScene, options: Options) -> list[Measurement]:
     """Forward + backward of the pass alone, with 1 and 2 threads; ours should agree bit for bit.
 
     Torch is held to its better number of threads: on a busy machine its second one may cost more than it brings.

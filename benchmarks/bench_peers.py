@@ -12,7 +12,7 @@ import torch
 
 from benchmarks import suite
 from benchmarks.bench_collect import stage
-from benchmarks.scenes import Geometry, Scene, garden, geometry, random_like
+from benchmarks.scenes import Geometry, SurfelScene, garden, geometry, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, ratio
 
@@ -39,7 +39,7 @@ def run(options: Options) -> list[Measurement]:
     return [*ours, *theirs, *ratios]
 
 
-def gsplat_2dgs(scene: Scene, options: Options, gsplat) -> list[Measurement]:
+def gsplat_2dgs(scene: SurfelScene, options: Options, gsplat) -> list[Measurement]:
     rasterize, leaves = gsplat_call(geometry(scene), gsplat)
     with torch.no_grad():
         signals = random_like(rasterize())

@@ -11,7 +11,7 @@ import torch
 
 import nexwarp as nw
 from benchmarks import suite
-from benchmarks.scenes import Scene, cloud, random_like, texture
+from benchmarks.scenes import SurfelScene, cloud, random_like, texture
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure
 
@@ -130,18 +130,18 @@ def left_out(last: Measurement, axis: str, points: list[Point], reason: str) -> 
     return replace(last, note="; ".join(filter(None, (last.note, note))))
 
 
-def scene_at(point: Point, before: Scene | None, sweep: Sweep, options: Options) -> Scene:
-    """Make a cloud and its texture, or see the ones before in an image of another size."""
+def scene_at(point: Point, before: SurfelScene | None, sweep: Sweep, options: Options) -> SurfelScene:
+    """Make a cloud and its texture, or keep the ones before and change the image's size."""
     height = round((1e6 * point.megapixels / ASPECT) ** 0.5)
     width = round(ASPECT * height)
     if before is None or len(before.surfels) != point.surfels:
         made = cloud(point.surfels, width, height).to(options.device)
-        return replace(made, texture=texture(made, table_size=sweep.table_size))
+        return replace(made, model=nw.Model(made.surfels, texture(made, table_size=sweep.table_size)))
     seen = cloud(1, width, height).to(options.device)
     return replace(before, name=f"cloud {point.surfels:,} at {width}x{height}", cameras=seen.cameras)
 
 
-def at_size(scene: Scene, hits: int, sweep: Sweep, options: Options) -> list[Measurement]:
+def at_size(scene: SurfelScene, hits: int, sweep: Sweep, options: Options) -> list[Measurement]:
     field = texture(scene) if hits else None
     leaves = [*scene.surfels.parameters(), *(field.parameters() if field else ())]
 

@@ -31,7 +31,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from benchmarks.fuzz_inputs import Files, damage, strategy
-from benchmarks.fuzz_targets import TARGETS, Target
+from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
 HANG = 5.0  # seconds an input
 MEMORY = 10**9  # bytes beyond what the process has before its first input
@@ -96,7 +96,7 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
     return "loaded"
 
 
-def fuzz(target: Target, *, seconds: float, inputs: int, seed: int, driver: str, failed: Path) -> Result:
+def fuzz(target: FuzzTarget, *, seconds: float, inputs: int, seed: int, driver: str, failed: Path) -> Result:
     """Run a target until time or inputs are used up.
 
     Args:
@@ -121,7 +121,7 @@ def fuzz(target: Target, *, seconds: float, inputs: int, seed: int, driver: str,
 
 
 def _batch(
-    target: Target,
+    target: FuzzTarget,
     valid: list[Files],
     folder: Path,
     result: Result,
@@ -167,7 +167,7 @@ def _batch(
     return index + 1
 
 
-def _collect(message: tuple, target: Target, result: Result, folder: Path, failed: Path) -> None:
+def _collect(message: tuple, target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
     if message[0] == "failure":
         _, kind, index, detail, kept = message
         result.failures.append(_saved(Failure(target.name, index, kind, detail), Path(kept), failed))
@@ -192,7 +192,7 @@ def _saved(failure: Failure, folder: Path, failed: Path) -> Failure:
 
 
 def _work(
-    target: Target,
+    target: FuzzTarget,
     valid: list[Files],
     folder: Path,
     report: Connection,
@@ -270,7 +270,7 @@ def _limit_memory() -> None:
 
 
 def _draw(
-    target: Target, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], None]
+    target: FuzzTarget, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], None]
 ) -> None:
     """Run inputs that Hypothesis draws."""
     import hypothesis
@@ -295,7 +295,7 @@ def _draw(
     one()
 
 
-def drive_atheris(target: Target, seconds: float, failed: Path) -> None:
+def drive_atheris(target: FuzzTarget, seconds: float, failed: Path) -> None:
     """Let atheris choose the bytes of a target's first file, watching nexwarp's code; ends the process."""
     try:
         import atheris

@@ -217,10 +217,7 @@ def main(
         trainer = Trainer(scene, config, "cpu")
         trainer.run()
         model = trainer.finish()
-        own, same = (
-            evaluate(model.surfels, model.texture, views, options=model.render_options)["psnr"]
-            for views in (scene.test, reference.test)
-        )
+        own, same = (evaluate(model, views)["psnr"] for views in (scene.test, reference.test))
         size = scene.train[0].camera
         print(
             f"{name:14}  {size.width}x{size.height}  own test photos {own:.2f} dB, "

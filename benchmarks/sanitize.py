@@ -24,7 +24,6 @@ import torch
 import tyro
 import warp as wp
 
-import nexwarp as nw
 from nexwarp.run import warmup
 from nexwarp.train.presets import preset
 from nexwarp.train.trainer import Trainer
@@ -94,9 +93,10 @@ def work(device: torch.device) -> dict[str, int]:
             trainer.step()
             done["steps"] += 1
         trainer.check()
+    model = trainer.model()
     with torch.no_grad():
         for camera in (scene.test[0].camera.to(device), scene.test[0].camera.to(device).crop(-5, 7, 33, 50)):
-            out = nw.render(trainer.surfels, trainer.texture, camera, **trainer.render_options())
+            out = model.render(camera)
             out.splat_error(out.alpha)
             if not bool(torch.isfinite(out.image).all()):
                 raise RuntimeError("the frame is not finite")

@@ -149,7 +149,7 @@ def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, lo
     model = trainer.finish()
     for i in range(count):
         with torch.no_grad():
-            out = nw.render(model.surfels, model.texture, cameras[i % len(cameras)], **model.render_options)
+            out = model.render(cameras[i % len(cameras)])
         del out
         look(i + 1)
 

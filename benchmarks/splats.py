@@ -83,17 +83,18 @@ def main(
         return 2
     model = nw.load(run)
     surfels = untextured(model.surfels).to("cuda")
+    degree = model.options.sh_degree
     sets = load_cameras(run / CAMERAS_FILE)
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "splats.ply"
         cameras = [camera for members in sets.values() for camera in members.values()]
-        save_splats_ply(path, surfels, model.meta["sh_degree"], cameras=cameras)
+        save_splats_ply(path, surfels, degree, cameras=cameras)
         count = len(read_ply(path)["x"])
         for name, camera in list(sets["test"].items())[:max_views]:
             camera = camera.to("cuda")
             with torch.no_grad():
-                mine = nw.render(surfels, None, camera, sh_degree=model.meta["sh_degree"]).image
+                mine = nw.render(surfels, None, camera, sh_degree=degree).image
             figures.append(psnr(to_uint8(draw(path, camera, (0.0, 0.0, 0.0))).cpu(), to_uint8(mine).cpu()))
             print(f"{name}: {figures[-1]:.2f} dB", flush=True)
     print(
