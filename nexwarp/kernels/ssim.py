@@ -25,9 +25,8 @@ import warp as wp
 from nexwarp.kernels.types import types
 
 SIMD_WIDTH = 16
-PAD = (
-    16  # a multiple of SIMD_WIDTH, at least the 5 pixels of 3 values by which the window reaches past the end of a row
-)
+# A multiple of SIMD_WIDTH, at least the 5 pixels of 3 values by which the window reaches past the end of a row.
+PAD = 16
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
