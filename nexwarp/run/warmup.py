@@ -17,7 +17,7 @@ from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.kernels.catalogue import thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads
-from nexwarp.kernels.ssim import LANES
+from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
@@ -55,15 +55,15 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         features=(config.texture.features,) * textured,
         clamps=(config.clamp_texture,) * textured,
         low_passes=(config.low_pass,),
-        ssim_lanes=(LANES if cpu else 1,),
+        ssim_lengths=(SIMD_WIDTH if cpu else 1,),
         cpu=cpu,
-        fixed=config.deterministic,
+        fixed_point=config.deterministic,
     )
     low_passes = (config.low_pass,)
     hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
     if config.densify.floaters or config.footprints:
         hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
-    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed=fixed)
+    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
     return [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 
 
