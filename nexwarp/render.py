@@ -196,21 +196,48 @@ def render(
         if not isinstance(depth_jitter, torch.Tensor) and depth_jitter > 0:
             depth_jitter = jitter_factors(camera, max_hits, depth_jitter, hits.depths.dtype, generator)
         looked_up = hits.depths * depth_jitter if isinstance(depth_jitter, torch.Tensor) else hits.depths
-        positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
-        depths = limited_depths(hits.ids, hits.depths, detail_limits, camera.focal)
-        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
+        texels = _texels(texture, camera, pinhole, hits, looked_up, detail_limits, sh_degree, clamp_texture)
     residual = texture is not None and texture.residual
-    base = hits.base if texture is None or residual else None
-    plain = hits.plain
-    blended = (hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0])
-    if texels is not None:
-        blended = (texels, hits.weights)
-    image, textured = ops.compose(plain, *blended, hits.alpha, background, base)
-    factors = None if exposures is None else exposures.factors(camera).to(image)
-    if factors is not None:
-        image, plain, textured = image * factors, plain * factors, textured * factors
+    factors = None if exposures is None else exposures.factors(camera).to(hits.plain)
+    image, plain, textured = _composed(hits, texels, residual, background, factors)
     intermediates = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
     return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, intermediates)
+
+
+def _texels(
+    texture: NeuralTexture,
+    camera: Camera,
+    pinhole: ops.Pinhole,
+    hits: ops.Hits,
+    looked_up: torch.Tensor,
+    limits: DetailLimits | None,
+    sh_degree: int,
+    clamp: bool,
+) -> torch.Tensor:
+    """The texturing pass: the texture's colours (H, W, K, 3) at the depths `looked_up` (H, W, K)."""
+    positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
+    depths = limited_depths(hits.ids, hits.depths, limits, camera.focal)
+    return texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp)
+
+
+def _composed(
+    hits: ops.Hits,
+    texels: torch.Tensor | None,
+    residual: bool,
+    background: torch.Tensor,
+    factors: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Composition: image, plain and textured, (H, W, 3) each, times the factors of the exposure."""
+    plain = hits.plain
+    if texels is None:  # the textured hits keep their plain colours
+        no_texels, no_weights = plain.new_empty(*plain.shape[:2], 0, 3), hits.weights[..., :0]
+        image, textured = ops.compose(plain, no_texels, no_weights, hits.alpha, background, hits.base)
+    else:
+        base = hits.base if residual else None
+        image, textured = ops.compose(plain, texels, hits.weights, hits.alpha, background, base)
+    if factors is not None:
+        image, plain, textured = image * factors, plain * factors, textured * factors
+    return image, plain, textured
 
 
 def jitter_factors(
