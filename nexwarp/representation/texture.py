@@ -83,10 +83,7 @@ class NeuralTexture(nn.Module):
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
-        ends = torch.tensor([min_resolution, max_resolution], dtype=torch.float64).log()
-        steps = torch.linspace(0.0, 1.0, levels, dtype=torch.float64)
-        resolutions = (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
-        self.register_buffer("resolutions", resolutions)
+        self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):
@@ -177,6 +174,13 @@ class NeuralTexture(nn.Module):
             clamp=clamp,
             half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
         )
+
+
+def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
+    """Return (count,) float32, computed in float64."""
+    ends = torch.tensor([first, last], dtype=torch.float64).log()
+    steps = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+    return (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
 
 
 def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
