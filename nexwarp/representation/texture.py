@@ -83,7 +83,7 @@ class NeuralTexture(nn.Module):
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
-        self.register_buffer("resolutions", _geometric(min_resolution, max_resolution, levels))
+        self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):
@@ -176,8 +176,8 @@ class NeuralTexture(nn.Module):
         )
 
 
-def _geometric(first: float, last: float, count: int) -> torch.Tensor:
-    """(count,) float32 geometric sequence from `first` to `last`; `first` alone where count is 1."""
+def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
+    """Return (count,) float32, computed in float64."""
     ends = torch.tensor([first, last], dtype=torch.float64).log()
     steps = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
     return (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
