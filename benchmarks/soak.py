@@ -24,7 +24,8 @@ from nexwarp.cli.device import keep_freed_memory
 from nexwarp.data import Scene, write_demo
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.trainer import Progress, Trainer
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
 
 MIB = 2**20
 WARMUP, WINDOW = 500, 1000
@@ -203,7 +204,7 @@ class Soak:
         extremes: list[int] = []
         sample, (first, _) = _sampler(samples, self.steps, device), spans(self.steps)
 
-        def observe(step: Progress) -> None:
+        def observe(step: StepReport) -> None:
             if step.iteration >= first.start:
                 extremes[:] = [min([step.surfels, *extremes]), max([step.surfels, *extremes])]
             sample(step.iteration)

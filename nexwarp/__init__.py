@@ -15,19 +15,31 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.render import Rendering, render
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.api import train
+from nexwarp.train.config import Config
+from nexwarp.train.presets import preset
+from nexwarp.train.report import StepReport
+from nexwarp.train.target import Target
+from nexwarp.train.trainer import Trainer
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "Config",
     "Model",
     "NeuralTexture",
     "RenderOptions",
     "Rendering",
     "Scene",
+    "StepReport",
     "Surfels",
+    "Target",
+    "Trainer",
     "View",
     "load",
     "load_scene",
+    "preset",
     "render",
+    "train",
 ]

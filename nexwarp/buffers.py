@@ -1,22 +1,19 @@
-"""All passes of a rendering, those that follow from it too, and their OpenEXR file (see docs/outputs.md)."""
+"""All buffers of a rendering, and their OpenEXR file; docs/outputs.md describes it."""
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
+from typing_extensions import Unpack
 
-from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
-from nexwarp.render import Rendering, limited_depths
+from nexwarp.model.options import RenderChanges
 
 FORMAT = 2
-# Passes that a rendering has itself.
-RENDERED = (
+PASSES = (
     "image",
     "plain",
     "textured",
@@ -24,6 +21,7 @@ RENDERED = (
     "ids",
     "depths",
     "weights",
+    "colors",
     "expected_depth",
     "median_depth",
     "top_depth",
@@ -34,12 +32,12 @@ SLOTS = ("ids", "depths", "weights", "colors")
 
 @dataclass(frozen=True)
 class Buffers:
-    """Every pass of one rendering, float32 unless said. Nothing is differentiable.
+    """All buffers of one rendering, float32 unless stated otherwise; not differentiable.
 
-    Adds up to rounding: image = plain + textured + (1 - alpha) background, textured = sum over k of weights * colors.
+    Up to rounding, image = plain + textured + (1 - alpha) background, and textured = sum over k of weights * colors.
 
     Attributes:
-        image: (H, W, 3) the picture, not clamped.
+        image: (H, W, 3) the final image, not clamped.
         plain: (H, W, 3) blended colours of the hits that are not textured, without background.
         textured: (H, W, 3) sum over the K textured hits of weight * colour.
         alpha: (H, W) 1 - final transmittance.
@@ -48,13 +46,13 @@ class Buffers:
         weights: (H, W, K) their blending weights; 0 in empty slots.
         colors: (H, W, K, 3) their textured colours; 0 in empty slots.
         expected_depth: (H, W) mean z-depth of all hits, weighted by their blending weights; 0 where nothing is hit.
-        median_depth: (H, W) z-depth of the hit that takes the transmittance to 1/2; of the last hit where it stays
-            above; 0 where nothing is hit.
+        median_depth: (H, W) z-depth of the hit at which the transmittance falls to 1/2; of the last hit if it stays
+            above 1/2; 0 where nothing is hit.
         top_depth: (H, W) z-depth of the heaviest hit; 0 where nothing is hit.
-        normals: (H, W, 3) unit, world frame: mean of all hits' normals, weighted by their blending weights, each on the
-            side that faces the camera; 0 where nothing is hit.
-        camera: what was looked through.
-        background: (3,) colour behind everything; (H, W, 3) where a lens darkens it towards the corners.
+        normals: (H, W, 3) unit, world frame: mean of all hits' normals, each facing the camera, weighted by their
+            blending weights; 0 where nothing is hit.
+        camera: the camera of the rendering.
+        background: (3,) background colour, with the exposure applied; (H, W, 3) if the lens has falloff.
     """
 
     image: torch.Tensor
@@ -74,42 +72,36 @@ class Buffers:
 
 
 @torch.no_grad()
-def render_buffers(model: Model, camera: Camera, **changes: object) -> Buffers:
-    """Render every pass of a model; arguments and errors are those of `Model.render`."""
+def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges]) -> Buffers:
+    """Render all buffers of a model; arguments and errors are those of `Model.render`."""
     camera = camera.to(model.device)
     out = model.render(camera, **changes)
-    options = model.options.changed(**changes)
-    background = torch.tensor(options.background).to(out.image)
-    colors = _slot_colors(model, options, camera, out)
-    if model.exposures is not None and options.exposure == "photos":
-        factors = model.exposures.factors(camera).to(out.image)
-        background, colors = background * factors, colors * (factors if factors.ndim == 1 else factors[:, :, None])
-    return Buffers(
-        **{name: getattr(out, name) for name in RENDERED},
-        colors=colors,
-        camera=camera,
-        background=background,
-    )
+    background = torch.tensor(model.options.background).to(out.image)
+    if (factors := out.intermediates.factors) is not None:
+        background = background * factors
+    passes = {name: getattr(out, name) for name in PASSES}
+    return Buffers(**passes, camera=camera, background=background)
 
 
 def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
-    """Write one multi-part OpenEXR file: a part a pass, and a slot of it where there are K.
+    """Write one multi-part OpenEXR file, with one part per buffer, or per slot of a buffer that has K slots.
 
     Parts: `image`, `plain`, `textured`, `normals`, `colors.0` to `colors.K-1` (channels R, G, B); `alpha`,
-    `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty slots). Camera,
-    background and K are in the text attribute `nexwarp`, as JSON; a background of one colour a pixel is a part
-    `background` (R, G, B), and null there.
+    `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty
+    slots). The text attribute `nexwarp` holds camera, background and K as JSON. A background of shape (H, W, 3) is null
+    there, and a part `background` (R, G, B).
 
     Raises:
-        TypeError: buffers that are not float32; OSError: `path` cannot be written.
+        TypeError: a buffer is not float32.
+        OSError: `path` cannot be written.
     """
-    parts = {}
-    for field in fields(buffers):
-        value = getattr(buffers, field.name)
-        if field.name in SLOTS:
-            parts |= {f"{field.name}.{k}": value[:, :, k] for k in range(value.shape[2])}
-        elif field.name not in ("camera", "background"):
-            parts[field.name] = value
+    parts: dict[str, torch.Tensor] = {}
+    for name in PASSES:
+        value = getattr(buffers, name)
+        if name in SLOTS:
+            parts |= {f"{name}.{k}": value[:, :, k] for k in range(value.shape[2])}
+        else:
+            parts[name] = value
     camera, background = buffers.camera, buffers.background
     if background.ndim > 1:
         parts["background"] = background
@@ -130,51 +122,32 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
 
 
 def load_buffers(path: str | os.PathLike[str]) -> Buffers:
-    """Read what `save_buffers` wrote, bit for bit, onto the CPU.
+    """Read a file of `save_buffers` onto the CPU, bit for bit.
 
     Raises:
-        FileNotFoundError: no such file; ValueError: it is no such file, or it is damaged.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format, or is damaged.
     """
     path = Path(path)
     parts, metadata = load_exr(path)
     try:
         if metadata["format"] != FORMAT:
-            raise ValueError(f"format {metadata['format']}, expected {FORMAT}")
-        values: dict[str, Any] = dict(metadata["camera"])
-        matrices = {name: torch.tensor(values.pop(name), dtype=torch.float32) for name in ("viewmat", "K")}
-        camera = Camera(**matrices, **values)
+            raise ValueError(f"format: expected {FORMAT}, got {metadata['format']}")
+        stored = metadata["camera"]
+        viewmat, K = (torch.tensor(stored[name], dtype=torch.float32) for name in ("viewmat", "K"))
+        camera = Camera(viewmat, K, stored["width"], stored["height"], stored["near"])
         slots = range(metadata["max_hits"])
-        found: dict[str, Any] = {}
-        for name in (f.name for f in fields(Buffers) if f.name not in ("camera", "background")):
+        buffers: dict[str, torch.Tensor] = {}
+        for name in PASSES:
             if name not in SLOTS:
-                found[name] = parts[name]
+                buffers[name] = parts[name]
             elif slots:
-                found[name] = torch.stack([parts[f"{name}.{k}"] for k in slots], dim=2)
+                buffers[name] = torch.stack([parts[f"{name}.{k}"] for k in slots], dim=2)
             else:
                 shape = (camera.height, camera.width, 0, *((3,) if name == "colors" else ()))
-                found[name] = torch.empty(shape, dtype=torch.int32 if name == "ids" else torch.float32)
+                buffers[name] = torch.empty(shape, dtype=torch.int32 if name == "ids" else torch.float32)
         color = metadata["background"]
         background = parts["background"] if color is None else torch.tensor(color, dtype=torch.float32)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: expected the passes of a nexwarp rendering ({error})") from None
-    return Buffers(**found, camera=camera, background=background)
-
-
-def _slot_colors(model: Model, options: RenderOptions, camera: Camera, out: Rendering) -> torch.Tensor:
-    """(H, W, K, 3) what `render` multiplies the weights by, without exposures."""
-    empty = (out.ids < 0)[..., None]
-    colors = out.depths.new_zeros(*out.ids.shape, 3)
-    if bool(empty.all()):
-        return colors
-    surfels, texture, degree = model.surfels, model.texture, options.sh_degree
-    if texture is not None:
-        pinhole = ops.Pinhole(camera.K.to(out.depths), camera.width, camera.height, camera.near)
-        positions, rays = ops.unproject(out.depths, camera.viewmat, pinhole)
-        limits = model.detail_limits if options.detail_limits else None
-        depths = limited_depths(out.ids, out.depths, limits, camera.focal)
-        clamp = options.clamp_texture
-        colors = texture.colors(positions, depths, rays, camera.focal, sh_degree=degree, clamp=clamp)
-    if texture is None or texture.residual:
-        plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, degree)
-        colors = colors + plain[out.ids.clamp_min(0).long()]
-    return colors.masked_fill(empty, 0.0)
+        raise ValueError(f"{path}: expected the buffers of a nexwarp rendering ({error})") from None
+    return Buffers(**buffers, camera=camera, background=background)

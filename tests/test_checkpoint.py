@@ -8,6 +8,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +19,23 @@ from safetensors import safe_open
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
+from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import FORMAT_VERSION, MODEL_FILE, save_model, write_atomically
+from nexwarp.model.model_file import FORMAT_VERSION, LATER_OPTIONS, MODEL_FILE, save_model, write_atomically
+from nexwarp.model.options import RenderOptions
+from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import Exposures
+from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
-META = {
-    "max_hits": 2,
-    "background": (0.1, 0.2, 0.3),
-    "sh_degree": 3,
-    "low_pass": False,
-    "clamp_texture": True,
-    "near": 0.01,
-    "scene_scale": 1.25,
-    "preset": "default",
-    "iteration": 1200,
-}
+META: dict[str, Json] = {"near": 0.01, "scene_scale": 1.25, "preset": "default", "iteration": 1200}
+OPTIONS = RenderOptions(background=(0.1, 0.2, 0.3), clamp_texture=True)
 
 
 def make_model(count: int = 24) -> Model:
-    return Model(make_surfels(random_scene(count)), make_texture(), dict(META))
+    return Model(make_surfels(random_scene(count)), make_texture(), options=OPTIONS, meta=META)
 
 
 def rewrite(file: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], None]) -> None:
@@ -79,7 +75,7 @@ def test_loaded_model_renders_the_same_image(tmp_path):
     first, second = nw.load(tmp_path), nw.load(file)
     camera = make_camera(random_scene(24))
     with torch.no_grad():
-        images = [nw.render(m.surfels, m.texture, camera, **m.render_options).image for m in (model, first, second)]
+        images = [m.render(camera).image for m in (model, first, second)]
     assert torch.equal(images[1], images[2])
     assert images[0].std() > 0.05
     assert_close(images[1], images[0], kind="value", name="image", precision=torch.float16)
@@ -98,39 +94,84 @@ def test_surfels_come_back_exactly_and_the_texture_in_half_precision(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["footprints", "far_footprints"])
-def test_footprints_come_back_exactly(tmp_path, name):
-    """One may be there without the other, as in files from before there were two."""
+def test_detail_limits_come_back_exactly(tmp_path: Path, name: str) -> None:
+    """One may be there without the other, as in files from before there were two; the other then limits nothing."""
     model = make_model()
-    assert getattr(nw.load(save_model(tmp_path, model)).surfels, name) is None
-    values = torch.rand(len(model.surfels))
-    setattr(model.surfels, name, values)
-    loaded = nw.load(save_model(tmp_path, model))
-    assert torch.equal(getattr(loaded.surfels, name), values)
-    assert getattr(loaded.surfels.to(torch.float64), name).dtype == torch.float64
-    setattr(model.surfels, name, torch.rand(len(model.surfels) + 1))
-    with pytest.raises(ValueError, match=rf"the tensors do not make a model \({name}: expected shape"):
-        nw.load(save_model(tmp_path, model))
+    assert nw.load(save_model(tmp_path, model)).detail_limits is None
+    limits = DetailLimits(*torch.rand(2, len(model.surfels)))
+    model.detail_limits = limits
+    file = save_model(tmp_path, model)
+    loaded = nw.load(file).detail_limits
+    assert loaded is not None
+    assert torch.equal(loaded.nearest, limits.nearest) and torch.equal(loaded.farthest, limits.farthest)
+    assert nw.load(file).to(torch.float64).detail_limits.farthest.dtype == torch.float64
+    other = "far_footprints" if name == "footprints" else "footprints"
+    rewrite(file, lambda tensors, _: tensors.pop(other))
+    alone = nw.load(file).detail_limits
+    assert alone is not None
+    if name == "footprints":
+        assert torch.equal(alone.nearest, limits.nearest) and (alone.farthest == NEVER).all()
+    else:
+        assert (alone.nearest == 0).all() and torch.equal(alone.farthest, limits.farthest)
+    rewrite(file, lambda tensors, _: tensors.update({name: torch.rand(len(model.surfels) + 1)}))
+    with pytest.raises(ValueError, match=rf"expected the tensors of a nexwarp model \({name}: expected shape"):
+        nw.load(file)
+
+
+@pytest.mark.parametrize("stored", [(), ("footprints",), ("footprints", "far_footprints")])
+def test_a_file_of_version_0_1_renders_as_before(tmp_path: Path, stored: tuple[str, ...]) -> None:
+    """Its metadata has no `exposure` and `detail_limits`; it may hold the nearest limits alone, or none."""
+    scene = random_scene(24)
+    camera = make_camera(scene)
+    model = make_model()
+    limits = torch.full((24,), 3.5 / camera.focal), torch.full((24,), 3.0 / camera.focal)
+    model.detail_limits = DetailLimits(*limits)
+    model.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2]]), [camera], (-0.3, -0.2, 0.4))
+    file = save_model(tmp_path, model)
+
+    def age(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> None:
+        for key in LATER_OPTIONS:
+            del meta[key]
+        for name in {"footprints", "far_footprints"}.difference(stored):
+            del tensors[name]
+
+    rewrite(file, age)
+    loaded = nw.load(file)
+    assert loaded.options == OPTIONS and loaded.exposures is not None
+    nearest = limits[0] if "footprints" in stored else torch.zeros(24)
+    farthest = limits[1] if "far_footprints" in stored else torch.full((24,), NEVER)
+    expected = nw.render(
+        loaded.surfels,
+        loaded.texture,
+        camera,
+        background=OPTIONS.background,
+        clamp_texture=True,
+        exposures=loaded.exposures,
+        detail_limits=DetailLimits(nearest, farthest) if stored else None,
+    )
+    assert torch.equal(loaded.render(camera).image, expected.image)
+    assert (loaded.detail_limits is None) == (not stored)
 
 
 def test_exposures_come_back_exactly(tmp_path):
     model = make_model()
-    assert nw.load(save_model(tmp_path, model)).surfels.exposures is None
-    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2), torch.rand(3))
+    assert nw.load(save_model(tmp_path, model)).exposures is None
+    model.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2), torch.rand(3))
     loaded = nw.load(save_model(tmp_path, model))
-    for name, value in model.surfels.exposures.tensors().items():
-        assert torch.equal(loaded.surfels.exposures.tensors()[name], value), name
-    assert loaded.surfels.to(torch.float64).exposures.lengths.dtype == torch.float64
-    model.surfels.exposures.positions = torch.rand(4, 3)
-    with pytest.raises(ValueError, match=r"the tensors do not make a model \(positions: expected shape"):
+    for name, value in model.exposures.tensors().items():
+        assert torch.equal(loaded.exposures.tensors()[name], value), name
+    assert loaded.to(torch.float64).exposures.lengths.dtype == torch.float64
+    model.exposures.positions = torch.rand(4, 3)
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(positions: expected shape"):
         nw.load(save_model(tmp_path, model))
 
 
 @pytest.mark.parametrize("largest", [0.0, -1.0, float("nan")])
 def test_a_falloff_that_cannot_be_is_refused(tmp_path, largest):
     model = make_model()
-    model.surfels.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2))
-    assert model.surfels.exposures.falloff.tolist() == [0.0, 0.0, 1.0]  # as in files from before there was one
-    model.surfels.exposures.falloff = torch.tensor([0.1, 0.1, largest])
+    model.exposures = Exposures(*torch.rand(4, 5, 3), torch.rand(3), torch.rand(2))
+    assert model.exposures.falloff.tolist() == [0.0, 0.0, 1.0]  # as in files from before there was one
+    model.exposures.falloff = torch.tensor([0.1, 0.1, largest])
     with pytest.raises(ValueError, match=r"\(falloff: expected a largest squared tangent > 0, got "):
         nw.load(save_model(tmp_path, model))
 
@@ -147,10 +188,17 @@ def test_saving_what_was_loaded_changes_nothing(tmp_path):
 
 def test_meta_survives(tmp_path):
     loaded = nw.load(save_model(tmp_path, make_model()))
-    plain = json.loads(json.dumps(META))
-    assert {name: loaded.meta[name] for name in META} == plain
+    assert {name: loaded.meta[name] for name in META} == META
     assert loaded.meta["format_version"] == FORMAT_VERSION and "COLMAP" in loaded.meta["frame"]
-    assert loaded.render_options == {name: plain[name] for name in list(META)[:5]}
+    assert loaded.options == OPTIONS
+
+
+@pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0, "low_pass": True}])
+def test_options_survive(tmp_path: Path, changes: dict[str, Any]) -> None:
+    model = Model(make_surfels(random_scene(3)), None, options=OPTIONS.changed(**changes), meta=META)
+    loaded = nw.load(save_model(tmp_path, model))
+    assert loaded.options == model.options
+    assert not {field.name for field in fields(RenderOptions)} & loaded.meta.keys()
 
 
 @pytest.mark.parametrize("count", [1, 700])
@@ -158,7 +206,7 @@ def test_file_is_as_large_as_accounted(tmp_path, count):
     """60 float32 a surfel, L T F half-precision features, a half-precision MLP (recipe.md 3.8), and a header."""
     scene = random_scene(count)
     texture = nw.NeuralTexture(levels=8, table_size=2**12, max_resolution=64.0)
-    size = save_model(tmp_path, Model(make_surfels(scene), texture, dict(META))).stat().st_size
+    size = save_model(tmp_path, Model(make_surfels(scene), texture, options=OPTIONS, meta=META)).stat().st_size
     mlp = 2 * (16 * 64 + 64 * 64 + 64 * 48)
     accounted = 60 * 4 * count + 8 * 2**12 * 2 * 2 + mlp
     assert 0 < size - accounted < 4096
@@ -338,7 +386,7 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
         if stage == "tensors":
             patch.setattr(safetensors.torch, "save", fail)
         elif stage == "state":
-            patch.setattr("nexwarp.train.checkpoint.write_atomically", fail)
+            patch.setattr(checkpoint, "write_atomically", fail)
         else:
             patch.setattr(Path, "rename", rename)
         if (stage, after_kill) != ("second rename", True):  # there is only one rename then
@@ -519,8 +567,7 @@ def test_models_that_cannot_render_are_refused(tmp_path):
     from safetensors.torch import load_file, save_file
 
     texture = nw.NeuralTexture(levels=2, table_size=2**4, width=8)
-    meta = {"max_hits": 2, "background": [0.0, 0.0, 0.0], "sh_degree": 3, "low_pass": False, "clamp_texture": False}
-    model = nw.Model(make_surfels(random_scene(3)), texture, meta)
+    model = nw.Model(make_surfels(random_scene(3)), texture)
     for key, value in (
         ("max_hits", "two"),
         ("max_hits", 9),
@@ -530,8 +577,10 @@ def test_models_that_cannot_render_are_refused(tmp_path):
         ("near", "far"),
         ("smooth_sh", "smooth"),
         ("smooth_sh", -0.1),
+        ("exposure", "bright"),
+        ("detail_limits", "no"),
     ):
-        save_model(tmp_path, nw.Model(model.surfels, texture, meta | {key: value}))
+        rewrite(save_model(tmp_path, model), lambda _, meta, key=key, value=value: meta.update({key: value}))
         with pytest.raises(ValueError, match=key):
             nw.load(tmp_path)
     path = save_model(tmp_path, model)

@@ -110,11 +110,11 @@ def test_the_model_is_that_of_the_last_iteration(trained):
     model = nw.load(trained)
     metrics = read(trained, "metrics.json")
     assert len(model.surfels) == metrics["surfels"] <= 100
-    assert model.meta["iteration"] == 20 and model.meta["preset"] == "default" and model.meta["sh_degree"] == 3
+    assert model.meta["iteration"] == 20 and model.meta["preset"] == "default" and model.options.sh_degree == 3
     cameras = load_cameras(trained / "cameras.json")
     assert list(cameras["test"]) == ["view_000.png", "view_008.png"] and len(cameras["train"]) == 8
     with torch.no_grad():
-        out = nw.render(model.surfels, model.texture, cameras["test"]["view_000.png"], **model.render_options)
+        out = model.render(cameras["test"]["view_000.png"])
     assert torch.equal(to_uint8(out.image), picture(trained / "renders" / "test" / "view_000.png"))
 
 
@@ -129,7 +129,7 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
         assert word in out, word
     settings = config_from_dict(read(run, "config.json")["config"])
     assert (settings.max_hits, settings.seed) == (0, 3)
-    assert nw.load(run).meta["max_hits"] == 0
+    assert nw.load(run).options.max_hits == 0
 
 
 def test_default_run_folder_is_named_after_the_scene(scene, tmp_path, monkeypatch):
@@ -150,7 +150,7 @@ def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "finish", full)
         assert cli.main(command) == 2
-    told = "out of memory: it needed 2.00 GiB; the training is done and kept: --resume finishes the run"
+    told = "out of memory: needed 2.00 GiB; training is complete and saved: --resume finishes the run"
     assert capsys.readouterr().err == f"nexwarp: error: {told}\n"
     assert cli.main([*command, "--resume"]) == 0
     assert "resumed at iteration 20" in capsys.readouterr().out
@@ -374,7 +374,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tm
         (run / "checkpoint.tmp" / "tensors.safetensors").write_bytes(b"\x10")
     command = ["train", str(scene), "--run", str(run), *FLAGS, "--resume"]
     assert cli.main(command) == 0
-    assert f"{run}: no checkpoint yet, so training starts anew" in capsys.readouterr().out
+    assert f"{run}: no checkpoint yet, training starts from the beginning" in capsys.readouterr().out
     assert {f.name for f in run.iterdir()} == RUN_FILES
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
 
@@ -693,7 +693,7 @@ def test_a_run_may_not_replace_its_own_scene(scene, tmp_path, capsys):
     shutil.copytree(scene, folder / "scene")
     (folder / "config.json").write_text("{}")
     assert cli.main(["train", str(folder / "scene"), "--run", str(folder), "--overwrite"]) == 2
-    assert "--run: expected a folder that does not hold the scene" in capsys.readouterr().err
+    assert "--run: expected a folder that does not contain the scene" in capsys.readouterr().err
     assert (folder / "scene" / "images").is_dir()
 
 
@@ -717,7 +717,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
     given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
     assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given
     assert config["config"]["background"] == [0.0, 0.5, 1.0]
-    assert nw.load(run).meta["background"] == [0.0, 0.5, 1.0]
+    assert nw.load(run).options.background == (0.0, 0.5, 1.0)
     before = read(run, "metrics.json")["psnr"]
     assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
     assert read(run, "metrics.json")["psnr"] == pytest.approx(before, abs=1e-6)

@@ -211,16 +211,16 @@ def test_a_capture_that_fails_leaves_training_as_it_is(
 def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: Scene) -> None:
     launched = trained(tiny_scene, cuda_graphs=False)
     trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
-    learn, failed = trainer._learn, []
+    optimize, failed = trainer._optimize, []
 
     def failing(view: Any) -> Any:
         if trainer.iteration == 31 and not failed:  # the first step after a round
             assert graphs_of(trainer) > 0
             failed.append(1)
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-        return learn(view)
+        return optimize(view)
 
-    trainer._learn = failing  # type: ignore[method-assign]
+    trainer._optimize = failing  # type: ignore[method-assign]
     trainer.run()
     assert failed and trainer.graphs is not None and trainer.graphs.chances == step_graphs.CHANCES - 1
     assert_same_state(trainer, launched)

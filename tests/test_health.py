@@ -57,7 +57,7 @@ def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
 
 def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Trainer], None]) -> list[int]:
     """Let a fault strike before Adam's step of some iterations, each time they come; returns those it struck."""
-    struck, made = [], trainer._make_optimizer
+    struck, made = [], trainer.make_optimizer
     trainers: list[Trainer] = []
     init = Trainer.__init__
 
@@ -138,16 +138,16 @@ def test_a_fault_is_found_named_and_gone_back_from(scene, monkeypatch, where, va
 
 
 def test_a_bad_loss_is_named_with_its_iteration(scene, monkeypatch):
-    losses = Trainer._losses
+    losses = trainer.step_losses
+    run, told = Trainer(scene, SMALL, "cpu"), []
 
-    def spoilt(self: Trainer, *args: Any) -> dict[str, torch.Tensor]:
-        terms = losses(self, *args)
-        if self.iteration == 14 and self.rate_factor == 1.0:
+    def spoilt(*args: Any, **options: Any) -> dict[str, torch.Tensor]:
+        terms = losses(*args, **options)
+        if run.iteration == 14 and run.rate_factor == 1.0:
             terms["dssim"] = terms["dssim"] * NAN
         return terms
 
-    monkeypatch.setattr(Trainer, "_losses", spoilt)
-    run, told = Trainer(scene, SMALL, "cpu"), []
+    monkeypatch.setattr(trainer, "step_losses", spoilt)
     run.run(warn=told.append)
     assert len(told) == 1 and told[0].startswith("iteration 14: the loss 'dssim' is nan; "), told
 
@@ -173,7 +173,8 @@ def test_what_happens_again_is_given_up_with_a_report(scene, monkeypatch):
     assert "iteration 22: not finite; gradient of surfels.log_scales: 1 of" in told[0]
     report = caught.value.report
     assert report["good_iteration"] == run.iteration == 20 and report["rate_factor"] == 0.5
-    assert any("surfels.log_scales" in fact for fact in report["tensors"])
+    tensors = report["tensors"]
+    assert isinstance(tensors, list) and any("surfels.log_scales" in fact for fact in tensors)
     json.dumps(report)
     assert not_finite(run._watched()) == []  # the trainer is in its last good state
 
@@ -278,7 +279,7 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     def fail(*_: Any, **__: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has 1 KiB free")
 
-    monkeypatch.setattr(trainer, "render", fail)
+    monkeypatch.setattr("nexwarp.model.model.render", fail)
     run = Trainer(scene, dataclasses.replace(SMALL, max_surfels=48), "cpu")
     with pytest.raises(OutOfMemoryError) as caught:
         run.run()
@@ -314,7 +315,7 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
 def test_states_that_cannot_be_are_refused(scene, tmp_path, changes, match):
     run = Trainer(scene, SMALL, "cpu")
     run.step()
-    tensors, state = run._state()
+    tensors, state = run.snapshot()
     save_checkpoint(tmp_path, tensors, state | changes)
     with pytest.raises(CheckpointError, match=rf"does not fit \(.*{match}") as caught:
         Trainer(scene, SMALL, "cpu").restore(tmp_path)
@@ -338,7 +339,7 @@ def test_states_that_cannot_be_are_refused(scene, tmp_path, changes, match):
 def test_tensors_that_do_not_fit_are_refused(scene, tmp_path, name, value):
     run = Trainer(scene, SMALL, "cpu")
     run.step()
-    tensors, state = run._state()
+    tensors, state = run.snapshot()
     save_checkpoint(tmp_path, tensors | {name: value(tensors[name])}, state)
     with pytest.raises(CheckpointError, match="does not fit"):
         Trainer(scene, SMALL, "cpu").restore(tmp_path)

@@ -2,40 +2,17 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-LAYERS = [
-    {"errors", "signals"},
-    {"kernels"},
-    {"ops", "camera", "files"},
-    {"json_files", "exposures"},
-    {"data", "surfels", "texture"},
-    {"render", "losses", "metrics", "paths", "pictures", "nerfstudio", "splats", "video"},
-    {
-        "densify",
-        "floaters",
-        "metering",
-        "smooth_sh",
-        "checkpoint",
-        "evaluate",
-        "passes",
-        "export",
-        "viewer",
-        "training_views",
-        "watch",
-    },
-    {"config", "step_graphs"},
-    {"initial"},
-    {"trainer"},
-    {"logs"},
-    {"runs", "console", "warmup", "sfm"},
-    {"outputs"},
-    {"cli"},
-]
+ROOT = Path(__file__).parents[1] / "nexwarp"
+# The one list of layers, from the top to the bottom, is in CONTRIBUTING.md.
+(BLOCK,) = re.findall(r"```layers\n(.*?)```", (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.S)
+LAYERS = [line.split() for line in reversed(BLOCK.splitlines())]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 EXEMPT = {"__init__", "__main__"}
 PURE = {
@@ -49,7 +26,6 @@ PURE = {
     "types",
     "contextlib",
 }
-ROOT = Path(__file__).parents[1] / "nexwarp"
 
 TIMED_IMPORT = """
 import time, torch
@@ -71,8 +47,19 @@ def imported_modules(path: Path) -> set[str]:
     return found
 
 
+def modules() -> list[Path]:
+    """All files of the package."""
+    return sorted(ROOT.rglob("*.py"))
+
+
+def test_the_list_of_layers_is_that_of_the_rooms() -> None:
+    rooms = {path.stem if path.is_file() else path.name for path in ROOT.iterdir() if path.name != "__pycache__"}
+    assert set(RANK) == rooms - EXEMPT - {"py"}
+    assert len(list(ROOT.glob("*.py"))) <= 10
+
+
 def test_imports_point_downwards() -> None:
-    for path in sorted(ROOT.rglob("*.py")):
+    for path in modules():
         here = path.relative_to(ROOT).with_suffix("").parts[0]
         if here in EXEMPT:
             continue
@@ -83,6 +70,35 @@ def test_imports_point_downwards() -> None:
                 there = rest.split(".")[0]
                 assert there in RANK, f"{path}: imports {dotted}, which is in no layer"
                 assert here == there or RANK[there] < RANK[here], f"{path}: imports {dotted}"
+
+
+def test_files_and_functions_are_short() -> None:
+    """Outside kernels: at most 400 lines a file and 60 a function."""
+    long = []
+    for path in modules():
+        if path.is_relative_to(ROOT / "kernels"):
+            continue
+        text = path.read_text(encoding="utf-8")
+        if (lines := text.count("\n")) > 400:
+            long.append(f"{path}: {lines} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - node.lineno + 1 > 60:
+                long.append(f"{path}: {node.name}")
+    assert not long
+
+
+def test_types_say_something() -> None:
+    """Outside kernels: few `Any`, and no SimpleNamespace."""
+    any_, loose = 0, []
+    for path in modules():
+        if path.is_relative_to(ROOT / "kernels"):
+            continue
+        names = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Name)]
+        any_ += sum(node.id == "Any" for node in names)
+        if any(node.id == "SimpleNamespace" for node in names):
+            loose.append(str(path))
+    assert any_ <= 60
+    assert not loose
 
 
 def test_kernels_are_pure_warp() -> None:

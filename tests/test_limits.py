@@ -253,7 +253,7 @@ def test_too_many_points(tmp_path, monkeypatch):
 def test_a_models_tables_are_checked_before_they_are_allocated(tmp_path, changes):
     file = save_model(tmp_path, make_model())
     rewrite(file, lambda tensors, meta: meta["texture"].update(changes))
-    with pytest.raises(ValueError, match=r"the tensors do not make a model \(.*expected"):
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(.*expected"):
         load(file)
 
 

@@ -16,7 +16,8 @@ from nexwarp.data import Scene, load_scene, write_demo
 from nexwarp.run.log import LOG_FILE, TENSORBOARD_FOLDER, TrainingLog, keep_lines, peak_memory
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.trainer import Progress, Trainer
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
@@ -58,7 +59,7 @@ def test_a_line_is_what_the_step_was(trainer, scene, tmp_path):
     seen: list[dict[str, Any]] = []
     with TrainingLog(tmp_path, trainer) as log:
 
-        def observe(step: Progress) -> None:
+        def observe(step: StepReport) -> None:
             log(step)
             losses = {name: x.item() for name, x in step.losses.items()}
             seen.append({"iteration": step.iteration, "losses": losses, "psnr": step.psnr(), "surfels": step.surfels})
@@ -123,7 +124,7 @@ def test_resuming_goes_on_as_if_nothing_had_happened(trainer, scene, tmp_path):
     first = Trainer(scene, CONFIG, "cpu")
     with pytest.raises(Killed), TrainingLog(broken, first) as log:
 
-        def observe(step: Progress) -> None:
+        def observe(step: StepReport) -> None:
             log(step)
             if step.iteration == 5:
                 first.save(broken)
@@ -166,7 +167,7 @@ def test_what_is_not_finite_is_null(trainer, tmp_path):
     nothing = torch.full((2, 2, 3), math.nan)
     losses = {"image": torch.tensor(math.nan), "grid": torch.tensor(math.inf), "alpha": torch.tensor(1.0)}
     with TrainingLog(tmp_path, trainer) as log:
-        log(Progress(1, 5, losses, nothing, nothing))
+        log(StepReport(1, 5, losses, nothing, nothing))
     (line,) = lines(tmp_path)
     assert line["losses"] == {"image": None, "grid": None, "alpha": 1.0}
     assert line["loss"] is None and line["psnr"] is None

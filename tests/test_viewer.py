@@ -21,6 +21,7 @@ from PIL import Image
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
+from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.train import presets
@@ -37,13 +38,13 @@ from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, ra
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
-OPTIONS = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 3, "low_pass": False, "clamp_texture": False}
+OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
-def model() -> tuple[nw.Surfels, nw.NeuralTexture]:
-    return make_surfels(random_scene(60, width=64, height=48)), make_texture()
+def model() -> nw.Model:
+    return nw.Model(make_surfels(random_scene(60, width=64, height=48)), make_texture(), options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -71,29 +72,28 @@ def eight_bit(x: torch.Tensor) -> np.ndarray:
 @pytest.mark.parametrize("mode", ["image", "plain", "textured"])
 def test_colour_modes_are_the_buffers(model, camera, mode):
     with torch.no_grad():
-        out = nw.render(*model, camera, **{**OPTIONS, "max_hits": 3, "sh_degree": 1})
-    picture = draw(*model, [camera], Settings(mode, max_hits=3, sh_degree=1), OPTIONS)
+        out = model.render(camera, max_hits=3, sh_degree=1)
+    picture = draw(model, [camera], Settings(mode, max_hits=3, sh_degree=1))
     assert picture.span is None
     np.testing.assert_array_equal(picture.pixels, eight_bit(getattr(out, mode)))
 
 
 @pytest.mark.parametrize("falloff", [None, (-0.2, -0.1, 0.3)])
 def test_colours_are_at_the_exposure_of_the_photos_or_the_mean(camera, falloff):
-    surfels, texture = make_surfels(random_scene(60, width=64, height=48)), make_texture()
-    mean = {mode: draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels for mode in MODES}
-    surfels.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera], falloff)
+    model = nw.Model(make_surfels(random_scene(60, width=64, height=48)), make_texture(), options=OPTIONS)
+    mean = {mode: draw(model, [camera], Settings(mode)).pixels for mode in MODES}
+    model.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera], falloff)
     for mode in MODES:
-        exposed = draw(surfels, texture, [camera], Settings(mode), OPTIONS).pixels
+        exposed = draw(model, [camera], Settings(mode)).pixels
         assert np.array_equal(exposed, mean[mode]) == (mode not in ("image", "plain", "textured")), mode
-        again = draw(surfels, texture, [camera], Settings(mode, photo_exposure=False), OPTIONS).pixels
+        again = draw(model, [camera], Settings(mode, photo_exposure=False)).pixels
         np.testing.assert_allclose(again.astype(int), mean[mode].astype(int), atol=1, err_msg=mode)
 
 
 def test_buffer_modes_tell_what_the_buffers_hold(model, camera):
-    surfels, _ = model
     with torch.no_grad():
-        out = nw.render(surfels, None, camera, **{**OPTIONS, "max_hits": 8})
-    pictures = {mode: draw(*model, [camera], Settings(mode, slot=2), OPTIONS) for mode in MODES}
+        out = model.bare(max_hits=8).render(camera)
+    pictures = {mode: draw(model, [camera], Settings(mode, slot=2)) for mode in MODES}
     there = (out.ids[..., 1] >= 0).numpy()
     assert 0.1 < there.mean() < 0.99
     for mode in BY_SLOT:
@@ -130,7 +130,7 @@ def test_normals_face_the_camera_and_belong_to_their_surfel(camera):
         torch.ones(1, 2),
         torch.zeros(1, 1, 3),
     )
-    picture = draw(surfels, None, [camera], Settings("normal"), OPTIONS)
+    picture = draw(nw.Model(surfels, None, options=OPTIONS), [camera], Settings("normal"))
     seen = picture.pixels[24, 32] / 255.0 * 2.0 - 1.0
     expected = normal if normal @ (centre - to_world[:3, 3]) < 0 else -normal
     np.testing.assert_allclose(seen, expected, atol=1.01 / 127)
@@ -139,22 +139,19 @@ def test_normals_face_the_camera_and_belong_to_their_surfel(camera):
 @pytest.mark.parametrize("mode", MODES)
 def test_bands_make_the_same_picture(model, camera, mode):
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 64, 48)
-    like = model[0].means
+    like = model.surfels.means
     whole, parts = here.bands(1.0, 0.01, like), here.bands(1.0, 0.01, like, count=3)
     assert [(c.height, c.cy) for c in parts] == [(16, 24.0), (16, 8.0), (16, -8.0)] and whole[0].height == 48
-    one, many = (draw(*model, bands, Settings(mode), OPTIONS).pixels.astype(int) for bands in (whole, parts))
+    one, many = (draw(model, bands, Settings(mode)).pixels.astype(int) for bands in (whole, parts))
     assert (abs(one - many) <= 1).mean() > 0.995 and one.std() > 1
 
 
-def test_every_mode_looks_the_same_everywhere(camera, device):
+def test_every_mode_looks_the_same_everywhere(model, camera, device):
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 64, 48)
     for mode in MODES:
         one, other = (
-            draw(
-                surfels, make_texture(device=d), here.bands(1.0, 0.01, surfels.means, count=2), Settings(mode), OPTIONS
-            )
-            for d in (torch.device("cpu"), device)
-            for surfels in [make_surfels(random_scene(60, width=64, height=48, device=d))]
+            draw(shown, here.bands(1.0, 0.01, shown.surfels.means, count=2), Settings(mode))
+            for shown in (copy.deepcopy(model).to(d) for d in (torch.device("cpu"), device))
         )
         assert (np.abs(one.pixels.astype(int) - other.pixels) <= 2).mean() > 0.99, mode
         assert one.span is None or np.allclose(one.span, other.span, rtol=1e-4)
@@ -162,32 +159,32 @@ def test_every_mode_looks_the_same_everywhere(camera, device):
 
 def test_a_stale_picture_is_given_up(model, camera):
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 64, 48)
-    bands, asked = here.bands(1.0, 0.01, model[0].means, count=3), []
-    assert draw(*model, bands, Settings(), OPTIONS, stale=lambda: asked.append(1) or len(asked) == 2) is None
+    bands, asked = here.bands(1.0, 0.01, model.surfels.means, count=3), []
+    assert draw(model, bands, Settings(), stale=lambda: asked.append(1) or len(asked) == 2) is None
     assert len(asked) == 2
 
 
 def test_photo_detail_limits_the_texture_alone(model, camera):
     """Not the surfels, which are as wide as the picture's own pixels show them."""
-    surfels, texture = copy.deepcopy(model[0]), model[1]
-    surfels.far_footprints = torch.full((len(surfels),), 3.5 / (3 * camera.focal))
-    model = surfels, texture
+    farthest = torch.full((len(model.surfels),), 3.5 / (3 * camera.focal))
+    limits = DetailLimits(torch.zeros_like(farthest), farthest)
+    model = nw.Model(model.surfels, model.texture, detail_limits=limits, options=OPTIONS)
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 256, 192)
-    free, limited = (here.bands(1.0, 0.01, model[0].means, focal_limit=f) for f in (math.inf, camera.focal))
+    free, limited = (here.bands(1.0, 0.01, model.surfels.means, focal_limit=f) for f in (math.inf, camera.focal))
     assert limited[0].focal == pytest.approx(camera.focal) and free[0].focal == pytest.approx(4 * camera.focal)
-    one, other = (draw(*model, bands, Settings("image"), OPTIONS).pixels for bands in (free, limited))
+    one, other = (draw(model, bands, Settings("image")).pixels for bands in (free, limited))
     assert (one != other).any()
     for mode in ("plain", "ids", "depth"):
-        one, other = (draw(*model, bands, Settings(mode), OPTIONS).pixels for bands in (free, limited))
+        one, other = (draw(model, bands, Settings(mode)).pixels for bands in (free, limited))
         np.testing.assert_array_equal(one, other)
 
 
 def test_no_surfels_and_no_texture_can_be_looked_at(camera, model):
     none = make_surfels({k: v[:0] if torch.is_tensor(v) and v.ndim else v for k, v in random_scene(3).items()})
     for mode in MODES:
-        pixels = draw(none, None, [camera], Settings(mode), OPTIONS).pixels
+        pixels = draw(nw.Model(none, None, options=OPTIONS), [camera], Settings(mode)).pixels
         assert pixels.shape == (48, 64, 3) and (mode in ("image", "alpha") or not pixels.any())
-    assert draw(model[0], None, [camera], Settings(max_hits=0), OPTIONS).pixels.any()
+    assert draw(model.bare(), [camera], Settings(max_hits=0)).pixels.any()
     assert set(TEXTURED) == {"image", "textured"}
 
 
@@ -463,11 +460,11 @@ class Client:
 
 
 @contextmanager
-def serving(model: Any, **arguments: Any) -> Iterator[Viewer]:
+def serving(model: nw.Model, **arguments: Any) -> Iterator[Viewer]:
     """A viewer that draws on a thread of its own."""
     pytest.importorskip("viser")
     over = threading.Event()
-    with Viewer(lambda: (*model, OPTIONS), ring(), near=0.01, port=0, **arguments) as viewer:
+    with Viewer(lambda: model, ring(), near=0.01, port=0, **arguments) as viewer:
         thread = threading.Thread(target=viewer.show, args=(over.is_set,))
         thread.start()
         try:
@@ -552,7 +549,7 @@ def test_a_picture_that_fails_is_told_and_the_rest_goes_on(model, monkeypatch):
     from nexwarp.viewer import viewer as module
 
     def fail(*arguments: Any, **options: Any) -> Any:
-        if arguments[3].mode == "normal":
+        if arguments[2].mode == "normal":
             raise RuntimeError("out of memory")
         return draw(*arguments, **options)
 
@@ -586,7 +583,7 @@ def test_looking_changes_nothing_about_a_training(run):
     trainer = watched = trainer_of(run)
     with (
         Viewer(
-            lambda: (trainer.surfels, trainer.texture, trainer.render_options()),
+            trainer.model,
             {"train": {view.name: view.camera for view in scene.train}},
             near=0.01,
             port=0,
@@ -613,22 +610,22 @@ def test_looking_changes_nothing_about_a_training(run):
         assert len(set(drawn)) > 2 and described, "pictures came while it trained"
         assert session.frustums and len(viewer.thumbnails) == len(scene.train)
         finished = watched.finish()
-        viewer.finish("done", lambda: (finished.surfels, finished.texture, finished.render_options))
-        asked: list[nw.Surfels] = []
+        viewer.finish("done", lambda: finished)
+        asked: list[nw.Model] = []
         shown = viewer.model
-        viewer.model = lambda: asked.append(shown()[0]) or shown()
+        viewer.model = lambda: asked.append(shown()) or shown()
         start = time.perf_counter()
         viewer.show(
             lambda: (bool(asked) and session.drawn_version == session.version) or time.perf_counter() > start + 20
         )
-        assert asked and asked[-1] is finished.surfels is not watched.surfels
+        assert asked and asked[-1] is finished and finished.surfels is not watched.surfels
     for (name, a), (_, b) in zip(alone._named_parameters(), watched._named_parameters(), strict=True):
         assert torch.equal(a, b), name
 
 
 def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
     pytest.importorskip("viser")
-    with Viewer(lambda: (*TINY, OPTIONS), ring(), near=0.01, port=0, total=10, photos={}) as viewer:
+    with Viewer(lambda: TINY, ring(), near=0.01, port=0, total=10, photos={}) as viewer:
         start = time.perf_counter()
         for i in range(1000):
             viewer.between_steps(i, lambda: pytest.fail("asked although nobody looks"))
@@ -639,7 +636,7 @@ def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
         assert len(asked) == 3
 
 
-TINY = (make_surfels(random_scene(4)), make_texture())
+TINY = nw.Model(make_surfels(random_scene(4)), make_texture(), options=OPTIONS)
 
 
 # A browser

@@ -1,10 +1,10 @@
 """`nexwarp eval`."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, cast
 
 from rich.console import Console
 
@@ -13,7 +13,7 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Run_, option
 from nexwarp.data import Scene
 from nexwarp.errors import SceneError
-from nexwarp.io.json_files import write_json
+from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.run.evaluate import evaluate
@@ -30,12 +30,12 @@ class Eval:
 
     run: Run_
     """Run folder."""
-    scene: Annotated[str | None, option("SCENE", "where it was trained from")] = None
-    """Folder of the scene, if it moved."""
+    scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
+    """Folder of the scene, if it has moved."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
-    """Figures to give; flip and lpips need the extras `flip` and `lpips`."""
+    """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
     device: Device_ = None
-    """Where to compute."""
+    """Device to render on."""
 
     def __call__(self, console: Console) -> None:
         """Evaluate."""
@@ -46,17 +46,19 @@ class Eval:
             source = dataclasses.replace(source, path=self.scene)
         with display.loading(console) as progress:
             scene = source.load(progress)
-        options = {"mask_mode": config.mask_mode, "metrics": self.metrics}
-        rows = figures(evaluate_run(model, scene, self.run, console, options), self.metrics)
+        results = evaluate_run(model, scene, self.run, console, mask_mode=config.mask_mode, metrics=self.metrics)
+        rows = figures(results, self.metrics)
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
 
 
-def figures(results: dict[str, Any], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
-    """Rows of a table: the metrics of the test views."""
-    shown = {name: "not available" if results[name] is None else f"{results[name]:.4f}" for name in metrics}
-    if "psnr" in shown:
-        shown["psnr"] = f"{results['psnr']:.2f} dB"
-    return {f"test {name.upper()}": value for name, value in shown.items()}
+def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
+    """Return test metrics as rows of a table."""
+    rows = {}
+    for name in metrics:
+        value = results[name]
+        text = f"{value:.2f} dB" if name == "psnr" else f"{value:.4f}" if value is not None else "not available"
+        rows[f"test {name.upper()}"] = text
+    return rows
 
 
 def evaluate_run(
@@ -64,20 +66,32 @@ def evaluate_run(
     scene: Scene,
     run: Path,
     console: Console,
-    options: dict[str, Any],
-    facts: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Evaluate a model on its test views and write metrics.json, keeping the facts that an older one holds."""
+    *,
+    mask_mode: str,
+    metrics: Sequence[str] = ("psnr", "ssim"),
+    facts: dict[str, Json] | None = None,
+) -> dict[str, Json]:
+    """Evaluate a model on its test views and write metrics.json.
+
+    Args:
+        model: the model, on the device to render on.
+        scene: the scene with the test views.
+        run: run folder.
+        console: where to show the progress.
+        mask_mode: see `evaluate`.
+        metrics: see `evaluate`.
+        facts: the file's entries beside the metrics; None keeps those of an existing file.
+
+    Returns:
+        The entries of metrics.json.
+    """
     if not scene.test:
         raise SceneError(f"{scene.path}: expected test views, found none")
     with display.counting(console, "evaluating", len(scene.test)) as done:
         results = evaluate(
-            model,
-            scene.test,
-            renders=run / "renders",
-            progress=done,
-            **options,
+            model, scene.test, renders=run / "renders", mask_mode=mask_mode, metrics=metrics, progress=done
         )
-    metrics = {**(read_metrics(run) if facts is None else facts), **results}
-    write_json(run / METRICS_FILE, metrics)
-    return metrics
+    entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
+    entries |= cast(dict[str, Json], results)
+    write_json(run / METRICS_FILE, entries)
+    return entries

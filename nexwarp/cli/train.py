@@ -1,45 +1,34 @@
 """`nexwarp train`."""
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 import tyro
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.device import keep_freed_memory, pick_device
-from nexwarp.cli.display import device_name, warn
-from nexwarp.cli.eval import evaluate_run, figures
+from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
-from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import show_until_interrupted
 from nexwarp.data import Scene
-from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, SettingError, StorageError
-from nexwarp.io.json_files import write_json
-from nexwarp.model.model import Model
-from nexwarp.model.model_file import load, save_model
+from nexwarp.errors import SettingError
+from nexwarp.io.json_files import Json
 from nexwarp.run.folder import (
-    CAMERAS_FILE,
     DEMO,
     SceneSource,
-    check_room,
     create_run,
     keep_camera_path,
     prepare_run,
     read_run,
-    tidy_run,
 )
-from nexwarp.run.log import TrainingLog, check_tensorboard
-from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
+from nexwarp.run.log import check_tensorboard
 from nexwarp.train.config import Config
-from nexwarp.train.health import needed_memory
 from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
 from nexwarp.train.trainer import Trainer
@@ -47,42 +36,39 @@ from nexwarp.train.trainer import Trainer
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
-CHECKPOINTS_A_RUN = 10
-DIVERGED_FILE = "diverged.json"
-
 
 @dataclass
 class Train:
-    """Train a scene, evaluate it on its test views, and keep everything in a run folder."""
+    """Train a scene, evaluate it on its test views, and write everything to a run folder."""
 
     scene: Scene_
     """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
     run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
-    """Folder to write to."""
+    """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
-    """Budget of surfels, never exceeded."""
+    """Largest number of surfels."""
     iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
-    """Training steps, one photo each; schedules stretch with them."""
+    """Training steps, each of one photo; schedules scale with it."""
     downscale: Annotated[int, option("N")] = 1
-    """Reduce photos by this factor, by area."""
+    """Factor by which photos are downscaled, with an area filter."""
     images: Annotated[str, option("FOLDER")] = "images"
-    """Folder of the photos below SCENE, such as images_4."""
+    """Folder of the photos, relative to SCENE, such as images_4."""
     masks: Annotated[str, option("{FOLDER,alpha,none}")] = "masks"
-    """Folder of the masks below SCENE, if it is there; `alpha` takes the photos' own transparency."""
+    """Folder of the masks, relative to SCENE, used if it exists; `alpha` takes the photos' alpha channel as masks."""
     mask_mode: Annotated[str | None, option("{ignore,background}", "ignore")] = None
-    """What masks leave out: learn nothing there, or learn that nothing is there."""
+    """Treatment of masked-out pixels: `ignore` excludes them from training, `background` trains them to be empty."""
     background: Annotated[
-        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else photos count as opaque")
+        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else alpha is ignored")
     ] = None
-    """Colour behind transparent photos, and behind renderings; R,G,B go up to 1, `random` is another each step."""
+    """Colour behind transparent photos and behind renderings; R,G,B are in [0, 1], `random` changes in each step."""
     points: Annotated[str | None, option("FILE.ply", "the scene's own points")] = None
-    """Points to start from."""
-    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "the one that is there")] = None
-    """Kind of the scene, for a folder that holds more than one."""
+    """PLY file of the initial points."""
+    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "detected")] = None
+    """Format of the scene, for a folder that holds several."""
     max_hits: Annotated[int | None, option("K", "2")] = None
-    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
+    """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
-    """Settings to start from: nexwarp's own, or those of the publication (docs/paper.md)."""
+    """Settings to start from: nexwarp's defaults, or those of the paper (docs/paper.md)."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
@@ -91,50 +77,38 @@ class Train:
     seed: Annotated[int | None, option("N", "0")] = None
     """Random seed."""
     deterministic: bool = False
-    """Give the same bits in every run also on CUDA; slower. A CPU always does."""
+    """Make CUDA runs bitwise reproducible, which is slower; CPU runs always are."""
     device: Device_ = None
-    """Where to train."""
+    """Device to train on."""
     resume: bool = False
-    """Continue the run in --run, however it ended: with its settings, whatever else is given must agree with them."""
+    """Continue the run in --run with its settings; other options must agree with them."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
-    """Iterations between checkpoints, of which the last two are kept."""
+    """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
     """Replace the run in --run."""
     view: bool = False
-    """Show the training in the browser (extra `viewer`); afterwards the result, until Ctrl-C."""
+    """Show the training in the browser, then the result until Ctrl-C (extra `viewer`)."""
     host: Host_ = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look."""
+    """Address that --view listens on; 0.0.0.0 allows other machines."""
     port: Port_ = 8080
-    """Port for --view; 0 takes any free one."""
+    """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
-    """Also log into RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
+    """Also log to RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
         source = self._source()
         run = self.run or Path("runs") / source.name
         resume = prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
-        if self.checkpoint_every is not None and self.checkpoint_every < 1:
-            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if resume:
             source = self._resumed_source(source, run)
         device = pick_device(self.device)
         config = self._config(run, resume)
-        if self.tensorboard:
-            check_tensorboard()
-        if self.view:
-            from nexwarp.viewer import check_server
-
-            check_server(self.host, self.port)
-        if self.downscale < 1:
-            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
+        self._check()
         console.print(f"{source.name} on {device_name(device)}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = source.load(progress)
-        if scene.background is not None and not resume:
-            if "background" in parse_settings(self.settings):
-                raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
-            config = dataclasses.replace(config, background=scene.background)
+        config = self._with_background(config, scene, resume)
         size = scene.train[0].camera
         console.print(
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
@@ -143,36 +117,47 @@ class Train:
         if device.type == "cpu":
             keep_freed_memory()
         trainer = Trainer(scene, config, device)
-        kept = sum((run / name).is_dir() for name in CHECKPOINTS) if resume else 0
-        # While one is written, the last two are there too.
-        check_room(run, max(4 - kept, 1) * trainer.checkpoint_size())
+        session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
         if resume:
-            tidy_run(run)
-        if resume and has_checkpoint(run):
-            trainer.restore(run, partial(warn, console))
-            console.print(f"resumed at iteration {trainer.iteration:,}")
-        elif self.resume:
-            console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
+            session.resume()
+        else:
+            session.check_room()
+            if self.resume:
+                console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
         with self._viewer(trainer, run, source.name, console) as viewer:
             if not resume:
                 create_run(run, source, config, device.type)
-            _train(trainer, run, console, viewer, tensorboard=self.tensorboard, every=self.checkpoint_every)
-            try:
-                model = _finish(trainer, scene, run, device, console)
-            except OSError as error:
-                raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
-            except (MemoryError, RuntimeError) as error:
-                if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
-                    raise
-                raise OutOfMemoryError(
-                    f"out of memory: it needed {needed}; the training is done and kept: --resume finishes the run"
-                ) from error
+            session.train(viewer)
+            model = session.finish()
             if viewer is not None:
                 viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
                 show_until_interrupted(viewer, console)
 
-    def _viewer(self, trainer: Trainer, run: Path, title: str, console: Console) -> Any:
-        """A context with the viewer of a training, or with None."""
+    def _check(self) -> None:
+        """Raise SettingError for invalid options, before the photos are read."""
+        if self.checkpoint_every is not None and self.checkpoint_every < 1:
+            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
+        if self.downscale < 1:
+            raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
+        if self.tensorboard:
+            check_tensorboard()
+        if self.view:
+            from nexwarp.viewer import check_server
+
+            check_server(self.host, self.port)
+
+    def _with_background(self, config: Config, scene: Scene, resume: bool) -> Config:
+        """Return a config with the background of the scene's photos; a resumed run keeps its own."""
+        if scene.background is None or resume:
+            return config
+        if "background" in parse_settings(self.settings):
+            raise SettingError("--set: background: expected --background instead, which also applies to the photos")
+        return dataclasses.replace(config, background=scene.background)
+
+    def _viewer(
+        self, trainer: Trainer, run: Path, title: str, console: Console
+    ) -> AbstractContextManager["Viewer | None"]:
+        """Return a context with the viewer of the training; with None, without --view."""
         if not self.view:
             return nullcontext()
         from nexwarp.viewer import Viewer
@@ -193,13 +178,13 @@ class Train:
         return viewer
 
     def _source(self) -> SceneSource:
-        """The scene that the flags ask for."""
+        """Return the scene of the options."""
         return SceneSource(
             self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
         )
 
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
-        """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
+        """Return the scene of the run to resume; its folder may have moved, other options must agree."""
         old, config, _ = read_run(run)
         for flag, default, given, expected in (
             ("--downscale", 1, self.downscale, old.downscale),
@@ -215,33 +200,43 @@ class Train:
         return dataclasses.replace(old, path=source.path)
 
     def _config(self, run: Path, resume: bool = False) -> Config:
-        """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
-        given = {"iterations": self.iterations, "max_surfels": self.max_surfels, "max_hits": self.max_hits}
-        given |= {"seed": self.seed, "mask_mode": self.mask_mode, "deterministic": self.deterministic or None}
-        given = {name: value for name, value in given.items() if value is not None}
+        """Return the settings of preset and options, or those of the run to resume, which options must agree with."""
+        flags: dict[str, Json] = {
+            "iterations": self.iterations,
+            "max_surfels": self.max_surfels,
+            "max_hits": self.max_hits,
+            "seed": self.seed,
+            "mask_mode": self.mask_mode,
+            "deterministic": self.deterministic or None,
+        }
+        given: dict[str, Json] = {name: value for name, value in flags.items() if value is not None}
         check_max_hits(self.max_hits)
         settings = self._settings(given)
         if resume:
-            config = read_run(run)[1]
-            for name, value in given.items():
-                if getattr(config, name) != value:
-                    flag = f"--{name.replace('_', '-')}"
-                    raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
-            changed = with_flag_settings(config, settings)
-            for name in settings:
-                old, new = setting(config, name), setting(changed, name)
-                if name == "cuda_graphs":  # shapes nothing
-                    config = dataclasses.replace(config, cuda_graphs=new)
-                elif old != new:
-                    raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
-            return config
+            return self._resumed_config(run, given, settings)
         base = preset(self.preset)
         if self.scene == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
-        return with_flag_settings(dataclasses.replace(base, **given), settings)
+        return with_flag_settings(with_settings(base, given), settings)
 
-    def _settings(self, given: dict[str, Any]) -> dict[str, Any]:
-        """What --set asks for; a setting has one flag alone."""
+    def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
+        """Return the settings of the run to resume; a SettingError names an option that differs."""
+        config = read_run(run)[1]
+        for name, value in given.items():
+            if getattr(config, name) != value:
+                flag = f"--{name.replace('_', '-')}"
+                raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
+        changed = with_flag_settings(config, settings)
+        for name in settings:
+            old, new = setting(config, name), setting(changed, name)
+            if name == "cuda_graphs":  # does not change the results
+                config = dataclasses.replace(config, cuda_graphs=changed.cuda_graphs)
+            elif old != new:
+                raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
+        return config
+
+    def _settings(self, given: dict[str, Json]) -> dict[str, Json]:
+        """Return the settings of --set; those that are also given as an option of their own are refused."""
         try:
             settings = parse_settings(self.settings)
         except ValueError as error:
@@ -249,103 +244,5 @@ class Train:
         for name in settings:
             if name == "preset" or name in given:
                 flag = f"--{name.replace('_', '-')}"
-                raise SettingError(f"--set: {name}: expected {flag} alone, got {name} with --set")
+                raise SettingError(f"--set: {name}: expected {flag} instead of --set")
         return settings
-
-
-def _train(
-    trainer: Trainer,
-    run: Path,
-    console: Console,
-    viewer: "Viewer | None" = None,
-    *,
-    tensorboard: bool = False,
-    every: int | None = None,
-) -> None:
-    """Run the loop with its display and log; keep checkpoints on the way and when a signal asks to stop."""
-    total = trainer.config.iterations
-    every = every or max(total // CHECKPOINTS_A_RUN, 1)
-    shown = display.TrainingDisplay(console, total, trainer.iteration, trainer.device)
-    with shown, TrainingLog(run, trainer, tensorboard=tensorboard) as log, deferred_stop() as asked:
-
-        def observe(step: Any) -> None:
-            shown(step)
-            with _rescued(trainer, run):
-                log(step)
-            if viewer is not None:
-                viewer.between_steps(step.iteration, partial(_describe, step), lambda: asked() is not None)
-            if step.iteration % every == 0 or step.iteration == total or asked() is not None:
-                with _rescued(trainer, run):
-                    trainer.save(run)
-            if (number := asked()) is not None:
-                raise Stopped(number)
-
-        def warn(text: str) -> None:
-            warn(console, text)
-            log.rewind()
-
-        try:
-            trainer.run(observe, warn)
-        except DivergedError as error:
-            # The trainer is in its last good state.
-            report = {"message": str(error), **error.report}
-            kept = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
-            try:
-                write_json(run / DIVERGED_FILE, report)
-                save_model(run, trainer.model())
-            except OSError as problem:
-                kept = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
-            raise DivergedError(f"{error}; {kept}", report) from None
-
-
-@contextmanager
-def _rescued(trainer: Trainer, run: Path) -> Iterator[None]:
-    """Where the disk takes no more in a block, keep at least the model, which is smaller than a checkpoint."""
-    try:
-        yield
-    except OSError as error:
-        try:
-            save_model(run, trainer.model())
-            model = "the model as it is now is saved"
-        except OSError:
-            model = "the model cannot be saved either"
-        rest = "the last checkpoint is kept, --resume continues from it" if has_checkpoint(run) else "no checkpoint yet"
-        raise StorageError(f"{error}; training stops at iteration {trainer.iteration:,}: {model}, {rest}") from error
-
-
-def _describe(step: Any) -> str:
-    return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"
-
-
-def _finish(trainer: Trainer, scene: Scene, run: Path, device: torch.device, console: Console) -> Model:
-    """Write the model, evaluate what was written, and return that."""
-    with display.stages(console) as observe:
-        finished = trainer.finish(observe)
-    file = save_model(run, finished)
-    sets = {"train": scene.train, "test": scene.test}
-    save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
-    model = load(run).to(device)
-    rate = trainer.iteration / max(trainer.seconds, 1e-9)
-    facts = {
-        "preset": trainer.config.preset,
-        "iterations": trainer.iteration,
-        "surfels": len(model.surfels),
-        "megabytes": file.stat().st_size / 1e6,
-        "seconds": trainer.seconds,
-        "iterations_per_second": rate,
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-    }
-    rows = {}
-    if scene.test:
-        rows = figures(evaluate_run(model, scene, run, console, {"mask_mode": trainer.config.mask_mode}, facts))
-    rows |= {
-        "surfels": f"{facts['surfels']:,}",
-        "model file": f"{facts['megabytes']:.1f} MB",
-        "training": f"{facts['seconds']:.0f} s, {rate:.1f} it/s",
-        "run": str(run),
-    }
-    console.print(display.results_table(rows, f"{len(scene.test)} test views"))
-    if scene.test:
-        first = Path(scene.test[0].name).with_suffix("")
-        console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
-    return model

@@ -12,10 +12,12 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.data.cache import PhotoCache, cache_folder
 from nexwarp.data.capture import Capture, Cloud, Photo
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.images import quiet_pillow
+from nexwarp.data.in_memory import Array, make_cloud, split_views
 from nexwarp.data.memory import check_memory
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
@@ -53,7 +55,7 @@ class Scene:
             unknown.
         scale: 1.1 times the largest distance of a training camera from their mean, in world units; with all
             of them in one place, the median distance of the points from there.
-        path: the folder it was read from.
+        path: the folder it was read from; `Path("memory")` where it was made of tensors.
         background: colour, three numbers in [0, 1], that transparent photos were put on, and that should lie
             behind a rendering to compare with; None where no photo's transparency was looked at, or none is
             transparent and no colour was asked for.
@@ -71,6 +73,43 @@ class Scene:
     path: Path
     background: tuple[float, float, float] | None = None
     random_background: bool = False
+
+    @classmethod
+    def from_tensors(
+        cls,
+        images: Sequence[Array],
+        cameras: Sequence[Camera],
+        points: Array | None = None,
+        colors: Array | None = None,
+        masks: Sequence[Array | None] | None = None,
+        names: Sequence[str] | None = None,
+        test_every: int = TEST_EVERY,
+    ) -> "Scene":
+        """Make a scene of photos and cameras in memory; no files are read or written.
+
+        Args:
+            images: (H, W, 3) sRGB photos, tensors or arrays, uint8, or floating in [0, 1], which are rounded to 8 bits.
+            cameras: of the photos, of the same sizes; their near depths are kept.
+            points: (P, 3) floating, world units, to start from; None takes random points, as for scenes without any.
+            colors: (P, 3) sRGB of the points, uint8 or floating in [0, 1]; None only where `points` is None.
+            masks: for each photo (H, W) bool, True where it counts, or None where all of it does; None for no masks.
+            names: of the photos, each once, as relative paths; None numbers them.
+            test_every: of the views sorted by name, those with index % `test_every` == 0 are test views, which are
+                never used for training; 0 keeps all views for training.
+
+        Returns:
+            The scene, copies of all tensors on the CPU.
+
+        Raises:
+            TypeError, ValueError: naming the argument, its index, what was expected and what came.
+        """
+        split = split_views(images, cameras, masks, names, test_every)
+        if points is None and colors is not None:
+            raise ValueError("colors: expected None without points, got colours")
+        cloud = None if points is None else make_cloud(points, colors)
+        viewmats = [view.camera.viewmat.double().numpy() for view in split.train]
+        scale = _scene_scale("cameras", viewmats, cloud)
+        return _make_scene(split.train, split.test, cloud, scale, Path("memory"), None)
 
 
 def load_scene(
@@ -208,7 +247,8 @@ def _load(
         index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
         for index, photo in enumerate(capture.photos)
     ]
-    scale = _scene_scale(capture, cloud, tests)
+    viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
+    scale = _scene_scale(str(capture.source), viewmats, cloud)
     reader = ViewReader(
         downscale=downscale,
         background=background,
@@ -224,10 +264,23 @@ def _load(
     if asked is None and all(view.alpha is None for view in views):
         background = None  # behind opaque photos there is none to see
     train = [view for view, test in zip(views, held_out, strict=True) if not test]
+    held = [view for view, test in zip(views, held_out, strict=True) if test]
+    return _make_scene(train, held, cloud, scale, path, background)
+
+
+def _make_scene(
+    train: list[View],
+    test: list[View],
+    cloud: Cloud | None,
+    scale: float,
+    path: Path,
+    background: tuple[float, float, float] | None,
+) -> Scene:
+    """Make a scene of its parts; random points where there is no cloud."""
     cloud = _thinned(random_points(train, scale) if cloud is None else cloud)
     return Scene(
         train=train,
-        test=[view for view, test in zip(views, held_out, strict=True) if test],
+        test=test,
         points=torch.from_numpy(cloud.positions.astype(np.float32)),
         colors=torch.from_numpy(cloud.colors),
         track_lengths=torch.from_numpy(cloud.track_lengths),
@@ -278,16 +331,16 @@ def _with_masks(path: Path, photos: list[Photo], masks: str | None) -> list[Phot
     return photos
 
 
-def _scene_scale(capture: Capture, cloud: Cloud | None, tests: Sequence[bool]) -> float:
-    train = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
-    centres = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in train])
+def _scene_scale(source: str, viewmats: Sequence[np.ndarray], cloud: Cloud | None) -> float:
+    """Scale of a scene, from the (4, 4) float64 world to camera matrices of its training views; see `Scene.scale`."""
+    centres = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
     mean = centres.mean(axis=0)
     radius = float(np.linalg.norm(centres - mean, axis=1).max())
     distance = 1.0 if cloud is None else float(np.median(np.linalg.norm(cloud.positions - mean, axis=1)))
     # A camera that only turns is at one place but for rounding: its centres are computed from its poses.
     scale = SCALE_MARGIN * radius if radius > 1e-6 * distance else distance
     if not 0 < scale < math.inf:
-        raise ValueError(f"{capture.source}: cannot tell the scene's scale: cameras and points give {scale}")
+        raise ValueError(f"{source}: cannot tell the scene's scale: cameras and points give {scale}")
     return scale
 
 

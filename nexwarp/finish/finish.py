@@ -1,11 +1,82 @@
 """Turns trained surfels into a finished model."""
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+from nexwarp.camera import Camera
+from nexwarp.data import View
+from nexwarp.determinism import deterministic
+from nexwarp.finish.auto_exposure import with_auto_exposure
+from nexwarp.finish.detail_limits import measure_detail_limits
+from nexwarp.finish.sh_smoothing import smooth_sh
+from nexwarp.model.model import Model
+from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.surfels import Surfels
+
+FinishObserver = Callable[[str, int, int], None]
+Item = TypeVar("Item")
 
 
-def counted(views: Sequence[Any], stage: str, observe: Callable[[str, int, int], None]) -> Iterator[Any]:
-    """The views, each of which is done when the next one is asked for."""
-    for done, view in enumerate(views, 1):
-        yield view
-        observe(stage, done, len(views))
+@dataclass(frozen=True)
+class FinishSettings:
+    """What a finished model gets.
+
+    Attributes:
+        smooth_sh: strength of the surfels' SH smoothing; 0 keeps the SH as trained.
+        detail_limits: measure how close and how far the training views saw each surfel.
+        auto_exposure: predict the gains of rendered views by their brightness, too, where the photos' follow it.
+        deterministic: give the same bits in every run, also on CUDA.
+    """
+
+    smooth_sh: float
+    detail_limits: bool
+    auto_exposure: bool
+    deterministic: bool
+
+
+def finish_model(
+    model: Model,
+    views: Sequence[View],
+    cameras: Sequence[Camera],
+    exposures: Exposures | None,
+    settings: FinishSettings,
+    observe: FinishObserver = lambda *_: None,
+) -> Model:
+    """Return a finished model with surfels of its own: smooth SH, detail limits and exposures. The texture is shared.
+
+    Args:
+        model: the trained surfels and texture, at the photos' mean exposure; stays as it is.
+        views: all training views, on any device.
+        cameras: of these views, on the model's device.
+        exposures: of the training photos; None where they have one exposure.
+        settings: what to do.
+        observe: called with each stage's name, how many views of it are rendered, and of how many.
+    """
+    raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
+    finished = Model(Surfels(raw), model.texture, options=model.options)
+    if settings.smooth_sh > 0:
+        # Detail limits and brightness are the same whatever the order of threads.
+        with deterministic(settings.deterministic and model.device.type == "cuda"):
+            sh0, shN = smooth_sh(finished, counted(views, "smoothing SH", observe), settings.smooth_sh)
+        finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
+    if settings.detail_limits:
+        seen = counted(cameras, "measuring footprints", observe)
+        finished.detail_limits = measure_detail_limits(finished, seen)
+    if exposures is not None:
+        exposures = copy.deepcopy(exposures)
+        if settings.auto_exposure:
+            progress = partial(observe, "metering exposures")
+            exposures = with_auto_exposure(exposures, finished, cameras, progress=progress)
+        finished.exposures = exposures.to(model.device)
+    finished.meta = model.meta | {"smooth_sh": settings.smooth_sh}
+    return finished
+
+
+def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Iterator[Item]:
+    """Yield items, each of which is done when the next one is asked for."""
+    for done, item in enumerate(items, 1):
+        yield item
+        observe(stage, done, len(items))

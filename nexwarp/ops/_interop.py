@@ -93,6 +93,11 @@ def launch(
     launching.launch(kernel, dim, inputs, outputs, device=device_of(like), stream=stream_of(like), **options)
 
 
+def uses_simd(like: torch.Tensor) -> bool:
+    """Whether stages run on a tensor's device in the form written for CPUs; see `nexwarp.kernels.launch.cpu_form`."""
+    return launching.uses_simd(device_of(like))
+
+
 def grad_like(tensor: torch.Tensor, needed: bool) -> torch.Tensor | None:
     """Zeros to add gradients to, or None when nobody needs them."""
     return torch.zeros_like(tensor, memory_format=torch.contiguous_format) if needed else None
@@ -103,9 +108,9 @@ def sums_in_fixed_point(like: torch.Tensor) -> bool:
     return like.is_cuda and torch.are_deterministic_algorithms_enabled()
 
 
-def sums_like(like: torch.Tensor, shape: tuple[int, ...], fixed: bool) -> torch.Tensor:
+def sums_like(like: torch.Tensor, shape: tuple[int, ...], fixed_point: bool) -> torch.Tensor:
     """Zeros to add floats to: of the dtype of `like`, or, in fixed point, a pair of integers each (..., 2)."""
-    return like.new_zeros(*shape, 2, dtype=torch.int64) if fixed else like.new_zeros(shape)
+    return like.new_zeros(*shape, 2, dtype=torch.int64) if fixed_point else like.new_zeros(shape)
 
 
 def from_fixed_point(pairs: torch.Tensor, bad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:

@@ -18,7 +18,7 @@ def compose(
     background: torch.Tensor,
     base: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Add up the passes (paper Eq. 5); differentiable in every argument.
+    """Add up the passes (paper Eq. 7); differentiable in every argument.
 
     Args:
         plain: (H, W, 3) colour of the hits outside the buffer.

@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import array, launch, real_of, uses_simd
 
 
 def plain_colors(
@@ -72,9 +72,9 @@ class _PlainColors(torch.autograd.Function):
         if need_sh0 or need_shN:
             grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
             # Memory is what counts on CUDA, arithmetic on a CPU.
-            lanes = 1 if means.device.type == "cpu" else shN.shape[1] + 1
+            sharing = 1 if uses_simd(means) else shN.shape[1] + 1
             outputs = [array(x, vec3) for x in (grad_sh0, grad_shN)]
-            launch(means, kernels.coefficients_backward, count * lanes, [lanes, *seen], outputs)
+            launch(means, kernels.coefficients_backward, count * sharing, [sharing, *seen], outputs)
         if need_means or need_position:
             grad_means = torch.empty_like(means)
             launch(means, kernels.rays_backward, count, [array(shN, vec3), *seen], [array(grad_means, vec3)])

@@ -12,19 +12,19 @@ from nexwarp.kernels.tiles import (
     MAX_ENTRIES,
     check_entries,
     depth_keys_kernel,
-    footprint_kernel,
     list_kernels,
     surfel_ids_kernel,
     tile_offsets_kernel,
+    tile_polygon_kernel,
 )
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of, stream_of, warp_streams
+from nexwarp.ops._interop import array, launch, real_of, stream_of, uses_simd, warp_streams
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
-LANES = 8
+SHARING = 8
 
 
 @dataclass(frozen=True)
@@ -118,15 +118,15 @@ def intersect_tiles(
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
     order = _depth_order(projection.centers.detach(), t)
     kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
-    footprints, reaches = _footprints(tensors, viewmat, camera, low_pass, tile_size)
-    lanes = 1 if means.device.type == "cpu" else LANES
-    arguments = [array(order, wp.int32), *footprints, wp.vec2i(columns, rows), lanes]
-    counts = torch.empty(count * lanes, dtype=torch.int32, device=means.device)
-    launch(means, kernels.count, count * lanes, arguments, [array(counts, wp.int32)])
+    polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
+    sharing = 1 if uses_simd(means) else SHARING
+    arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows), sharing]
+    counts = torch.empty(count * sharing, dtype=torch.int32, device=means.device)
+    launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)])
     # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
     total = counts.sum().clamp_max(LARGEST_INT).view(1) if count * columns * rows > LARGEST_INT else None
     _scan(counts)
-    ends = counts[lanes - 1 :: lanes]
+    ends = counts[sharing - 1 :: sharing]
     if total is not None:
         ends[-1:] = total
     exact = means.device.type == "cpu" and room is None
@@ -137,7 +137,7 @@ def intersect_tiles(
     entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
     surfels, surfel_ids = torch.zeros(room, **fill), torch.empty(room, **fill)
     emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
-    launch(means, kernels.emit, count * lanes, [*arguments, array(counts, wp.int32)], emitted)
+    launch(means, kernels.emit, count * sharing, [*arguments, array(counts, wp.int32)], emitted)
     _sort(tile_ids, entries, room, (columns * rows).bit_length())
     launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     offsets = torch.empty(columns * rows + 1, **fill)
@@ -145,10 +145,10 @@ def intersect_tiles(
     return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact, kind)
 
 
-def _footprints(
+def _tile_polygons(
     shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, low_pass: bool, tile_size: int
 ) -> tuple[list[Any], torch.Tensor]:
-    """The supports' polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
+    """The tile polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
     like, count = shape[0], len(shape[0])
     real = real_of(like)
     t = types(real)
@@ -163,10 +163,10 @@ def _footprints(
     reaches, corners = like.new_empty(count, 2), like.new_empty(count, MAX_CORNERS, 2)
     shapes = torch.empty(count, 3, dtype=torch.int32, device=like.device)
     margins, discs = like.new_empty(count), like.new_empty(count if low_pass else 1, 3)
-    footprints = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
-    kernel = footprint_kernel(real, low_pass, tile_size)
-    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *footprints])
-    return footprints, reaches
+    polygons = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
+    kernel = tile_polygon_kernel(real, low_pass, tile_size)
+    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *polygons])
+    return polygons, reaches
 
 
 def _depth_order(centers: torch.Tensor, t: Any) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The neural texture: one field shared by all surfels, a hash grid and a small MLP (paper Sec. 3.1)."""
+"""The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
 
@@ -10,21 +10,22 @@ from nexwarp.checks import check_range, check_tensors
 
 GRID_INIT = 0.01
 
-# Cells are indexed by int32: finer grids wrap around at once.
+# Cells have int32 indices: in finer grids these overflow.
 LARGEST_RESOLUTION = 1e9
 
-# A focal length in pixels at which every cell is larger than a pixel.
-NO_FOOTPRINT = 1e12
+# Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
+FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
 
 
 class NeuralTexture(nn.Module):
-    """World-space field F(x) = G(Delta H(x)) that gives spherical harmonics coefficients (paper Eq. 1 and 2).
+    """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5; H of Eq. 2, Delta of Eq. 4).
 
-    Parameters: `grid` (levels, table_size, features), float32, in table order; `mlp`, a torch module without biases
-    whose `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, geometric.
+    Parameters: `grid` (levels, table_size, features), float32; `mlp`, a torch module without biases whose
+    `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, a geometric
+    series.
 
-    On CUDA the lookup and the MLP run in half precision on a copy made for each call, with float32 parameters and
-    gradient sums; set `half_precision` to False to keep float32.
+    On CUDA, lookup and MLP use half-precision copies of the float32 parameters, made for each call; gradients are
+    summed in float32. Set `half_precision` to False to compute in float32.
     """
 
     resolutions: torch.Tensor
@@ -42,49 +43,30 @@ class NeuralTexture(nn.Module):
         residual: bool = False,
         down_weighting: bool = True,
     ) -> None:
-        """Make a fresh field.
+        """Make a field with initial values.
 
         Args:
-            levels: L, resolution levels.
-            table_size: T, entries a level, a power of two.
-            features: F, features an entry: 1, 2, 4 or 8.
-            min_resolution: of the coarsest level, cells per world unit.
-            max_resolution: of the finest level.
-            width: of the hidden layers.
+            levels: L, number of resolution levels.
+            table_size: T, entries per level, a power of two.
+            features: F, features per entry: 1, 2, 4 or 8.
+            min_resolution: resolution of the coarsest level, cells per world unit.
+            max_resolution: resolution of the finest level, cells per world unit.
+            width: width of the hidden layers.
             hidden_layers: number of hidden layers.
-            sh_degree: of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
-            residual: colours are added to the surfels' plain ones instead of replacing them, so that a field of 0, as
-                it is where no photo looked, leaves those.
-            down_weighting: fade levels whose cells are smaller than a pixel (Delta of paper Eq. 2).
+            sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
+            residual: add the texture's colours to the surfels' plain colours instead of replacing them. Where no photo
+                trained the field it is 0, and the plain colours remain.
+            down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
 
         Raises:
-            ValueError: naming the argument that is out of its range.
+            TypeError, ValueError: the message names the argument.
         """
         super().__init__()
-        for name, value, low, high in (
-            ("levels", levels, 1, 64),
-            ("table_size", table_size, 1, 2**30),
-            ("width", width, 1, 4096),
-            ("hidden_layers", hidden_layers, 0, 64),
-            ("sh_degree", sh_degree, 0, 3),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-            check_range(name, value, low, high)
-        for name, value in (("residual", residual), ("down_weighting", down_weighting)):
-            if not isinstance(value, bool):
-                raise TypeError(f"{name}: expected True or False, got {value!r}")
-        if table_size & (table_size - 1):
-            raise ValueError(f"table_size: expected a power of two, got {table_size}")
-        if isinstance(features, bool) or not isinstance(features, int):
-            raise TypeError(f"features: expected an int, got {type(features).__name__}")
-        if features not in (1, 2, 4, 8):
-            raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
-        for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-        check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
-        check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
+        _check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
+        _check_resolutions(min_resolution, max_resolution)
+        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected True or False, got {flag!r}")
         self.config = {
             "levels": levels,
             "table_size": table_size,
@@ -108,7 +90,7 @@ class NeuralTexture(nn.Module):
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):
-            # Linear's own initial values are U(+-1/sqrt(fan_in)), as the method wants.
+            # torch.nn.Linear's own initialisation, U(+-1/sqrt(fan_in)), is the method's.
             layers += [nn.Linear(fan_in, fan_out, bias=False), nn.ReLU()]
         self.mlp = nn.Sequential(*layers[:-1])
 
@@ -118,11 +100,11 @@ class NeuralTexture(nn.Module):
         return self.grid.device
 
     def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
-        """Return the field's spherical harmonics coefficients.
+        """Return the field's SH coefficients.
 
         Args:
-            positions: (..., 3) world.
-            depths: (...) z-depths at which the points are seen, world units; 0 marks a point to skip.
+            positions: (..., 3) points, world frame.
+            depths: (...) their z-depths in the camera, world units; 0 marks a point to skip.
             focal: focal length in pixels, a number or a tensor of one element.
 
         Returns:
@@ -145,15 +127,15 @@ class NeuralTexture(nn.Module):
         sh_degree: int = 3,
         clamp: bool = False,
     ) -> torch.Tensor:
-        """Return the textured colours 0.5 + SH(direction) of hits; SH(direction) alone when `residual`.
+        """Return the textured colours of hits: 0.5 + SH(direction), or SH(direction) if `residual`.
 
         Args:
-            positions: (..., K, 3) hit points, world.
+            positions: (..., K, 3) hit points, world frame.
             depths: (..., K) their z-depths, 0 in empty slots.
-            directions: (..., 3) unit ray directions, world.
+            directions: (..., 3) unit ray directions, world frame.
             focal: focal length in pixels, a number or a tensor of one element.
-            sh_degree: limits the degree that is evaluated.
-            clamp: limit colours to >= 0.
+            sh_degree: largest SH degree to evaluate.
+            clamp: clamp colours to >= 0.
 
         Returns:
             (..., K, 3) colours.
@@ -174,7 +156,7 @@ class NeuralTexture(nn.Module):
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if not self.down_weighting:
-            focal = NO_FOOTPRINT
+            focal = FOCAL_WITHOUT_DOWN_WEIGHTING
         if isinstance(focal, torch.Tensor):
             if focal.numel() != 1:
                 raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
@@ -195,3 +177,32 @@ class NeuralTexture(nn.Module):
             clamp=clamp,
             half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
         )
+
+
+def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
+    """Raise TypeError or ValueError unless each size is an int in its range."""
+    for name, value, low, high in (
+        ("levels", levels, 1, 64),
+        ("table_size", table_size, 1, 2**30),
+        ("width", width, 1, 4096),
+        ("hidden_layers", hidden_layers, 0, 64),
+        ("sh_degree", sh_degree, 0, 3),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, low, high)
+    if table_size & (table_size - 1):
+        raise ValueError(f"table_size: expected a power of two, got {table_size}")
+    if isinstance(features, bool) or not isinstance(features, int):
+        raise TypeError(f"features: expected an int, got {type(features).__name__}")
+    if features not in (1, 2, 4, 8):
+        raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
+
+
+def _check_resolutions(min_resolution: float, max_resolution: float) -> None:
+    """Raise TypeError or ValueError unless the resolutions are numbers in their ranges."""
+    for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+    check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)

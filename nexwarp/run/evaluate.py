@@ -1,9 +1,9 @@
-"""Evaluation on held-out views, by the field's conventions (see `nexwarp.run.metrics`)."""
+"""Evaluation on held-out views; `nexwarp.run.metrics` defines the metrics."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TypedDict, cast
 
 import torch
 
@@ -11,6 +11,26 @@ from nexwarp.data import View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
+
+
+class Evaluation(TypedDict, total=False):
+    """The requested metrics of held-out views: their means over the views, and the values of each view.
+
+    Attributes:
+        psnr: mean PSNR [dB].
+        ssim: mean SSIM, at most 1.
+        flip: mean FLIP error in [0, 1], lower is better; None if its package is not installed.
+        lpips: mean LPIPS, lower is better; None if its package is not installed.
+        views: the metrics of each view, by view name.
+        convention: how the metrics are computed, as text.
+    """
+
+    psnr: float
+    ssim: float
+    flip: float | None
+    lpips: float | None
+    views: dict[str, dict[str, float | None]]
+    convention: str
 
 
 @torch.no_grad()
@@ -22,20 +42,22 @@ def evaluate(
     mask_mode: str = "ignore",
     metrics: Sequence[str] = ("psnr", "ssim"),
     progress: Callable[[str], None] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Render views and compare them with their photos.
 
     Args:
-        model: on the device to render on.
+        model: the model, on the device to render on.
         views: held-out views.
-        renders: folder for each view's picture and its strip of photo, render and error; None writes nothing.
-        mask_mode: what the views' masks leave out: `ignore` does not judge it, `background` wants the background there.
-        metrics: which figures, of psnr, ssim, flip and lpips. FLIP and LPIPS are of whole pictures, the photo put where
-            a mask ignores them, and None where their packages are not there.
-        progress: called with each view's name when it is done.
+        renders: folder for the images: `test/` gets each rendering, `compare/` a strip of photo, rendering and error
+            map. None writes nothing.
+        mask_mode: treatment of masked-out pixels: `ignore` excludes them from the metrics, `background` compares them
+            with the background colour.
+        metrics: names among psnr, ssim, flip and lpips. FLIP and LPIPS need whole images: ignored pixels are copied
+            from the photo.
+        progress: called with each view's name after the view is evaluated.
 
-    Returns:
-        Each metric (PSNR in dB): mean over views; "views": name -> the same; "convention".
+    Raises:
+        ValueError: there are no views, or a metric is unknown.
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
@@ -47,8 +69,8 @@ def evaluate(
         picture = to_uint8(out.image).cpu()
         photo, mask = to_uint8(view.image), view.mask
         if mask is not None and mask_mode == "background":
-            behind = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
-            photo, mask = torch.where(mask[..., None], photo, behind), None
+            background = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
+            photo, mask = torch.where(mask[..., None], photo, background), None
         results[view.name] = {name: METRICS[name](picture, photo, mask) for name in metrics}
         if renders is not None:
             stem = Path(view.name).with_suffix("")
@@ -61,20 +83,21 @@ def evaluate(
         if progress is not None:
             progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
-    return {**means, "views": results, "convention": CONVENTION}
+    return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
 
 
 def _mean(values: list[float | None]) -> float | None:
-    return None if None in values else fmean(values)
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
 
 
 def _whole(metric: Callable[..., float | None]) -> Callable[..., float | None]:
-    """The metric of whole pictures, where what does not count is as it should be."""
+    """Return a metric of whole images that takes a mask: excluded pixels are copied from the photo."""
 
-    def judge(picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> float | None:
+    def masked_metric(picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> float | None:
         return metric(picture if mask is None else torch.where(mask[..., None], picture, photo), photo)
 
-    return judge
+    return masked_metric
 
 
 METRICS = {"psnr": psnr, "ssim": ssim, "flip": _whole(flip), "lpips": _whole(lpips_vgg)}

@@ -16,7 +16,7 @@ EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two core
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How photos are turned into cameras and points."""
+    """Settings of structure from motion."""
 
     cameras: Cameras = "auto"
     """Photos that share a camera: of one size, lens and EXIF focal length (auto), all, of a folder, or none (image)."""

@@ -78,8 +78,8 @@ def load_checkpoint(
         except CheckpointError as error:
             damaged.append(error)
             continue
-        for error in damaged:
-            warn(f"{error}; going back to the one before it, {folder.name}")
+        for found in damaged:
+            warn(f"{found}; going back to the one before it, {folder.name}")
         return tensors, state
     if damaged:
         raise damaged[0]

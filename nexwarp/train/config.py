@@ -73,7 +73,7 @@ class TextureConfig:
     residual: bool = True
     """Add the texture's colours to the plain ones instead of replacing them."""
     down_weighting: bool = True
-    """Fade levels whose cells are smaller than a pixel (paper Eq. 2)."""
+    """Fade levels whose cells are smaller than a pixel (paper Eq. 4)."""
 
 
 @dataclass(frozen=True)

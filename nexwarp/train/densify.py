@@ -1,4 +1,4 @@
-"""Adaptive density control (paper Sec. 3.3): split where the blended error is, prune what is transparent."""
+"""Adaptive density control (paper Sec. 4.3): split where the blended error is, prune what is transparent."""
 
 from dataclasses import dataclass
 
@@ -67,7 +67,7 @@ class Densifier:
         self.errors += errors
 
     def step(self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> tuple[int, int]:
-        """Split, then prune, in place; children start with zero Adam moments.
+        """Split, then prune, in place; children start with optimizer state of zeros.
 
         Args:
             surfels: to change.
@@ -139,16 +139,20 @@ def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: to
     surfels.means[chosen], surfels.means[count:] = means - offset, means + offset
     surfels.log_scales[chosen], surfels.log_scales[count:] = halved, halved
     for name in PARAMETERS:
-        state = optimizer.state.get(getattr(surfels, name), {})
-        for key in ("exp_avg", "exp_avg_sq"):
-            if key in state:
-                state[key][chosen] = 0
-                state[key][count:] = 0
+        parameter = getattr(surfels, name)
+        for value in optimizer.state.get(parameter, {}).values():
+            if has_rows_of(value, parameter):
+                value[chosen] = 0
+                value[count:] = 0
 
 
 @torch.no_grad()
 def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor) -> None:
-    """Make the surfels the given rows (M,) of themselves, optimizer state included."""
+    """Make the surfels the given rows (M,) of themselves, optimizer state included.
+
+    Tensors of the optimizer's state that have their parameter's shape get the same rows; everything else, such as the
+    number of steps, is kept as it is.
+    """
     for name in PARAMETERS:
         old = getattr(surfels, name)
         new = nn.Parameter(old.detach()[rows].contiguous())
@@ -157,7 +161,12 @@ def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = optimizer.state.pop(old, None)
         if state is not None:
-            for key in ("exp_avg", "exp_avg_sq"):
-                if key in state:
-                    state[key] = state[key][rows].contiguous()
+            for key, value in state.items():
+                if has_rows_of(value, old):
+                    state[key] = value[rows].contiguous()
             optimizer.state[new] = state
+
+
+def has_rows_of(value: object, parameter: torch.Tensor) -> bool:
+    """Whether a value of an optimizer's state holds a number for each number of the parameter."""
+    return isinstance(value, torch.Tensor) and value.shape == parameter.shape

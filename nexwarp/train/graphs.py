@@ -1,33 +1,35 @@
-"""Training steps as CUDA graphs: a step's launches are recorded once and repeated as one."""
+"""Training steps as CUDA graphs: a step's launches are captured once and replayed as one."""
 
 import warnings
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import fields, replace
+from typing import NamedTuple
 
 import torch
 
 from nexwarp import ops
-from nexwarp.camera import Camera
+from nexwarp.camera import StagedCamera
+from nexwarp.model.options import RenderOptions
 from nexwarp.train.health import needed_memory
+from nexwarp.train.target import Target
 
-# Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. One that
-# was not seen for so many steps makes room for others.
+# Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A kind that
+# was not used for FORGOTTEN steps makes room for another.
 MOST_KINDS = 4
 FORGOTTEN = 1000
 
-# How often to start again with nothing when memory does not suffice.
+# How often to start again without any graph when memory does not suffice.
 CHANCES = 3
 
 
 class StepResult(NamedTuple):
-    """What a step leaves behind.
+    """What a step leaves behind, without a gradient.
 
     Attributes:
         losses: terms of the loss, scalars.
         image: (H, W, 3) the rendering.
-        room: of its lists.
+        room: capacity of its lists of surfels and tiles.
     """
 
     losses: dict[str, torch.Tensor]
@@ -35,17 +37,8 @@ class StepResult(NamedTuple):
     room: ops.ListCapacity
 
 
-@dataclass(frozen=True)
-class _StagedCamera(Camera):
-    """A camera whose numbers lie on the GPU, where they can change under a graph; its `fx` to `cy` say nothing."""
-
-    @property
-    def focal(self) -> torch.Tensor:  # type: ignore[override]
-        return self.focals
-
-
 class CaptureError(Exception):
-    """A step could not be recorded; `memory` says whether for lack of that."""
+    """A step could not be captured; `memory` says whether memory did not suffice."""
 
     def __init__(self, cause: RuntimeError) -> None:
         super().__init__(" ".join(str(cause).split()))
@@ -55,28 +48,28 @@ class CaptureError(Exception):
 class StepGraphs:
     """Runs the GPU's part of training steps, as graphs where that pays.
 
-    A step launches hundreds of small kernels, which keeps the host busy for longer than the GPU. All that differs from
-    one step to the next, its target and the learning rates, is copied to where the graph reads it. Whatever else
-    changes, such as the number of surfels, makes for a new graph: the first step after it is launched as ever, the next
-    one recorded. Both do the same arithmetic on the same numbers. Where memory does not suffice for graphs, or a step
-    cannot be recorded, all steps are launched from then on.
+    A step launches hundreds of small kernels, which keeps the host busy for longer than the GPU. What differs from one
+    step to the next, its target and the learning rates, is copied into tensors that the graph reads. Whatever else
+    changes, such as the number of surfels, needs a new graph: the first step after it is launched kernel by kernel, the
+    next one is captured. Both do the same arithmetic on the same numbers. Where memory does not suffice for graphs, or
+    a step cannot be captured, all later steps are launched kernel by kernel.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
-        self.pool: Any = None
+        self.pool: tuple[int, int] | None = None
         self.keeper: torch.cuda.CUDAGraph | None = None
         self.stages: dict[Hashable, _Stage] = {}
         self.steps = 0
         self.chances = CHANCES
 
-    def run(self, target: Any, work: Callable[[Any], StepResult], state: Hashable) -> StepResult:
+    def run(self, target: Target, work: Callable[[Target], StepResult], state: Hashable) -> StepResult:
         """Do a step.
 
         Args:
-            target: a frozen dataclass of what the step is to show: tensors, and a camera by the name of `camera`.
+            target: of the step.
             work: does the step for a target; its launches may depend on nothing but the target's kind and `state`.
-            state: whatever else `work` depends on.
+            state: whatever else the launches depend on; see `graph_key`.
 
         Returns:
             What `work` returns.
@@ -98,12 +91,12 @@ class StepGraphs:
         return work(target)
 
     def clear(self) -> None:
-        """Drop all graphs, and the memory that they have."""
+        """Drop all graphs and free their memory."""
         self.stages.clear()
         self.keeper = self.pool = None
         torch.cuda.empty_cache()
 
-    def _run(self, target: Any, work: Callable[[Any], StepResult], state: Hashable) -> StepResult:
+    def _run(self, target: Target, work: Callable[[Target], StepResult], state: Hashable) -> StepResult:
         self.steps += 1
         kind = _kind(target)
         stage = self.stages.get(kind)
@@ -127,70 +120,65 @@ class StepGraphs:
         return stage.replay()
 
     def _keep_pool(self) -> None:
-        """A pool of memory is gone with its last graph: one that does nothing outlives the others."""
+        """Make a graph that keeps the memory pool: torch frees a pool with its last graph."""
         if self.keeper is not None:
             return
         keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=self.stream.device)
         self.pool = torch.cuda.graph_pool_handle()
-        with _told(), ops.captured(keeper, self.stream, self.pool):
+        with _capture_errors(), ops.captured(keeper, self.stream, self.pool):
             mark.add_(1)
         self.keeper = keeper
 
 
 class _Stage:
-    """The place where targets of one kind are put, and the graph that looks at it."""
+    """Tensors that targets of one kind are copied into, and the graph that reads them."""
 
-    def __init__(self, target: Any) -> None:
-        camera = target.camera
-        staged = object.__new__(_StagedCamera)
-        for name, value in vars(camera).items():
-            object.__setattr__(staged, name, value.clone() if isinstance(value, torch.Tensor) else value)
-        object.__setattr__(staged, "focals", camera.viewmat.new_full((1,), camera.focal))
+    def __init__(self, target: Target) -> None:
         tensors = {f.name: getattr(target, f.name) for f in fields(target)}
         tensors = {name: x.clone() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
-        self.target = replace(target, camera=staged, **tensors)
+        self.camera = StagedCamera.of(target.camera)
+        self.target = replace(target, camera=self.camera, **tensors)
         self.tensors = tensors
         self.seen = 0
         self.state: Hashable = None
         self.graph: torch.cuda.CUDAGraph | None = None
-        self.learnt: StepResult | None = None
+        self.result: StepResult | None = None
         self.losses: torch.Tensor | None = None
 
-    def take(self, target: Any) -> None:
-        """Put another target of the kind in the place of the last one."""
+    def take(self, target: Target) -> None:
+        """Overwrite the tensors with those of another target of the kind."""
         for name, place in self.tensors.items():
             place.copy_(getattr(target, name))
-        staged, camera = self.target.camera, target.camera
-        staged.viewmat.copy_(camera.viewmat)
-        staged.K.copy_(camera.K)
-        staged.focals.fill_(camera.focal)
+        self.camera.copy_(target.camera)
 
-    def capture(self, work: Callable[[Any], StepResult], stream: torch.cuda.Stream, pool: Any) -> None:
-        """Record the work."""
+    def capture(
+        self, work: Callable[[Target], StepResult], stream: torch.cuda.Stream, pool: tuple[int, int] | None
+    ) -> None:
+        """Capture the work."""
         graph = torch.cuda.CUDAGraph()
-        with _told(), ops.captured(graph, stream, pool):
-            self.learnt = work(self.target)
-            self.losses = torch.stack(list(self.learnt.losses.values()))
+        with _capture_errors(), ops.captured(graph, stream, pool):
+            self.result = work(self.target)
+            self.losses = torch.stack(list(self.result.losses.values()))
         self.graph = graph
 
     def replay(self) -> StepResult:
-        """Do the recorded work."""
-        assert self.graph is not None and self.learnt is not None and self.losses is not None
+        """Replay the captured work."""
+        assert self.graph is not None and self.result is not None and self.losses is not None
         self.graph.replay()
-        learnt = self.learnt
-        if not ops.fits(learnt.room):
+        result = self.result
+        if not ops.fits(result.room):
             self.state = None
-        # They may be looked at later, when the graph has put others there.
-        losses = dict(zip(learnt.losses, self.losses.clone().unbind(), strict=True))
-        return learnt._replace(losses=losses, image=learnt.image.clone())
+        # Copies: they may be read after the next replay has overwritten the graph's own.
+        losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
+        return result._replace(losses=losses, image=result.image.clone())
 
     def forget(self) -> None:
         """Drop the graph."""
-        self.graph = self.learnt = self.losses = None
+        self.graph = self.result = self.losses = None
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def _capture_errors() -> Iterator[None]:
     """Turn errors of a capture into CaptureError."""
     try:
         yield
@@ -198,10 +186,10 @@ def _told() -> Iterator[None]:
         raise CaptureError(error) from None  # whose traceback would keep what the step had made
 
 
-def _kind(target: Any) -> Hashable:
-    """All of a target that is not tensors' values."""
+def _kind(target: Target) -> Hashable:
+    """Key of a target's kind: everything but its tensors' values."""
     camera = target.camera
-    parts: list[Any] = [camera.width, camera.height, camera.near]
+    parts: list[Hashable] = [camera.width, camera.height, camera.near]
     for field in fields(target):
         value = getattr(target, field.name)
         if isinstance(value, torch.Tensor):
@@ -210,3 +198,31 @@ def _kind(target: Any) -> Hashable:
             value = (value.viewmat.dtype, value.K.dtype)
         parts.append(value)
     return tuple(parts)
+
+
+def can_capture(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether an optimizer's step can be captured: it says so, and its learning rates are tensors on the GPU."""
+    rates = [group["lr"] for group in optimizer.param_groups if group.get("capturable")]
+    on_gpu = all(isinstance(rate, torch.Tensor) and rate.is_cuda for rate in rates)
+    return on_gpu and len(rates) == len(optimizer.param_groups)
+
+
+def graph_key(
+    options: RenderOptions, optimizer: torch.optim.Optimizer, state: Sequence[torch.Tensor], *, densify: bool
+) -> Hashable:
+    """Key that decides whether a captured graph can be reused, beside its target's kind.
+
+    Args:
+        options: how the step renders.
+        optimizer: whose learning rates are tensors.
+        state: tensors that a step reads and writes: the parameters, their moments and the densifier's sums.
+        densify: whether the step adds to these sums.
+    """
+    return (
+        densify,
+        options.max_hits,
+        options.sh_degree,
+        torch.are_deterministic_algorithms_enabled(),
+        *((x.data_ptr(), x.shape) for x in state),
+        *(group["lr"].data_ptr() for group in optimizer.param_groups),
+    )

@@ -1,10 +1,20 @@
-"""Watching a training: numbers that are no longer finite, and memory that does not suffice."""
+"""Health of a training: numbers that are not finite, going back from them, and memory that does not suffice."""
 
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
+
+from nexwarp.camera import Camera
+from nexwarp.errors import DivergedError
+from nexwarp.train.config import Config
+from nexwarp.train.report import StepReport
+from nexwarp.train.state import Snapshot
+
+LOWERED_RATES = 0.5
 
 ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
 
@@ -17,7 +27,7 @@ UNKNOWN = "more than there is"
 
 
 class LossLog:
-    """Losses of the iterations since they were last looked at; looking costs one wait for the GPU, noting none."""
+    """Losses of the iterations since the last check; a check waits for the GPU once, noting does not."""
 
     def __init__(self) -> None:
         self.noted: list[tuple[int, str, torch.Tensor]] = []
@@ -34,6 +44,46 @@ class LossLog:
         values = torch.stack([value for _, _, value in noted]).tolist()
         bad = ((i, name, x) for (i, name, _), x in zip(noted, values, strict=True) if not math.isfinite(x))
         return next(bad, None)
+
+
+@dataclass(frozen=True)
+class StepFacts:
+    """Where a run stands, for messages and reports.
+
+    Attributes:
+        iteration: steps done.
+        checked_before: the iteration of the last check.
+        surfels: how many there are.
+        rate_factor: multiplies all learning rates.
+    """
+
+    iteration: int
+    checked_before: int
+    surfels: int
+    rate_factor: float
+
+
+class RestorableRun(Protocol):
+    """A run that can be taken back to a snapshot and repeated from there.
+
+    Attributes:
+        iteration: steps done.
+        rate_factor: multiplies all learning rates.
+        loss_log: of the losses since the last check.
+    """
+
+    iteration: int
+    rate_factor: float
+    loss_log: LossLog
+
+    def step(self) -> StepReport:
+        """Do one step."""
+
+    def check(self) -> None:
+        """Raise DivergedError where something is not finite."""
+
+    def load_snapshot(self, snapshot: Snapshot) -> None:
+        """Return to a snapshot."""
 
 
 def not_finite(tensors: Mapping[str, torch.Tensor]) -> list[str]:
@@ -70,3 +120,102 @@ def _readable(amount: str) -> str:
         return amount
     size = int(match[1])
     return f"{size / 2**30:.2f} GiB" if size >= 2**30 else f"{size / 2**20:.2f} MiB"
+
+
+def check_health(losses: LossLog, tensors: Mapping[str, torch.Tensor], facts: StepFacts) -> None:
+    """Raise DivergedError unless the noted losses and all tensors are finite; forget the noted losses.
+
+    Args:
+        losses: of the iterations since the last check.
+        tensors: parameters, the optimizer's state and whatever else must stay finite, by name.
+        facts: of the run, for the message and the report.
+    """
+    loss, bad = losses.first_bad(), not_finite(tensors)
+    if loss is None and not bad:
+        return
+    if loss is not None:
+        when, name, value = loss
+        told = f"iteration {when}: the loss {name!r} is {value}"
+    else:
+        span = f"{facts.checked_before + 1} to " if facts.checked_before + 1 < facts.iteration else ""
+        told = f"iteration {span}{facts.iteration}: not finite"
+    found = [describe(name, tensors[name]) for name in bad]
+    if len(found) > 1:
+        others = dict.fromkeys(name.rpartition(" ")[2] for name in bad)
+        found[0] += f" (in all: {', '.join(others)})"
+    report = {
+        "iteration": facts.iteration,
+        "checked_before": facts.checked_before,
+        "loss": None if loss is None else {"iteration": loss[0], "term": loss[1], "value": str(loss[2])},
+        "tensors": found,
+        "surfels": facts.surfels,
+        "rate_factor": facts.rate_factor,
+    }
+    raise DivergedError("; ".join([told, *found[:1]]), report)
+
+
+def go_back(run: RestorableRun, good: Snapshot, fault: DivergedError) -> str:
+    """Return a run to its last good snapshot with half the learning rates.
+
+    Args:
+        run: the run.
+        good: the snapshot.
+        fault: what was found.
+
+    Returns:
+        A warning that names the fault.
+
+    Raises:
+        DivergedError: the run had gone back before; it is in its last good state, and its rates are halved.
+    """
+    again = run.rate_factor < 1.0
+    fault = first_fault(run, good, fault)
+    run.load_snapshot(good)
+    run.rate_factor = LOWERED_RATES
+    if again:
+        told = f"{fault}; it had gone back and halved its learning rates before, so training gives up"
+        raise DivergedError(told, fault.report | {"good_iteration": run.iteration}) from None
+    return f"{fault}; going back to iteration {run.iteration:,} with half the learning rates"
+
+
+def first_fault(run: RestorableRun, good: Snapshot, fault: DivergedError) -> DivergedError:
+    """Replay the steps since a good snapshot, checking each one: NaNs spread within a few steps.
+
+    Returns:
+        The first fault of the replay; where the replay has none, the one given.
+    """
+    until, rate_factor = run.iteration, run.rate_factor
+    run.load_snapshot(good)
+    run.rate_factor = rate_factor
+    try:
+        while run.iteration < until:
+            run.loss_log.note(run.iteration + 1, run.step().losses)
+            run.check()
+    except DivergedError as first:
+        return first
+    return fault
+
+
+def oom_message(
+    needed: str, facts: StepFacts, camera: Camera, config: Config, device: torch.device, *, graphs: bool
+) -> str:
+    """Return what to say when memory does not suffice: what it was needed for, and what to lower.
+
+    Args:
+        needed: as `needed_memory` tells it.
+        facts: of the run.
+        camera: of the first training view, whose size stands for all.
+        config: settings.
+        device: of the training.
+        graphs: whether CUDA graphs are in use.
+    """
+    place, used, advice = "memory", "", ""
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        place, used = "GPU memory", f", with {(total - free) / 2**30:.1f} of {total / 2**30:.1f} GiB in use"
+        advice = ", or do without CUDA graphs (--set cuda_graphs=false)" if graphs else ""
+    return (
+        f"out of {place} at iteration {facts.iteration}: it needed {needed}{used}, for {facts.surfels:,} "
+        f"surfels and photos of {camera.width}x{camera.height}; lower --max-surfels (now "
+        f"{config.max_surfels:,}) or --max-hits (now {config.max_hits}), or raise --downscale{advice}"
+    )

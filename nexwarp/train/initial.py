@@ -20,7 +20,7 @@ TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the
 
 
 def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
-    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 3.3)."""
+    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 4.3)."""
     points = initial_points(
         scene.points,
         scene.colors,

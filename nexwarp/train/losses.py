@@ -86,7 +86,7 @@ def training_losses(
     if empty is not None:
         check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
         _, textured, weights = _masked(image, textured, weights, target, ~empty)
-    # With all of K = 4 test views came out worse than with K = 2: benchmarks/NOTES.md.
+    # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
     all_count = weights.shape[-1] <= factors.alpha_hits
     l1_term, texture_term, alpha_term = photometric_terms(
         image,
@@ -105,9 +105,17 @@ def training_losses(
         "texture": texture_term,
         "alpha": alpha_term,
         "opacity": factors.opacity * opacity_loss(opacities) if factors.opacity > 0.0 else None,
-        "grid": factors.grid * grid_loss(grid, resolutions) if factors.grid > 0.0 and grid is not None else None,
+        "grid": None,
     }
+    if factors.grid > 0.0 and grid is not None and resolutions is not None:
+        terms["grid"] = factors.grid * grid_loss(grid, resolutions)
     return {name: term for name, term in terms.items() if term is not None}
+
+
+def _computed(term: torch.Tensor | None) -> torch.Tensor:
+    """Return a term whose factor is not 0, which is therefore computed."""
+    assert term is not None
+    return term
 
 
 def _masked(
@@ -126,7 +134,7 @@ def _masked(
 
 def l1(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """L_1: mean absolute difference of two (H, W, 3) images."""
-    return photometric_terms(image, None, None, target, l1=1.0)[0]
+    return _computed(photometric_terms(image, None, None, target, l1=1.0)[0])
 
 
 def dssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -155,12 +163,12 @@ def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Te
         weights: (H, W, K), W.
         target: (H, W, 3).
     """
-    return photometric_terms(None, textured, weights, target, texture=1.0)[1]
+    return _computed(photometric_terms(None, textured, weights, target, texture=1.0)[1])
 
 
 def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
     """L_alpha: mean over the pixels of 1 - sum_k W, for (H, W, K) weights."""
-    return photometric_terms(None, None, weights, None, alpha=1.0)[2]
+    return _computed(photometric_terms(None, None, weights, None, alpha=1.0)[2])
 
 
 def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor) -> torch.Tensor:

@@ -1,19 +1,96 @@
-"""Learning rates and schedules over a run."""
+"""Learning rates and schedules over a run, and the optimizer whose rates follow them."""
 
 import dataclasses
+import math
+from collections.abc import Callable
+from typing import TypedDict
 
 import torch
 
+from nexwarp.model.options import RenderOptions
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.densify import PARAMETERS, DensifyConfig
 
 
-def make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, scale: float) -> torch.optim.Adam:
-    """Make Adam with the learning rates of a config; `scale` is the scene's, which the means' rates follow."""
+class ParameterGroup(TypedDict):
+    """Parameters that share a learning rate, as an optimizer takes them.
+
+    Attributes:
+        params: the parameters, leaves.
+        name: "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" or "mlp".
+        lr: learning rate of the first step.
+    """
+
+    params: list[torch.nn.Parameter]
+    name: str
+    lr: float
+
+
+OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
+
+
+def make_optimizer(
+    surfels: Surfels,
+    texture: NeuralTexture,
+    config: Config,
+    scale: float,
+    make: OptimizerMaker | None = None,
+) -> torch.optim.Optimizer:
+    """Make the optimizer; each of its groups gets the ends of its schedule as `group["ends"]`.
+
+    Args:
+        surfels: to train.
+        texture: to train, unless K is 0.
+        config: whose learning rates count.
+        scale: of the scene, world units, which the means' rates follow.
+        make: makes an optimizer of one's own; None makes Adam.
+
+    Raises:
+        TypeError: `make` returned no optimizer.
+        ValueError: its groups are not those that it was given.
+    """
+    ends = rate_ends(config, scale)
+    parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
+    if config.max_hits:
+        parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+    groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
+    optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
+    if not isinstance(optimizer, torch.optim.Optimizer):
+        raise TypeError(f"optimizer: expected it to return a torch.optim.Optimizer, got {type(optimizer).__name__}")
+    expected = {name: {id(x) for x in values} for name, values in parts.items()}
+    if {g.get("name"): {id(x) for x in g["params"]} for g in optimizer.param_groups} != expected:
+        given = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
+        raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {given}")
+    for group in optimizer.param_groups:
+        group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
+    return optimizer
+
+
+def _make_adam(groups: list[ParameterGroup], device: torch.device) -> torch.optim.Adam:
+    """Make Adam with the paper's epsilon; on CUDA, its rates are tensors, which a CUDA graph reads."""
+    on_gpu = device.type == "cuda"
+    given = [dict(group, lr=torch.tensor(group["lr"], device=device)) if on_gpu else dict(group) for group in groups]
+    return torch.optim.Adam(given, eps=1e-15, fused=True, capturable=on_gpu)
+
+
+def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:
+    """Return the first and last rate of a group whose first rate may have been changed; their ratio is kept."""
+    if math.isclose(rate, ends[0], rel_tol=1e-6):  # a rate on the GPU is rounded to float32
+        return ends
+    return (rate, rate) if ends[0] == 0 else (rate, rate * ends[1] / ends[0])
+
+
+def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
+    """Return the learning rates of a run's first and last step by the name of their group.
+
+    Args:
+        config: whose rates count.
+        scale: of the scene, world units, which the means' rates follow.
+    """
     rates = config.rates
-    ends: dict[str, tuple[float, float]] = {
+    return {
         "means": (rates.means[0] * scale, rates.means[1] * scale),
         "raw_quats": (rates.quats,) * 2,
         "log_scales": (rates.scales,) * 2,
@@ -21,15 +98,50 @@ def make_optimizer(surfels: Surfels, texture: NeuralTexture, config: Config, sca
         "raw_gammas": (rates.gammas,) * 2,
         "sh0": (rates.sh0,) * 2,
         "shN": (rates.shN,) * 2,
+        "grid": rates.grid,
+        "mlp": rates.mlp,
     }
-    groups = [{"params": [getattr(surfels, name)], "ends": ends[name], "lr": ends[name][0]} for name in PARAMETERS]
-    if config.max_hits:
-        groups.append({"params": [texture.grid], "ends": rates.grid, "lr": rates.grid[0]})
-        groups.append({"params": list(texture.mlp.parameters()), "ends": rates.mlp, "lr": rates.mlp[0]})
-    on_gpu = surfels.means.is_cuda
-    if on_gpu:  # where a CUDA graph finds them
-        groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.means.device)} for group in groups]
-    return torch.optim.Adam(groups, eps=1e-15, fused=True, capturable=on_gpu)
+
+
+def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float) -> None:
+    """Set an optimizer's learning rates for a step: log-linear between the ends of each group.
+
+    Args:
+        optimizer: as `make_optimizer` makes it.
+        iteration: of the step, from 1.
+        iterations: of the run.
+        factor: multiplies all rates.
+    """
+    progress = (iteration - 1) / max(iterations - 1, 1)
+    for group in optimizer.param_groups:
+        first, last = group["ends"]
+        rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
+        rate *= factor
+        if isinstance(group["lr"], torch.Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
+def options_at(
+    config: Config, iteration: int, background: tuple[float, float, float], texture_degree: int
+) -> RenderOptions:
+    """Return how the scene is rendered after an iteration: more hits and SH degrees are unlocked on the way.
+
+    Args:
+        config: settings.
+        iteration: from 0, before the first step.
+        background: of the run.
+        texture_degree: SH degree of the texture.
+    """
+    unlocked = iteration // config.scaled(config.sh_every)
+    return RenderOptions(
+        max_hits=config.hits_at(iteration),
+        background=background,
+        sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
+        low_pass=config.low_pass,
+        clamp_texture=config.clamp_texture,
+    )
 
 
 def densify_schedule(config: Config) -> DensifyConfig:

@@ -1,34 +1,159 @@
 """What a training step compares its rendering with."""
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.camera import Camera, visible_points
+from nexwarp.data import Scene
+from nexwarp.render import Color, jitter_factors
+from nexwarp.train.config import Config
+from nexwarp.train.views import TrainingViews
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a step is to show.
+    """What a training step compares its rendering with; all tensors are on the device of the training.
 
     Attributes:
-        camera: to render with.
-        photo: (H, W, 3) float, what to compare with.
-        background: as `render` takes it.
+        camera: the camera that the step renders.
+        photo: (H, W, 3) float, the photo at the photos' mean exposure; values may exceed 1.
+        background: three numbers or a (3,) tensor, the colour behind everything in this step.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
-        beyond: (H, W) bool, what lies beyond the photo's frame; None is nothing.
-        places, expected: (M,) points to compare depths with, as `depth_loss` takes them; None is no such loss.
-        depth_jitter: as `render` takes it.
+        beyond: (H, W) bool, what lies beyond the photo's frame, where its edge is repeated; None is nothing.
+        places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
+        expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
+        depth_jitter: as `nexwarp.render` takes it.
     """
 
     camera: Camera
     photo: torch.Tensor
-    background: Any
+    background: Color
     counts: torch.Tensor | None = None
     empty: torch.Tensor | None = None
     beyond: torch.Tensor | None = None
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
+
+
+class TargetMaker:
+    """Makes the targets of the steps of one training."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        views: TrainingViews,
+        background: tuple[float, float, float],
+        generator: torch.Generator,
+        noise: torch.Generator,
+    ) -> None:
+        """Take what targets are made of.
+
+        Args:
+            scene: the scene of the training.
+            config: settings.
+            views: the scene's training views on the device.
+            background: the colour behind everything, where it is not random.
+            generator: of random backgrounds and of the shifts of border steps, on the CPU.
+            noise: of the depth jitter, on the device.
+        """
+        self.scene, self.config, self.views = scene, config, views
+        self.background, self.generator, self.noise = background, generator, noise
+        self.background_tensor = torch.tensor(background, device=views.device)
+        self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
+
+    def make(self, index: int, iteration: int, upcoming: list[int]) -> Target:
+        """Make the target of a step.
+
+        Args:
+            index: of the training view.
+            iteration: of the step, from 1.
+            upcoming: indices of the views to come, the next one first.
+        """
+        config = self.config
+        coarse = iteration <= config.coarse * config.iterations
+        target = self.from_view(index, 2 if coarse else 1, upcoming)
+        if config.border > 0 and iteration % config.border_every == 0:
+            # Without points: those of a shifted window would have to be found anew in every border step.
+            target = self.shifted(target)
+        else:
+            target = self.with_points(target, index)
+        if config.depth_jitter > 0 and config.max_hits:
+            hits = config.hits_at(iteration)
+            drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
+            target = dataclasses.replace(target, depth_jitter=drawn)
+        return target
+
+    def from_view(self, index: int, factor: int, upcoming: list[int] | None = None) -> Target:
+        """Make the target of a whole view, reduced by a factor: photo, background and mask.
+
+        Args:
+            index: of the training view.
+            factor: blocks of this many pixels squared are averaged.
+            upcoming: indices of the views to come, the next one first.
+        """
+        camera, photo = self.views.get(index, factor, upcoming or [])
+        background: Color = self.background
+        behind = self.background_tensor
+        if self.scene.random_background:
+            drawn = torch.rand(3, generator=self.generator)
+            background = behind = drawn.to(self.views.device, non_blocking=True)
+            alpha = self.views.alpha(index, factor)
+            if alpha is not None:
+                photo = photo + (1 - alpha)[..., None] * (behind - self.background_tensor)
+        mask = self.views.mask(index, factor)
+        if mask is None or self.config.mask_mode == "ignore":
+            return Target(camera, photo, background, counts=mask)
+        return Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
+
+    def shifted(self, target: Target) -> Target:
+        """Shift a target's window at random, for a border step; beyond the frame, the photo's edge is repeated.
+
+        No photo supervises what lies beyond all frames, and every test view shows some of it at its edges.
+        """
+        camera, device = target.camera, self.views.device
+        sizes = (camera.height, camera.width)
+        shifts = (2 * torch.rand(2, generator=self.generator) - 1) * self.config.border * torch.tensor(sizes)
+        top, left = (round(x) for x in shifts.tolist())
+        rows = torch.arange(top, top + sizes[0], device=device)
+        columns = torch.arange(left, left + sizes[1], device=device)
+        inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))
+        rows, columns = rows.clamp(0, sizes[0] - 1)[:, None], columns.clamp(0, sizes[1] - 1)
+        known = None if target.counts is None else target.counts[rows, columns]
+        return dataclasses.replace(
+            target,
+            camera=camera.crop(left, top, camera.width, camera.height),
+            photo=target.photo[rows, columns],
+            counts=inside if known is None else inside & known,
+            empty=None if target.empty is None else target.empty[rows, columns],
+            beyond=~inside if known is None else ~inside & known,
+        )
+
+    def with_points(self, target: Target, index: int) -> Target:
+        """Add the points of view `index` to its target, where it has any and the depth loss counts."""
+        points = self.scene.train[index].points
+        if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None:
+            return target
+        camera, device = target.camera, self.views.device
+        key = (index, camera.width)
+        if key not in self.points:
+            mask = target.counts if target.empty is None else ~target.empty
+            seen = camera.project(points.to(device))
+            found = visible_points(*seen, camera.width, camera.height, mask)
+            none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
+            self.points[key] = none if found is None else found
+        places, expected = self.points[key]
+        # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad too:
+        # sums of other lengths are rounded differently.
+        fill = self._most_points - len(places) if device.type == "cuda" else 0
+        places, expected = (torch.nn.functional.pad(x, (0, fill)) for x in (places, expected))
+        return dataclasses.replace(target, places=places, expected=expected)
+
+    @cached_property
+    def _most_points(self) -> int:
+        return max(len(view.points) for view in self.scene.train if view.points is not None)

@@ -1,4 +1,4 @@
-"""The photos that training looks at, on the device that it runs on."""
+"""The training photos, on the device of the training."""
 
 import copy
 import hashlib
@@ -41,7 +41,7 @@ class TrainingViews:
         self.alphas = [view.alpha for view in views]
         self.reduced: dict[tuple[int, int], Camera] = {}
         self.pool: ThreadPoolExecutor | None = None
-        self.coming: dict[int, Future] = {}
+        self.coming: dict[int, Future[tuple[torch.Tensor, torch.cuda.Event]]] = {}
         if device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
             if sum(p.numel() for p in self.photos) < PHOTO_SHARE * free:

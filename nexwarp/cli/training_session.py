@@ -1,0 +1,193 @@
+"""A training session: the training loop with display, log and checkpoints, and the files of a finished run."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from rich.console import Console
+
+from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.cli import display
+from nexwarp.cli.eval import evaluate_run, figures
+from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, StorageError
+from nexwarp.io.json_files import Json, write_json
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import load, save_model
+from nexwarp.run.folder import CAMERAS_FILE, check_room, tidy_run
+from nexwarp.run.log import TrainingLog
+from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
+from nexwarp.train.health import needed_memory
+from nexwarp.train.report import StepReport
+from nexwarp.train.trainer import Trainer
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
+
+CHECKPOINTS_A_RUN = 10
+# Large files on the disk at once: two checkpoints, a third while it is written, and the model.
+FILES_AT_A_TIME = 4
+DIVERGED_FILE = "diverged.json"
+
+
+class TrainingSession:
+    """One training in a run folder, from its first or resumed iteration to the evaluated model."""
+
+    def __init__(
+        self, trainer: Trainer, run: Path, console: Console, *, tensorboard: bool = False, every: int | None = None
+    ) -> None:
+        """Prepare the session; nothing runs yet.
+
+        Args:
+            trainer: the trainer, before its first iteration.
+            run: run folder.
+            console: where to print.
+            tensorboard: whether to log for TensorBoard, too.
+            every: iterations between checkpoints; None is a tenth of the run.
+        """
+        self.trainer, self.run, self.console, self.tensorboard = trainer, run, console, tensorboard
+        self.total = trainer.config.iterations
+        self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
+
+    def check_room(self, kept: int = 0) -> None:
+        """Raise StorageError unless the disk has room for the run's files.
+
+        Args:
+            kept: number of checkpoints that the run has already.
+        """
+        check_room(self.run, max(FILES_AT_A_TIME - kept, 1) * self.trainer.checkpoint_size())
+
+    def resume(self) -> None:
+        """Restore the run's newest complete checkpoint, if it has one."""
+        self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
+        tidy_run(self.run)
+        if has_checkpoint(self.run):
+            self.trainer.restore(self.run, partial(display.warn, self.console))
+            self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
+        else:
+            self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+
+    def train(self, viewer: "Viewer | None" = None) -> None:
+        """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
+
+        Args:
+            viewer: shows the training between steps; None shows nothing.
+
+        Raises:
+            DivergedError: the training diverged twice; the last good model and a report are in the run.
+            StorageError: the disk is full; the current model is in the run if there was room for it.
+            Stopped: a signal ended the training; a checkpoint of its last step is in the run.
+        """
+        trainer = self.trainer
+        progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
+        log = TrainingLog(self.run, trainer, tensorboard=self.tensorboard)
+        with progress_display, log, deferred_stop() as stop_signal:
+
+            def observe(step: StepReport) -> None:
+                progress_display(step)
+                with self._model_kept():
+                    log(step)
+                if viewer is not None:
+                    viewer.between_steps(step.iteration, partial(_describe, step), lambda: stop_signal() is not None)
+                if step.iteration % self.every == 0 or step.iteration == self.total or stop_signal() is not None:
+                    with self._model_kept():
+                        trainer.save(self.run)
+                if (number := stop_signal()) is not None:
+                    raise Stopped(number)
+
+            def warn(text: str) -> None:
+                display.warn(self.console, text)
+                log.rewind()
+
+            try:
+                trainer.run(observe, warn)
+            except DivergedError as error:
+                raise self._diverged(error) from None
+
+    def _diverged(self, error: DivergedError) -> DivergedError:
+        """Write a report and the last good model, which the trainer has restored; return the error to raise."""
+        trainer, run = self.trainer, self.run
+        report = {"message": str(error), **error.report}
+        outcome = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
+        try:
+            write_json(run / DIVERGED_FILE, report)
+            save_model(run, trainer.model())
+        except OSError as problem:
+            outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
+        return DivergedError(f"{error}; {outcome}", report)
+
+    @contextmanager
+    def _model_kept(self) -> Iterator[None]:
+        """If the block fails on a full disk, save the model at least, which is smaller than a checkpoint."""
+        try:
+            yield
+        except OSError as error:
+            try:
+                save_model(self.run, self.trainer.model())
+                model = "the current model is saved"
+            except OSError:
+                model = "the model cannot be saved either"
+            checkpoint = "there is no checkpoint"
+            if has_checkpoint(self.run):
+                checkpoint = "--resume continues from the last checkpoint"
+            iteration = self.trainer.iteration
+            raise StorageError(f"{error}; training stops at iteration {iteration:,}: {model}, {checkpoint}") from error
+
+    def finish(self) -> Model:
+        """Finish, write, evaluate and return the model.
+
+        Raises:
+            StorageError, OutOfMemoryError: the last checkpoint holds the trained state; --resume finishes the run.
+        """
+        try:
+            return self._finish()
+        except OSError as error:
+            raise StorageError(f"{error}; training is complete and saved: --resume finishes the run") from error
+        except (MemoryError, RuntimeError) as error:
+            if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
+                raise
+            raise OutOfMemoryError(
+                f"out of memory: needed {needed}; training is complete and saved: --resume finishes the run"
+            ) from error
+
+    def _finish(self) -> Model:
+        trainer, scene, run, device = self.trainer, self.trainer.scene, self.run, self.trainer.device
+        with display.stages(self.console) as observe:
+            finished = trainer.finish(observe)
+        file = save_model(run, finished)
+        sets = {"train": scene.train, "test": scene.test}
+        save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
+        model = load(run).to(device)
+        rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
+        facts: dict[str, Json] = {
+            "preset": trainer.config.preset,
+            "iterations": trainer.iteration,
+            "surfels": len(model.surfels),
+            "megabytes": megabytes,
+            "seconds": trainer.seconds,
+            "iterations_per_second": rate,
+            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        }
+        rows = {}
+        if scene.test:
+            rows = figures(
+                evaluate_run(model, scene, run, self.console, mask_mode=trainer.config.mask_mode, facts=facts)
+            )
+        rows |= {
+            "surfels": f"{len(model.surfels):,}",
+            "model file": f"{megabytes:.1f} MB",
+            "training": f"{trainer.seconds:.0f} s, {rate:.1f} it/s",
+            "run": str(run),
+        }
+        self.console.print(display.results_table(rows, f"{len(scene.test)} test views"))
+        if scene.test:
+            first = Path(scene.test[0].name).with_suffix("")
+            self.console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
+        return model
+
+
+def _describe(step: StepReport) -> str:
+    return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"

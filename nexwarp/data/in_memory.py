@@ -1,0 +1,154 @@
+"""Views and points from tensors in memory, checked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, safe_name
+from nexwarp.data.views import View
+
+Array = torch.Tensor | np.ndarray
+
+
+@dataclass(frozen=True)
+class Split:
+    """Views in memory, as a scene has them, sorted by name.
+
+    Attributes:
+        train: views to learn from.
+        test: views to judge by.
+    """
+
+    train: list[View]
+    test: list[View]
+
+
+def split_views(
+    images: Sequence[Array],
+    cameras: Sequence[Camera],
+    masks: Sequence[Array | None] | None,
+    names: Sequence[str] | None,
+    test_every: int,
+) -> Split:
+    """Make views of the arguments of `Scene.from_tensors`, which documents them.
+
+    Raises:
+        TypeError, ValueError: naming the argument, its index, what was expected and what came.
+    """
+    if isinstance(test_every, bool) or not isinstance(test_every, int):
+        raise TypeError(f"test_every: expected an int, got {type(test_every).__name__}")
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every: expected 0, or at least 2, got {test_every}")
+    for argument, values in (("images", images), ("cameras", cameras), ("masks", masks), ("names", names)):
+        if values is not None and not (hasattr(values, "__len__") and hasattr(values, "__getitem__")):
+            raise TypeError(f"{argument}: expected a sequence, got {type(values).__name__}")
+    if not len(images):
+        raise ValueError("images: expected at least one, got none")
+    for argument, values in (("cameras", cameras), ("masks", masks), ("names", names)):
+        if values is not None and len(values) != len(images):
+            raise ValueError(f"{argument}: expected {len(images)}, one for each image, got {len(values)}")
+    labels = _names(names, len(images))
+    views = [
+        _view(index, images[index], cameras[index], None if masks is None else masks[index], labels[index])
+        for index in range(len(images))
+    ]
+    views.sort(key=lambda view: view.name)
+    tests = [test_every > 0 and index % test_every == 0 for index in range(len(views))]
+    train = [view for view, test in zip(views, tests, strict=True) if not test]
+    if not train:
+        raise ValueError(f"test_every: expected 0 for {len(views)} image, which else is a test view, got {test_every}")
+    return Split(train, [view for view, test in zip(views, tests, strict=True) if test])
+
+
+def make_cloud(points: Array, colors: Array | None) -> Cloud:
+    """Make a point cloud of the arguments of `Scene.from_tensors`.
+
+    Raises:
+        TypeError, ValueError: naming the argument, what was expected and what came.
+    """
+    positions = _tensor("points", points)
+    if not positions.is_floating_point():
+        raise TypeError(f"points: expected a floating dtype, got {positions.dtype}")
+    if positions.ndim != 2 or positions.shape[1] != 3 or not len(positions):
+        raise ValueError(f"points: expected shape (P, 3) with P at least 1, got {tuple(positions.shape)}")
+    bad = (~(positions.abs() <= LARGEST_COORDINATE)).any(dim=1).nonzero()
+    if len(bad):
+        index = int(bad[0])
+        raise ValueError(f"points[{index}]: expected finite coordinates, got {tuple(positions[index].tolist())}")
+    if colors is None:
+        raise ValueError(f"colors: expected one for each of {len(positions)} points, got None")
+    values = _bytes("colors", colors)
+    if values.shape != positions.shape:
+        raise ValueError(f"colors: expected shape {tuple(positions.shape)}, got {tuple(values.shape)}")
+    return Cloud.of(positions.double().numpy(), values.numpy())
+
+
+def _names(names: Sequence[str] | None, count: int) -> list[str]:
+    if names is None:
+        return [f"{index:0{len(str(count - 1))}d}" for index in range(count)]
+    seen: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if not isinstance(name, str):
+            raise TypeError(f"names[{index}]: expected text, got {type(name).__name__}")
+        label = safe_name(f"names[{index}]:", name, "images folder")  # renderings get files of these names
+        if label in seen:
+            raise ValueError(f"names[{index}]: expected a name of its own, got {label!r} as of names[{seen[label]}]")
+        seen[label] = index
+    return list(seen)
+
+
+def _view(index: int, image: Array, camera: Camera, mask: Array | None, name: str) -> View:
+    pixels = _bytes(f"images[{index}]", image)
+    if pixels.ndim != 3 or pixels.shape[-1] != 3 or not pixels.numel():
+        raise ValueError(f"images[{index}]: expected shape (H, W, 3), got {tuple(pixels.shape)}")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"cameras[{index}]: expected a nexwarp.Camera, got {type(camera).__name__}")
+    height, width = pixels.shape[:2]
+    if (camera.width, camera.height) != (width, height):
+        raise ValueError(
+            f"cameras[{index}]: expected the size of images[{index}], {width}x{height}, "
+            f"got {camera.width}x{camera.height}"
+        )
+    counts = None if mask is None else _mask(f"masks[{index}]", mask, (height, width))
+    own = Camera(camera.viewmat.detach().cpu().float(), camera.K.detach().cpu().float(), width, height, camera.near)
+    return View(own, pixels, counts, name)
+
+
+def _mask(argument: str, mask: Array, shape: tuple[int, int]) -> torch.Tensor | None:
+    """A mask (H, W) bool; None where all pixels count."""
+    counts = _tensor(argument, mask)
+    if counts.dtype != torch.bool:
+        raise TypeError(f"{argument}: expected dtype torch.bool, True where the photo counts, got {counts.dtype}")
+    if counts.shape != shape:
+        raise ValueError(f"{argument}: expected shape {shape}, got {tuple(counts.shape)}")
+    if not bool(counts.any()):
+        raise ValueError(f"{argument}: expected pixels that count, got none")
+    return None if bool(counts.all()) else counts
+
+
+def _bytes(argument: str, values: Array) -> torch.Tensor:
+    """Colours in 8 bits: as they are, or rounded from floating values in [0, 1]."""
+    tensor = _tensor(argument, values)
+    if tensor.dtype == torch.uint8:
+        return tensor
+    if not tensor.is_floating_point():
+        raise TypeError(f"{argument}: expected uint8, or floating values in [0, 1], got {tensor.dtype}")
+    if tensor.numel() and not bool(((tensor >= 0) & (tensor <= 1)).all()):
+        low, high = tensor.min().item(), tensor.max().item()
+        raise ValueError(f"{argument}: expected values in [0, 1], got {low:g} to {high:g}")
+    return (tensor * 255.0).round().to(torch.uint8)
+
+
+def _tensor(argument: str, values: Array) -> torch.Tensor:
+    """A contiguous copy on the CPU: what the caller does to its own later changes nothing."""
+    if isinstance(values, torch.Tensor):
+        return values.detach().to("cpu", copy=True).contiguous()
+    if isinstance(values, np.ndarray):
+        try:
+            return torch.from_numpy(np.array(values, order="C"))
+        except TypeError:
+            raise TypeError(f"{argument}: expected numbers, got dtype {values.dtype}") from None
+    raise TypeError(f"{argument}: expected a torch.Tensor or numpy.ndarray, got {type(values).__name__}")

@@ -1,0 +1,78 @@
+"""Training from Python."""
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+
+from nexwarp.data import Scene
+from nexwarp.model.model import Model
+from nexwarp.train.config import Config
+from nexwarp.train.report import StepReport
+from nexwarp.train.schedules import OptimizerMaker
+from nexwarp.train.step_losses import OwnLoss
+from nexwarp.train.trainer import Trainer
+
+Callback = Callable[[StepReport], object]
+
+
+def train(
+    scene: Scene,
+    config: Config | None = None,
+    *,
+    device: torch.device | str | None = None,
+    callbacks: Iterable[Callback] = (),
+    losses: Mapping[str, OwnLoss] | None = None,
+    optimizer: OptimizerMaker | None = None,
+) -> Model:
+    """Train a scene and return the finished model, as `nexwarp train` does, without writing files.
+
+    On a CPU, and with `config.deterministic` on CUDA, the same arguments give the same bits.
+
+    Args:
+        scene: what to learn from: its training views and points.
+        config: settings; None is `nexwarp.preset("default")`.
+        device: where to train; None is CUDA where there is a device, else the CPU.
+        callbacks: functions that are called with a `StepReport` after each step. One that raises stops the training;
+            its exception is passed on. After divergence, steps are repeated and reported again.
+        losses: own losses by name: functions of the step's `Rendering` and `Target` (`target.photo` (H, W, 3),
+            `target.camera`, `target.background`, `target.counts`) that return a scalar tensor. They are added to ours
+            as they are, so that factors are their own business, and appear in `StepReport.losses` by their names. In
+            border steps, the photo's edge is repeated beyond its frame, where `counts` is False. On CUDA, steps are
+            captured as CUDA graphs and replayed: a loss may then depend on tensors, which it reads in place, but not on
+            numbers that change in Python; set `config.cuda_graphs` to False for such a loss. A step with a loss that
+            cannot be captured, such as one that calls `item()`, warns, and all steps are launched kernel by kernel.
+        optimizer: function from a list of parameter groups, dictionaries with `params`, `name` and `lr`, to any
+            `torch.optim.Optimizer` that keeps these groups; None is Adam. Each group's `lr` is that of the first step,
+            and may be changed; a schedule sets `group["lr"]` before each step, and keeps the ratio of the last rate to
+            the first one. When surfels are split or removed, state tensors of their parameter's shape get the same
+            rows, and zeros for new surfels; all other state is kept. An own optimizer runs in CUDA graphs if its groups
+            have `capturable=True` and learning rates that are tensors on the GPU; else without.
+
+    Returns:
+        The finished model on the device.
+
+    Raises:
+        SceneError: the scene has no training views.
+        TypeError, ValueError: naming the argument that does not fit.
+        DivergedError: numbers were not finite, again after going back once.
+        OutOfMemoryError: memory does not suffice; the message says what to lower.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a nexwarp.Scene, got {type(scene).__name__}")
+    if config is not None and not isinstance(config, Config):
+        raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
+    observers = list(callbacks)
+    for index, callback in enumerate(observers):
+        if not callable(callback):
+            raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    trainer = Trainer(scene, config or Config(), device, losses=losses, optimizer=optimizer)
+
+    def observe(report: StepReport) -> None:
+        for callback in observers:
+            callback(report)
+
+    trainer.run(observe, lambda message: warnings.warn(message, stacklevel=2))
+    return trainer.finish()

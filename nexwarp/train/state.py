@@ -1,0 +1,198 @@
+"""State of a training: everything that shapes its future, gathered and put back bit for bit."""
+
+import hashlib
+import math
+import random
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from nexwarp.data import Scene
+from nexwarp.io.json_files import Json
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import NeuralTexture
+
+MOMENTS = 2  # tensors that Adam keeps of each parameter
+HEADERS = 2**20  # bytes of a checkpoint beside its parameters, at most
+OTHER_TYPES = ("rng.", "optimizer.")  # of tensors that need not be float32
+
+
+class Snapshot(NamedTuple):
+    """State of a training, on the CPU.
+
+    Attributes:
+        tensors: by name.
+        state: the rest, JSON values.
+    """
+
+    tensors: dict[str, torch.Tensor]
+    state: dict[str, Any]
+
+
+def named_parameters(surfels: Surfels, texture: NeuralTexture) -> Iterator[tuple[str, torch.nn.Parameter]]:
+    """Yield all parameters with their names in a checkpoint."""
+    yield from ((f"surfels.{name}", x) for name, x in surfels.named_parameters())
+    yield from ((f"texture.{name}", x) for name, x in texture.named_parameters())
+
+
+def learned_tensors(surfels: Surfels, texture: NeuralTexture) -> dict[str, torch.Tensor]:
+    """Return what is learned by its names in a checkpoint, and the texture's buffers."""
+    tensors = {f"surfels.{name}": x for name, x in surfels.state_dict().items()}
+    return tensors | {f"texture.{name}": x for name, x in texture.state_dict().items()}
+
+
+def part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Return the tensors whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
+
+
+def gather_optimizer(
+    optimizer: torch.optim.Optimizer, parameters: Mapping[str, torch.nn.Parameter]
+) -> tuple[dict[str, torch.Tensor], dict[str, Json] | None]:
+    """Return the tensors of an optimizer's state, and the rest of it; None for Adam, which has only tensors.
+
+    Args:
+        optimizer: any of `torch.optim`.
+        parameters: by their names in a checkpoint.
+
+    Raises:
+        TypeError: its state holds something else than tensors, numbers, text and None.
+    """
+    prefix, plain = _prefix(optimizer), {}
+    tensors: dict[str, torch.Tensor] = {}
+    for name, parameter in parameters.items():
+        for key, value in optimizer.state.get(parameter, {}).items():
+            if isinstance(value, torch.Tensor):
+                tensors[f"{prefix}{name}.{key}"] = value
+            else:
+                plain[f"{name}.{key}"] = _plain(f"{name}.{key}", value)
+    if _is_adam(optimizer):
+        return tensors, None
+    groups: list[Json] = [
+        {key: x for key, x in group.items() if key not in ("params", "lr", "ends") and _is_plain(x)}
+        for group in optimizer.param_groups
+    ]
+    return tensors, {"kind": type(optimizer).__name__, "values": plain, "groups": groups}
+
+
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer,
+    parameters: Mapping[str, torch.nn.Parameter],
+    tensors: Mapping[str, torch.Tensor],
+    record: dict[str, Any] | None,
+) -> None:
+    """Put back what `gather_optimizer` returned, into a fresh optimizer of the same kind.
+
+    Raises:
+        ValueError: it was another kind of optimizer, or Adam's moments have other shapes than their parameters.
+    """
+    kind = "Adam" if record is None else record["kind"]
+    if kind != type(optimizer).__name__ or (record is None) != _is_adam(optimizer):
+        raise ValueError(f"its optimizer is {kind}, expected {type(optimizer).__name__}")
+    for name, parameter in parameters.items():
+        prefix = f"{_prefix(optimizer)}{name}."
+        entries = part(tensors, prefix)
+        if record is None:
+            wrong = [k for k, x in entries.items() if x.shape != (() if k == "step" else parameter.shape)]
+            if wrong:
+                raise ValueError(f"{prefix}{wrong[0]}: expected the shape of its parameter, {tuple(parameter.shape)}")
+        group = next(g for g in optimizer.param_groups if any(x is parameter for x in g["params"])) if entries else {}
+        # Where torch keeps the number of steps: on the CPU, unless the step is a fused kernel or can be captured.
+        counts_here = group.get("fused") or group.get("capturable")
+        values = {k: x if k == "step" and not counts_here else x.to(parameter.device) for k, x in entries.items()}
+        if record is not None:
+            values |= {k.removeprefix(f"{name}."): x for k, x in record["values"].items() if k.startswith(f"{name}.")}
+        if values:
+            optimizer.state[parameter] = values
+    for group, stored in zip(optimizer.param_groups, [] if record is None else record["groups"], strict=False):
+        group.update({key: x for key, x in stored.items() if key in group and _is_plain(group[key])})
+
+
+def _is_adam(optimizer: torch.optim.Optimizer) -> bool:
+    return type(optimizer) is torch.optim.Adam
+
+
+def _prefix(optimizer: torch.optim.Optimizer) -> str:
+    return "adam." if _is_adam(optimizer) else "optimizer."
+
+
+def _is_plain(value: object) -> bool:
+    return value is None or isinstance(value, (bool, int, float, str))
+
+
+def _plain(name: str, value: object) -> Json:
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"optimizer: expected a state of tensors and numbers, got {type(value).__name__} for {name}")
+
+
+def gather_random(
+    generator: torch.Generator, noise: torch.Generator, device: torch.device
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Return the states of all random generators: those of a training, torch's, numpy's and Python's."""
+    tensors = {"rng.views": generator.get_state(), "rng.noise": noise.get_state(), "rng.torch": torch.get_rng_state()}
+    if device.type == "cuda":
+        tensors["rng.cuda"] = torch.cuda.get_rng_state(device)
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002
+    tensors["rng.numpy"] = torch.from_numpy(np.asarray(keys).astype(np.int64))
+    return tensors, {"numpy": [kind, *rest], "python": random.getstate()}
+
+
+def restore_random(
+    generator: torch.Generator, noise: torch.Generator, device: torch.device, snapshot: Snapshot
+) -> None:
+    """Put back what `gather_random` returned."""
+    tensors, state = snapshot
+    generator.set_state(tensors["rng.views"])
+    noise.set_state(tensors["rng.noise"])
+    torch.set_rng_state(tensors["rng.torch"])
+    if device.type == "cuda" and "rng.cuda" in tensors:
+        torch.cuda.set_rng_state(tensors["rng.cuda"], device)
+    kind, *rest = state["numpy"]
+    np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
+    version, internal, gauss = state["python"]
+    random.setstate((version, tuple(internal), gauss))
+
+
+def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:
+    """Raise ValueError unless a snapshot, which may come from anywhere, holds what one of this training can.
+
+    Args:
+        snapshot: as it was read.
+        views: how many training views there are.
+        iterations: of the whole training.
+    """
+    tensors, state = snapshot
+    wrong = [name for name, x in tensors.items() if not name.startswith(OTHER_TYPES) and x.dtype != torch.float32]
+    if wrong:
+        raise ValueError(f"{wrong[0]}: expected float32, got {tensors[wrong[0]].dtype}")
+    for name, good in (
+        ("iteration", lambda x: type(x) is int and 0 <= x <= iterations),
+        ("seconds", lambda x: type(x) in (int, float) and 0 <= x < math.inf),
+        ("order", lambda x: isinstance(x, list) and all(type(i) is int and 0 <= i < views for i in x)),
+        ("rate_factor", lambda x: type(x) in (int, float) and 0 < x <= 1),
+    ):
+        if not good(state[name]):
+            raise ValueError(f"{name}: cannot be {state[name]!r:.60}")
+
+
+def scene_digest(scene: Scene, texture: NeuralTexture) -> str:
+    """Return a digest of what training takes from a scene beside its cameras: photos, masks, points, scale."""
+    digest = hashlib.sha256(f"{scene.scale} {texture.config}".encode())
+    for view in scene.train:
+        for values in (view.image, view.mask, view.alpha, view.points):
+            if values is not None:  # CRC: photos are many, and nobody forges them
+                digest.update(zlib.crc32(values.contiguous().numpy().data).to_bytes(4, "little"))
+    for values in (scene.points, scene.colors):
+        digest.update(values.contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def checkpoint_bytes(surfels: Surfels, texture: NeuralTexture, max_surfels: int) -> int:
+    """Return how many bytes a checkpoint with Adam takes at most, with as many surfels as the budget allows."""
+    each = sum(p.numel() for p in surfels.parameters()) / max(len(surfels), 1)
+    count = each * max(max_surfels, len(surfels)) + sum(p.numel() for p in texture.parameters())
+    return int((1 + MOMENTS) * 4 * count) + HEADERS
