@@ -5,7 +5,7 @@
     python -m benchmarks.before_after /tmp/before . --stages "" --fox ../shared/data/fox
 
 Each figure is measured several times, in fresh processes that alternate between the checkouts (before, after, before,
-after), so that a machine that slows down meanwhile slows down both. Each checkout runs its own `python -m benchmarks`,
+after), so that a change of the machine's speed affects both. Each checkout runs its own `python -m benchmarks`,
 `nexwarp` and `benchmarks.quality`. Without a CUDA device the sizes are tiny and tell only that everything runs.
 
 The table lists medians, their range over the repetitions, and the ratio after / before; --out keeps all values. This

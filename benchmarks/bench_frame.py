@@ -47,7 +47,7 @@ def finished(scene: SurfelScene) -> nw.Model:
 
 
 def back_to_back(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> Measurement:
-    """Frames without a pause between them, as in a video: wall time over their number."""
+    """Time frames without a pause between them, as in a video: wall time over their number."""
     count = 3 if options.quick or not options.cuda else STEADY_FRAMES
     synchronize(options.device)
     start = time.perf_counter()
@@ -59,7 +59,7 @@ def back_to_back(render: Callable[[], torch.Tensor], scene: SurfelScene, options
 
 
 def allocator_growth(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> Measurement:
-    """How much more memory is held after 50 more frames: by torch's and Warp's pools, or by the process on a CPU."""
+    """Return the growth of memory over 50 more frames: of torch's and Warp's pools, or of the process on a CPU."""
     before = _held(options.device)
     for _ in range(3 if options.quick else STEADY_FRAMES):
         render()
@@ -68,7 +68,7 @@ def allocator_growth(render: Callable[[], torch.Tensor], scene: SurfelScene, opt
 
 
 def waits(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> list[Measurement]:
-    """How often torch makes the host wait for the GPU in a frame; Warp's own waits do not show."""
+    """Return how often torch makes the host wait for the GPU in a frame; Warp's own waits are not counted."""
     if not options.cuda:
         return []
     with warnings.catch_warnings(record=True) as caught:

@@ -53,10 +53,10 @@ def gsplat_2dgs(scene: SurfelScene, options: Options, gsplat) -> list[Measuremen
 
 
 def gsplat_call(g: Geometry, gsplat) -> tuple[Rasterize, list[torch.Tensor]]:
-    """A function that gives gsplat's (1, H, W, 3) colours and (1, H, W, 1) alphas, and what it differentiates.
+    """Return a function that renders with gsplat, and its leaf tensors.
 
-    Colours that are not spherical harmonics must be there for every camera: its check of (N, 3) ones passes, but the
-    rasterisation then fails.
+    The function returns (1, H, W, 3) colours and (1, H, W, 1) alphas. Colours that are not spherical harmonics need a
+    camera dimension: gsplat's check accepts (N, 3), but its rasterisation then fails.
     """
     means, quats, scales, opacities, _ = (x.detach() for x in g.shape)
     # A surfel has no third scale; 2DGS ignores it.

@@ -1,4 +1,4 @@
-"""The readers of files that others made, each with small valid files to damage."""
+"""The readers of nexwarp's input files, each with small valid files to damage."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ class FuzzTarget:
         name: of the reader.
         make: writes valid inputs below a folder and returns them.
         read: loads the input in a folder.
-        fuzzed: ends of names of the files that are damaged; the others stay.
+        fuzzed: suffixes of the files to damage; other files stay as they are.
     """
 
     name: str
@@ -214,6 +214,7 @@ def _model(folder: Path) -> list[Files]:
     meta = {"near": 0.01, "scene_scale": 1.5, "preset": "default"}
     save_model(folder / "a", Model(surfels, texture, options=options, meta=meta))
     save_model(folder / "b", Model(surfels, texture, detail_limits=limits, options=options))
+    load(folder / "a")  # the first load imports modules for seconds, which no input must pay for
     return [_files(folder / "a"), _files(folder / "b")]
 
 
@@ -261,7 +262,7 @@ def _images(folder: Path) -> list[Files]:
 
 
 def _read_images(folder: Path) -> None:
-    """As a mask and as a photo; what refuses a file does so for each."""
+    """Read a file as a mask and as a photo; raise the first reader's error."""
     outcomes = []
     for read in (read_mask, read_image, read_transparent):
         try:
@@ -303,6 +304,6 @@ TARGETS = {
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }
-# One thread: a forked process has none of its parent's.
+# One thread: a forked process does not inherit its parent's threads.
 torch.set_num_threads(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -80,7 +80,7 @@ class Geometry:
 
     @property
     def leaves(self) -> tuple[torch.Tensor, ...]:
-        """All that takes a gradient."""
+        """The tensors that need gradients."""
         return (*self.shape, self.colors)
 
     def project(self) -> ops.Projection:
@@ -92,7 +92,7 @@ class Geometry:
         return ops.intersect_tiles(*self.shape, projection, self.viewmat, self.pinhole)
 
     def hits(self, max_hits: int = 2) -> ops.Hits:
-        """The whole collection stage: project, tiles, collect."""
+        """Run the whole collection stage: project, tiles, collect."""
         projection = self.project()
         return ops.collect(projection, self.tiles(projection), self.pinhole, max_hits=max_hits)
 
@@ -108,17 +108,17 @@ def geometry(scene: SurfelScene) -> Geometry:
 
 
 def entries(tiles: ops.Tiles) -> int:
-    """How many (tile, surfel) entries there are; waits for a GPU."""
+    """Return the number of (tile, surfel) entries; waits for a GPU."""
     return int(tiles.ends[-1]) if len(tiles.ends) else 0
 
 
 def outputs(hits: ops.Hits) -> tuple[torch.Tensor, ...]:
-    """The differentiable buffers."""
+    """Return the differentiable buffers of hits."""
     return hits.plain, hits.depths, hits.weights, hits.alpha
 
 
 def random_like(tensors: tuple[torch.Tensor, ...], seed: int = 1) -> list[torch.Tensor]:
-    """Seeded normal values, to stand for gradients."""
+    """Return seeded normal values, used as incoming gradients."""
     generator = torch.Generator().manual_seed(seed)
     return [torch.randn(x.shape, generator=generator, dtype=x.dtype).to(x.device) for x in tensors]
 
@@ -143,7 +143,7 @@ def texture(scene: SurfelScene, **shape: Any) -> nw.NeuralTexture:
 
 
 def workload(options: Options) -> list[SurfelScene]:
-    """Scenes for a pass: the garden on CUDA, the trained fox, and one that any CPU can take, to compare devices by."""
+    """Return the scenes for a stage: the garden on CUDA, a small cloud for any device, and the trained fox if named."""
     small = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
     scenes = [small]
     if options.cuda:
