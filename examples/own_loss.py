@@ -11,6 +11,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.data import demo_folder
+from nexwarp.train.schedules import ParameterGroup
 
 
 def edge_loss(weight: float) -> Callable[[nw.Rendering, nw.Target], torch.Tensor]:
@@ -23,7 +24,7 @@ def edge_loss(weight: float) -> Callable[[nw.Rendering, nw.Target], torch.Tensor
     return loss
 
 
-def make_radam(groups: list[dict]) -> torch.optim.Optimizer:
+def make_radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
     """RAdam; each group has `params`, `name` and `lr`, and the schedule goes on to drive `lr`."""
     return torch.optim.RAdam(groups, eps=1e-15)
 

@@ -5,7 +5,6 @@ python examples/refine_pose.py --model runs/demo --steps 200
 
 import argparse
 import dataclasses
-import math
 from pathlib import Path
 
 import torch
@@ -14,20 +13,18 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
 
 
-def moved(viewmat: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
-    """Move a camera by a twist (6,): rotation in radians and translation in world units, in the camera's frame."""
-    x, y, z, *shift = twist.unbind()
-    zero = torch.zeros_like(x)
-    rows = [(zero, -z, y, shift[0]), (z, zero, -x, shift[1]), (-y, x, zero, shift[2]), (zero,) * 4]
-    return torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows])) @ viewmat
+def moved(viewmat: torch.Tensor, rotation: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+    """Move a camera in its own frame, by a rotation vector (3,) in radians and a shift (3,) in world units."""
+    turn = torch.linalg.cross(rotation.expand(3, 3), torch.eye(3).to(rotation)).T
+    motion = torch.cat([turn, shift[:, None]], dim=1)
+    return torch.linalg.matrix_exp(torch.nn.functional.pad(motion, (0, 0, 0, 1))) @ viewmat
 
 
 def pose_error(viewmat: torch.Tensor, true: torch.Tensor) -> tuple[float, float]:
     """Angle in degrees and distance in world units between two poses."""
-    motion = (viewmat.double() @ torch.linalg.inv(true.double())).detach()
-    sine = torch.stack([motion[2, 1] - motion[1, 2], motion[0, 2] - motion[2, 0], motion[1, 0] - motion[0, 1]]).norm()
-    angle = math.atan2(sine.item() / 2, (motion[:3, :3].trace().item() - 1) / 2)
-    return math.degrees(angle), motion[:3, 3].norm().item()
+    motion = viewmat.detach().double() @ torch.linalg.inv(true.double())
+    half_angle = torch.asin(torch.linalg.matrix_norm(motion[:3, :3] - torch.eye(3).to(motion)) / 8**0.5)
+    return torch.rad2deg(2 * half_angle).item(), motion[:3, 3].norm().item()
 
 
 def main() -> None:
@@ -38,16 +35,16 @@ def main() -> None:
     args = parser.parse_args()
     model = nw.load(args.model).to("cuda" if torch.cuda.is_available() else "cpu")
     camera = next(iter(load_cameras(Path(args.model) / "cameras.json")["train"].values())).to(model.device)
-    with torch.no_grad():
-        photo = model.render(camera).image
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.tensor([0.03] * 3 + [0.03 * float(model.meta["scene_scale"])] * 3)
-    start = moved(camera.viewmat, (noise * torch.randn(6, generator=generator)).to(model.device))
-    twist = torch.zeros(6, device=model.device, requires_grad=True)
-    optimizer = torch.optim.Adam([twist], lr=5e-3)
+    photo = model.render(camera).image.detach()
+    torch.manual_seed(0)
+    size = torch.tensor([0.03, 0.03 * (model.surfels.means.detach().std())], device=model.device)
+    start = moved(camera.viewmat, *(size[:, None] * torch.randn(2, 3).to(size)))
+    rotation, shift = (torch.zeros(3, device=model.device, requires_grad=True) for _ in range(2))
+    rates = [{"params": [x], "lr": rate} for x, rate in zip((rotation, shift), (0.3 * size).tolist(), strict=True)]
+    optimizer = torch.optim.Adam(rates)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)
     for step in range(args.steps + 1):
-        guess = dataclasses.replace(camera, viewmat=moved(start, twist))
+        guess = dataclasses.replace(camera, viewmat=moved(start, rotation, shift))
         loss = (model.render(guess).image - photo).abs().mean()
         if step in (0, args.steps) or step % 20 == 0:
             angle, distance = pose_error(guess.viewmat, camera.viewmat)
