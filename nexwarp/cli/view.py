@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class View:
+class ViewCommand:
     """Show a run in the browser: every pass, from anywhere, and camera paths for render (extra `viewer`)."""
 
     run: Run_

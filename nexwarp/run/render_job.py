@@ -33,8 +33,15 @@ LARGEST_SIDE = 16384
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One picture to render: its PNG file, its camera, whether it is a frame of the path, whether its passes go too."""
+class PictureJob:
+    """One picture to render.
+
+    Attributes:
+        file: its PNG file.
+        camera: its camera.
+        is_frame: whether it is a frame of the path.
+        buffers: whether its buffers are written too.
+    """
 
     file: Path
     camera: Camera
@@ -46,7 +53,7 @@ class Picture:
 class RenderJob:
     """Pictures to render, in order, the video that their frames make, and the exposure of all (see `RenderOrder`)."""
 
-    pictures: list[Picture]
+    pictures: list[PictureJob]
     video: Path | None
     fps: float
     exposure: str = "photos"
@@ -146,14 +153,14 @@ class RenderOrder:
         for group in SETS[self.views]:
             for name, camera in cameras.get(group, {}).items():
                 file = renders / group / f"{Path(name).with_suffix('')}.png"
-                pictures.append(Picture(file, size(camera), False, self.buffers))
+                pictures.append(PictureJob(file, size(camera), False, self.buffers))
         fps = FPS
         if self.path is not None and self.frames != 0:
             folder, path, fps = self._path(cameras, renders)
             first = size(path[0])
             for i, camera in enumerate(path):
                 camera = resized(size(camera), first.width, first.height)
-                pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+                pictures.append(PictureJob(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
         return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, self.exposure)
