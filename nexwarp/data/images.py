@@ -23,7 +23,7 @@ MAX_SUM = 2**32 - 1
 MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
 # Larger images are refused above a ratio of pixels to bytes that no photo reaches: (2,000, 16,000 for bilevel images).
 HONEST_PIXELS, HONEST_RATIO = 40_000_000, (2_000, 16_000)
-WHITE = 128  # threshold of a mask; a mask without such values, such as one of 0 and 1, has the threshold 1
+WHITE = 128  # threshold of a mask; if no value reaches it, as in a mask of 0 and 1, all values above 0 are used
 
 
 @contextmanager
