@@ -4,12 +4,14 @@ import io
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from nexwarp.run.folder import keep_camera_path
+from nexwarp.viewer.session import Session
 from nexwarp.viewer.world import camera_to_world
 from tests.viewer.support import serving, wait_for
 
@@ -17,6 +19,28 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def record_and_save(page: Any, session: Session, folder: Path) -> None:
+    """Add two views to a path, save it and a screenshot; what the browser gets is what the run keeps."""
+    assert session.viewpoint is not None
+    page.get_by_role("tab", name="Record").click()
+    page.get_by_role("button", name="Add this view").click()
+    wait_for(lambda: len(session.keyframes) == 1)
+    session.jump("train/4.png")
+    wait_for(lambda: np.allclose(session.viewpoint.pose, camera_to_world(session.cameras["train/4.png"]), atol=1e-3))
+    page.get_by_role("button", name="Add this view").click()
+    wait_for(lambda: len(session.keyframes) == 2)
+    with page.expect_download() as path:
+        page.get_by_role("button", name="Save path").click()
+    saved = json.loads(Path(path.value.path()).read_text())
+    assert len(saved["camera_path"]) == 180 and (saved["render_width"], saved["render_height"]) == (64, 48)
+    assert json.loads((folder / "camera_path_1.json").read_text()) == saved
+    with page.expect_download() as shot:
+        page.get_by_role("button", name="Save screenshot").click()
+    with Image.open(shot.value.path()) as png:
+        assert png.format == "PNG" and png.height == 1080
+        assert png.width == pytest.approx(1080 * session.viewpoint.width / session.viewpoint.height, abs=1)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
@@ -71,25 +95,7 @@ def test_in_a_browser(model, tmp_path):
         page.mouse.up()
         settled()
         assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
-        page.get_by_role("tab", name="Record").click()
-        page.get_by_role("button", name="Add this view").click()
-        wait_for(lambda: len(session.keyframes) == 1)
-        session.jump("train/4.png")
-        wait_for(
-            lambda: np.allclose(session.viewpoint.pose, camera_to_world(session.cameras["train/4.png"]), atol=1e-3)
-        )
-        page.get_by_role("button", name="Add this view").click()
-        wait_for(lambda: len(session.keyframes) == 2)
-        with page.expect_download() as path:
-            page.get_by_role("button", name="Save path").click()
-        saved = json.loads(Path(path.value.path()).read_text())
-        assert len(saved["camera_path"]) == 180 and (saved["render_width"], saved["render_height"]) == (64, 48)
-        assert json.loads((tmp_path / "camera_path_1.json").read_text()) == saved
-        with page.expect_download() as shot:
-            page.get_by_role("button", name="Save screenshot").click()
-        with Image.open(shot.value.path()) as png:
-            assert png.format == "PNG" and png.height == 1080
-            assert png.width == pytest.approx(1080 * session.viewpoint.width / session.viewpoint.height, abs=1)
+        record_and_save(page, session, tmp_path)
         browser.close()
         wait_for(lambda: not viewer.sessions)
     assert not errors, errors

@@ -30,7 +30,7 @@ def test_only_the_servers_own_pages_may_connect():
     assert may_connect("0.0.0.0", "http://lab.example", "10.0.0.7:8080")
 
 
-def refused(capsys: pytest.CaptureFixture, arguments: list[str], *words: str) -> None:
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
     """The command fails with one line that holds the words."""
     assert cli.main(arguments) == 2
     lines = capsys.readouterr().err.strip().splitlines()
