@@ -158,15 +158,9 @@ def load_scene(
             are not usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than
             2 photos, no points in a COLMAP model, points that are not finite, photos too many for the memory.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    for name, value in (("images", images), ("masks", masks)):
-        if not isinstance(value, str) and not (name == "masks" and value is None):
-            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
-    if points is not None and not isinstance(points, (str, os.PathLike)):
-        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
-    path = Path(path)
+    _check_paths(path, images, masks, points)
     _check_downscale(downscale)
+    path = Path(path)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
     if path.is_file():
@@ -176,6 +170,17 @@ def load_scene(
     with quiet_pillow():
         scene = _load(path, images, downscale, masks, color, points, format, progress)
     return dataclasses.replace(scene, random_background=random)
+
+
+def _check_paths(path: object, images: object, masks: object, points: object) -> None:
+    """Raise TypeError unless the paths that `load_scene` takes are paths."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    for name, value in (("images", images), ("masks", masks)):
+        if not isinstance(value, str) and not (name == "masks" and value is None):
+            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
+    if points is not None and not isinstance(points, (str, os.PathLike)):
+        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
 
 
 def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:

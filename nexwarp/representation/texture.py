@@ -1,6 +1,7 @@
 """The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
+from typing import TypedDict
 
 import torch
 from torch import nn
@@ -15,6 +16,21 @@ LARGEST_RESOLUTION = 1e9
 
 # Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
 FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
+
+
+class TextureShape(TypedDict):
+    """Arguments of `NeuralTexture`, as a model file keeps them."""
+
+    levels: int
+    table_size: int
+    features: int
+    min_resolution: float
+    max_resolution: float
+    width: int
+    hidden_layers: int
+    sh_degree: int
+    residual: bool
+    down_weighting: bool
 
 
 class NeuralTexture(nn.Module):
@@ -67,7 +83,7 @@ class NeuralTexture(nn.Module):
         for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
             if not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected True or False, got {flag!r}")
-        self.config = {
+        self.config: TextureShape = {
             "levels": levels,
             "table_size": table_size,
             "features": features,
