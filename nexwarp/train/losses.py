@@ -80,9 +80,7 @@ def training_losses(
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
     """
     factors, has_slots = loss_weights, weights.shape[-1] > 0
-    for name, pixels in (("mask", mask), ("empty", empty)):
-        if pixels is not None:
-            check_tensors({name: (pixels, image.shape[:2])}, dtype=torch.bool, device=image.device)
+    _check_masks(image, mask=mask, empty=empty)
     if mask is not None:
         image, textured, weights = _masked(image, textured, weights, target, mask)
     if empty is not None:
@@ -110,6 +108,13 @@ def training_losses(
     if factors.grid > 0.0 and grid is not None and resolutions is not None:
         terms["grid"] = factors.grid * grid_loss(grid, resolutions)
     return {name: term for name, term in terms.items() if term is not None}
+
+
+def _check_masks(image: torch.Tensor, **masks: torch.Tensor | None) -> None:
+    """Raise TypeError or ValueError unless each mask that is there is bool, of the image's size and on its device."""
+    for name, mask in masks.items():
+        if mask is not None:
+            check_tensors({name: (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
 
 
 def _computed(term: torch.Tensor | None) -> torch.Tensor:
