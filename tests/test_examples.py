@@ -66,10 +66,10 @@ def test_examples_are_short_and_tell_how_to_run_them(path: Path) -> None:
 
 
 def test_training_from_tensors_raises_the_psnr(tmp_path: Path) -> None:
-    out = run("train_from_tensors", "--steps", 30, "--downscale", 4, "--out", tmp_path)
+    out = run("train_from_tensors", "--steps", 60, "--downscale", 4, "--out", tmp_path)
     steps = numbers(r"step \d+: ([\d.]+) dB", out)
     (test,) = numbers(r"test views: ([\d.]+) dB", out)
-    assert steps[-1] > steps[0] + 2.0 and test > steps[0] + 1.0
+    assert steps[-1] > steps[0] + 2.0 and test > steps[0] + 2.0
     assert len(nw.load(tmp_path).surfels) > 100
 
 
