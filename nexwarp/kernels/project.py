@@ -1,8 +1,8 @@
 """Projection: activated surfels to their records in the camera frame, see `surfel` (paper Sec. 4.2).
 
 A thread is a surfel. Read: means, rotations, scales, opacities, gammas, plain colours and the world-to-camera matrix.
-Written: records, centres and limits. Smooth and loop-free, so that Warp's own adjoint differentiates records and centres
-with respect to every float input; limits only cull and are frozen.
+Written: records, centres and limits. Smooth and loop-free, so that Warp's own adjoint differentiates records and
+centres with respect to every float input; limits only cull and are frozen.
 """
 
 import functools
