@@ -53,7 +53,9 @@ class Checkout:
         Raises:
             RuntimeError: its exit code is not 0.
         """
-        environment = os.environ | {"PYTHONPATH": str(self.root)}
+        # Packages that PYTHONPATH names stay; another checkout among them comes after this one.
+        path = os.pathsep.join(filter(None, (str(self.root), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": path}
         command = [sys.executable, *arguments]
         done = subprocess.run(command, cwd=self.root, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
