@@ -67,6 +67,7 @@ def table_jobs(
     Raises:
         ValueError: `table` is unknown.
     """
+    rows: tuple[Row, ...]
     sizes: tuple[int, ...] = (size,)
     variants: tuple[str, ...] = ("",)
     if table == "peers":
