@@ -19,7 +19,7 @@ from collections.abc import Mapping
 
 
 class NexwarpError(Exception):
-    """Base of all errors above. The message is one line: where the fault is, what was expected, what was found."""
+    """Base class of these errors. The message is one line: the place, what was expected, what was found."""
 
 
 class SettingError(NexwarpError, ValueError):

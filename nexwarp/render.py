@@ -159,8 +159,7 @@ def render(
 ) -> Rendering:
     """Render surfels from a camera (paper Sec. 4.2). `Model.render` renders a trained scene.
 
-    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`; `exposures` and
-    `detail_limits` are constants.
+    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`.
 
     Args:
         surfels: the N surfels, N >= 0.
@@ -171,12 +170,10 @@ def render(
         sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
-        depth_jitter: for training, shifts the points at which the texture is evaluated along their rays, at random. A
-            number is the standard deviation in pixels at the hit's depth. A tensor (H, W, K) holds factors on the
-            depths, see `jitter_factors`. `Rendering.depths` does not change.
+        depth_jitter: for training, random shifts of the texture's points along their rays. A number is their standard
+            deviation in pixels at the hit's depth; a tensor (H, W, K) holds the factors of `jitter_factors`.
         generator: random generator of the jitter, on the surfels' device; None is torch's default.
-        exposures: multiply all colours and the background by the gains predicted for this camera, and by the falloff
-            of the lens; None is the mean exposure.
+        exposures: multiply the image by the camera's gains and lens falloff; None is the mean exposure.
         detail_limits: detail limits of the N surfels; None limits nothing.
 
     Raises:
@@ -193,24 +190,34 @@ def render(
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     texels = None
     if texture is not None:
-        if not isinstance(depth_jitter, torch.Tensor) and depth_jitter > 0:
-            depth_jitter = jitter_factors(camera, max_hits, depth_jitter, hits.depths.dtype, generator)
-        looked_up = hits.depths * depth_jitter if isinstance(depth_jitter, torch.Tensor) else hits.depths
-        positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
+        jittered = _jittered(hits.depths, camera, depth_jitter, generator)
+        positions, directions = ops.unproject(jittered, camera.viewmat, pinhole)
         depths = limited_depths(hits.ids, hits.depths, detail_limits, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     residual = texture is not None and texture.residual
     base = hits.base if texture is None or residual else None
-    plain = hits.plain
-    blended = (hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0])
-    if texels is not None:
-        blended = (texels, hits.weights)
-    image, textured = ops.compose(plain, *blended, hits.alpha, background, base)
+    blended = _no_texels(hits) if texels is None else (texels, hits.weights)
+    image, textured = ops.compose(hits.plain, *blended, hits.alpha, background, base)
     factors = None if exposures is None else exposures.factors(camera).to(image)
-    if factors is not None:
-        image, plain, textured = image * factors, plain * factors, textured * factors
+    image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
     intermediates = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
     return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, intermediates)
+
+
+def _jittered(
+    depths: torch.Tensor, camera: Camera, jitter: float | torch.Tensor, generator: torch.Generator | None
+) -> torch.Tensor:
+    """Return depths (H, W, K) times the factors of a `depth_jitter`."""
+    if not isinstance(jitter, torch.Tensor):
+        if not jitter > 0:
+            return depths
+        jitter = jitter_factors(camera, depths.shape[2], jitter, depths.dtype, generator)
+    return depths * jitter
+
+
+def _no_texels(hits: ops.Hits) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return empty colours (H, W, 0, 3) and weights (H, W, 0), for a composition without texture."""
+    return hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
 
 
 def jitter_factors(

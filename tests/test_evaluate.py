@@ -51,7 +51,8 @@ def psnr_of(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def test_figures_are_those_of_the_written_pictures(tmp_path, model):
-    views, done = views_of(model), []
+    views = views_of(model)
+    done: list[str] = []
     result = evaluate(model, views, renders=tmp_path, progress=done.append)
     assert done == list(NAMES) == list(result["views"])
     assert result["convention"] == CONVENTION

@@ -24,7 +24,7 @@ from nexwarp.io.json_files import parse_json
 from nexwarp.model.model_file import load, save_model
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
-from tests.test_checkpoint import make_model, rewrite
+from tests.model_file_support import make_model, rewrite
 from tests.test_scene import HEIGHT, WIDTH, make_scene, pose
 
 CAMERA_SIZE = 8 + 8  # where width and height lie in cameras.bin, after the count, id and model

@@ -16,6 +16,7 @@ from nexwarp.camera import resized
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
+from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.folder import SceneSource, create_run
@@ -93,10 +94,10 @@ def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flag
     save_cameras(run / "cameras.json", {"train": {}, "test": dict(zip(names, cameras, strict=True))})
     assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 0
     model = nw.load(run)
-    changes = {"exposure": "mean"} if "mean" in flags else {}
+    exposure: Exposure = "mean" if "mean" in flags else "photos"
     for name, camera in zip(names, cameras, strict=True):
         with torch.no_grad():
-            out = model.render(camera, **changes)
+            out = model.render(camera, exposure=exposure)
         assert torch.equal(picture(run / "renders" / "test" / name), to_uint8(out.image)), name
         assert out.image.std() > 0.05
         if "--buffers" in flags:
@@ -114,9 +115,14 @@ def test_options_take_the_exposure_and_the_limits_away(
     assert_same(model.render(camera), pure(model, camera, exposures=exposures, detail_limits=limits))
     assert_same(model.render(camera, exposure="mean"), pure(model, camera, detail_limits=limits))
     assert_same(model.render(camera, detail_limits=False), pure(model, camera, exposures=exposures))
-    bare = {"exposure": "mean", "detail_limits": False}
+    bare: RenderChanges = {"exposure": "mean", "detail_limits": False}
     assert_same(model.render(camera, **bare), pure(model, camera))
-    images = [model.render(camera, **{key: bare[key] for key in keys}).image for keys in ((), *zip(bare), tuple(bare))]
+    images = [
+        model.render(camera).image,
+        model.render(camera, exposure="mean").image,
+        model.render(camera, detail_limits=False).image,
+        model.render(camera, **bare).image,
+    ]
     for i, one in enumerate(images):
         for other in images[i + 1 :]:
             assert (one - other).abs().max() > 0.01
@@ -265,7 +271,8 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
             )
         leaves = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
         leaves |= dict(model.surfels.named_parameters())
-        found.append(dict(zip(leaves, torch.autograd.grad(out.image.square().sum(), leaves.values()), strict=True)))
+        gradients = torch.autograd.grad(out.image.square().sum(), list(leaves.values()))
+        found.append(dict(zip(leaves, gradients, strict=True)))
     for name, gradient in found[0].items():
         assert_finite(gradient, name)
         assert gradient.abs().max() > 0, name
@@ -383,6 +390,7 @@ def test_changes_that_are_no_options_are_named() -> None:
     for error, changes in bad:
         with pytest.raises(error, match=rf"^{next(iter(changes))}: expected"):
             model.render(camera, **changes)
-    for other in ("camera", None, camera.viewmat, ["camera"]):
+    others: list[Any] = ["camera", None, camera.viewmat, ["camera"]]
+    for other in others:
         with pytest.raises(TypeError, match=r"^camera: expected a nexwarp\.Camera"):
             model.render(other)

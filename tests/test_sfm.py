@@ -24,7 +24,7 @@ from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.sfm.pairs import components, exhaustive_pairs, sequential_pairs
 from nexwarp.sfm.photos import list_photos
 from nexwarp.sfm.report import Overlaps, advise, left_out
-from tests.test_cli import refused, snapshot
+from tests.cli.support import refused, snapshot
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
 DISTANCE = 3.15  # of the cameras from what they look at

@@ -45,7 +45,7 @@ class Render:
     """Number of frames of the path; 0 renders no path."""
     fps: Annotated[float | None, option("N", "30, or that of FILE.json")] = None
     """Frames per second of the video."""
-    set: Annotated[str | None, option("{test,train,all}", "test without a path, else none")] = None
+    set: Annotated[str | None, option("{test,train,all}", "test without --path and --video, else none")] = None
     """Still views to render."""
     buffers: bool = False
     """Also write an OpenEXR file of all buffers (depths, normals, weights and more) for each still view; without still
@@ -103,8 +103,8 @@ class Export:
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """Surfels larger than this fraction of their distance to the nearest camera become several Gaussians in splats.ply;
-    inf splits none."""
+    """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
+    Gaussians; inf splits none."""
 
     def __call__(self, console: Console) -> None:
         """Export."""

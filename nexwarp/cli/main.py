@@ -15,7 +15,7 @@ from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
-from nexwarp.cli.view import View
+from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError
 from nexwarp.train.health import needed_memory
 
@@ -24,7 +24,7 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "eval": Eval,
     "render": Render,
     "export": Export,
-    "view": View,
+    "view": ViewCommand,
     "info": Info,
     "sfm": Sfm,
     "warmup": Warmup,

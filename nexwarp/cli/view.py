@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class View:
+class ViewCommand:
     """Show a run in the browser, with all buffers and an editor of camera paths for render (extra `viewer`)."""
 
     run: Run_

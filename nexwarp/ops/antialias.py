@@ -1,7 +1,6 @@
-"""Surfels as they look from farther away than training saw them."""
+"""Antialiasing: surfels as a camera sees them that is farther away than any training view was."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -9,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 def antialias(
@@ -20,14 +19,16 @@ def antialias(
     farthest: torch.Tensor,
     focal: float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Blur surfels by what a pixel covers more than in training; differentiable, but for `farthest` and `focal`.
+    """Blur surfels where a pixel covers more of them than it did in training.
+
+    Differentiable with respect to all arguments but `farthest` and `focal`.
 
     Args:
         depths: (N,) z-depths of the centres, world units.
         scales: (N, 2) world units.
         opacities: (N,).
         gammas: (N, 2).
-        farthest: (N,) depth / focal of the farthest look that training had, world units.
+        farthest: (N,) largest depth / focal at which a training view saw the surfel, world units.
         focal: of the camera, pixels.
 
     Returns:
@@ -46,17 +47,21 @@ def antialias(
         }
     )
     tensors = (x.contiguous() for x in (depths, scales, opacities, gammas))
-    return _Widen.apply(farthest.contiguous(), float(focal), *tensors)
+    return _Antialias.apply(farthest.contiguous(), float(focal), *tensors)
 
 
-def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Any]:
+def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
     """Of scalars (N,) and pairs (N, 2)."""
     return [array(x, real if x.ndim == 1 else types(real).vec2) for x in tensors]
 
 
-class _Widen(torch.autograd.Function):
+class _Context(Context):
+    focal: float
+
+
+class _Antialias(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: _Context, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
         real = real_of(farthest)
         wide = tuple(torch.empty_like(x) for x in shape[1:])
         inputs = [*_arrays(real, (*shape, farthest)), focal]
@@ -67,7 +72,7 @@ class _Widen(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         *shape, farthest = ctx.saved_tensors
         real = real_of(farthest)
         found = [torch.empty_like(x) for x in shape]

@@ -1,7 +1,6 @@
 """Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import warp as wp
@@ -15,7 +14,17 @@ from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.walk import BLOCK_DIM
-from nexwarp.ops._interop import array, from_fixed_point, launch, real_of, sums_in_fixed_point, sums_like, uses_simd
+from nexwarp.ops._interop import (
+    Argument,
+    Context,
+    array,
+    from_fixed_point,
+    launch,
+    real_of,
+    sums_in_fixed_point,
+    sums_like,
+    uses_simd,
+)
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 from nexwarp.ops.tiles import Tiles
@@ -23,11 +32,11 @@ from nexwarp.ops.tiles import Tiles
 
 @dataclass
 class SplatErrorRequest:
-    """Asks the backward pass to add up blended errors on its way; see `Rendering.request_splat_error`.
+    """Request that the backward pass also adds up blended errors; see `Rendering.request_splat_error`.
 
     Attributes:
-        errors: (H, W) error of each pixel, set between forward and backward; None asks for nothing.
-        sums_after_backward: (N,) what `splat_error` would give; the backward pass fills it.
+        errors: (H, W) error of each pixel, set between forward and backward; None requests nothing.
+        sums_after_backward: (N,) what `splat_error` would return; the backward pass sets it.
     """
 
     errors: torch.Tensor | None = None
@@ -36,7 +45,7 @@ class SplatErrorRequest:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the collection pass found.
+    """Outputs of the collection pass.
 
     Attributes:
         plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6); differentiable.
@@ -46,7 +55,7 @@ class Hits:
         weights: (H, W, K), 0 in empty slots; differentiable.
         alpha: (H, W) 1 - final transmittance; differentiable.
         stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
-        error_request: asks the backward pass for blended errors.
+        error_request: request for blended errors, empty at first.
     """
 
     plain: torch.Tensor
@@ -77,7 +86,8 @@ def collect(
     buffers = _Collect.apply(
         projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, request
     )
-    return Hits(*buffers, request)
+    plain, base, ids, depths, weights, alpha, stops = buffers
+    return Hits(plain, base, ids, depths, weights, alpha, stops, request)
 
 
 def splat_error(
@@ -116,13 +126,13 @@ def splat_error(
 
 
 def launch_walk(
-    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Any], outputs: list[Any], width: int = 1
+    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Argument], outputs: list[Argument], width: int = 1
 ) -> None:
     """Launch a kernel over the pixels of all tiles, `width` of them a thread."""
     threads = tiles.tile_size**2 // width
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    options = {"block_dim": BLOCK_DIM, "align": threads, "smallest": threads}
-    launch(like, kernel, (len(tiles.tile_offsets) - 1) * threads, inputs, outputs, **options)
+    count = (len(tiles.tile_offsets) - 1) * threads
+    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=threads, smallest=threads)
 
 
 def walk_inputs(
@@ -131,7 +141,7 @@ def walk_inputs(
     limits: torch.Tensor,
     tiles: Tiles,
     camera: Pinhole,
-) -> list[Any]:
+) -> list[Argument]:
     """Arguments that the kernels share, from `records` to `near`."""
     t = types(real_of(records))
     return [
@@ -166,7 +176,7 @@ class _SlotSums:
         """Zeros (slots, *shape), in fixed point (slots, *shape, 2)."""
         return sums_like(self.like, (self.count, *shape), self.fixed_point)
 
-    def array(self, slots: torch.Tensor | None, dtype: type) -> Any:
+    def array(self, slots: torch.Tensor | None, dtype: type) -> Argument:
         """View what `new` returned as the kernels do: (slots, ...) of `dtype`, in fixed point (slots, integers)."""
         if slots is not None and self.fixed_point:
             return array(slots.view(len(slots), -1), wp.int64)
@@ -185,10 +195,14 @@ class _SlotSums:
         return sums
 
 
+class _Context(Context):
+    rest: tuple[Tiles, Pinhole, int, bool, SplatErrorRequest]
+
+
 class _Collect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
+        ctx: _Context,
         records: torch.Tensor,
         centers: torch.Tensor,
         limits: torch.Tensor,
@@ -228,7 +242,7 @@ class _Collect(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any,
+        ctx: _Context,
         grad_plain: torch.Tensor,
         grad_base: torch.Tensor,
         _ids: None,
@@ -276,6 +290,6 @@ class _Collect(torch.autograd.Function):
         return grad_records, grad_centers, *(None,) * 6
 
 
-def _buffer_array(buffer: torch.Tensor, dtype: type) -> Any:
+def _buffer_array(buffer: torch.Tensor, dtype: type) -> Argument:
     """View a K-buffer (H, W, K) as the kernels do, (H * W, K); K = 0 gives one unused element."""
     return array(buffer.view(-1, buffer.shape[-1]) if buffer.shape[-1] else buffer.new_empty(1, 1), dtype)

@@ -1,6 +1,7 @@
 """The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
+from typing import TypedDict
 
 import torch
 from torch import nn
@@ -15,6 +16,21 @@ LARGEST_RESOLUTION = 1e9
 
 # Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
 FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
+
+
+class TextureShape(TypedDict):
+    """Arguments of `NeuralTexture`, as a model file keeps them."""
+
+    levels: int
+    table_size: int
+    features: int
+    min_resolution: float
+    max_resolution: float
+    width: int
+    hidden_layers: int
+    sh_degree: int
+    residual: bool
+    down_weighting: bool
 
 
 class NeuralTexture(nn.Module):
@@ -67,7 +83,7 @@ class NeuralTexture(nn.Module):
         for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
             if not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected True or False, got {flag!r}")
-        self.config = {
+        self.config: TextureShape = {
             "levels": levels,
             "table_size": table_size,
             "features": features,
@@ -83,10 +99,7 @@ class NeuralTexture(nn.Module):
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
-        ends = torch.tensor([min_resolution, max_resolution], dtype=torch.float64).log()
-        steps = torch.linspace(0.0, 1.0, levels, dtype=torch.float64)
-        resolutions = (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
-        self.register_buffer("resolutions", resolutions)
+        self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):
@@ -177,6 +190,13 @@ class NeuralTexture(nn.Module):
             clamp=clamp,
             half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
         )
+
+
+def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
+    """Return (count,) float32, computed in float64."""
+    ends = torch.tensor([first, last], dtype=torch.float64).log()
+    steps = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+    return (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
 
 
 def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:

@@ -2,7 +2,6 @@
 
 import warnings
 from functools import lru_cache
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -83,7 +82,7 @@ def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
 
 
 @lru_cache(maxsize=2)
-def _lpips_network(device: torch.device) -> Any:
+def _lpips_network(device: torch.device) -> torch.nn.Module | None:
     try:
         import lpips
 

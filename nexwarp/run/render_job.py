@@ -32,7 +32,7 @@ LARGEST_SIDE = 16384  # pixels
 
 
 @dataclass(frozen=True)
-class Picture:
+class PictureJob:
     """One image to render.
 
     Attributes:
@@ -59,7 +59,7 @@ class RenderJob:
         exposure: see `RenderOptions`.
     """
 
-    pictures: list[Picture]
+    pictures: list[PictureJob]
     video: Path | None
     fps: float
     exposure: Exposure = "photos"
@@ -164,14 +164,14 @@ class RenderOrder:
         for group in SETS[self.views]:
             for name, camera in cameras.get(group, {}).items():
                 file = renders / group / f"{Path(name).with_suffix('')}.png"
-                pictures.append(Picture(file, size(camera), False, self.buffers))
+                pictures.append(PictureJob(file, size(camera), False, self.buffers))
         fps = FPS
         if self.path is not None and self.frames != 0:
             folder, path, fps = self._path(cameras, renders)
             first = size(path[0])
             for i, camera in enumerate(path):
                 camera = resized(size(camera), first.width, first.height)
-                pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+                pictures.append(PictureJob(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
         return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure, self.exposure))

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import TypedDict
+from typing import Any
 
 import torch
 
@@ -13,21 +13,10 @@ from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.densify import PARAMETERS, DensifyConfig
 
-
-class ParameterGroup(TypedDict):
-    """Parameters that share a learning rate, as an optimizer takes them.
-
-    Attributes:
-        params: the parameters, leaves.
-        name: "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" or "mlp".
-        lr: learning rate of the first step.
-    """
-
-    params: list[torch.nn.Parameter]
-    name: str
-    lr: float
-
-
+# Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" and "mlp"; `lr`, the
+# learning rate of the first step.
+ParameterGroup = dict[str, Any]
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 
@@ -71,8 +60,9 @@ def make_optimizer(
 def _make_adam(groups: list[ParameterGroup], device: torch.device) -> torch.optim.Adam:
     """Make Adam with the paper's epsilon; on CUDA, its rates are tensors, which a CUDA graph reads."""
     on_gpu = device.type == "cuda"
-    given = [dict(group, lr=torch.tensor(group["lr"], device=device)) if on_gpu else dict(group) for group in groups]
-    return torch.optim.Adam(given, eps=1e-15, fused=True, capturable=on_gpu)
+    if on_gpu:
+        groups = [group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups]
+    return torch.optim.Adam(groups, eps=1e-15, fused=True, capturable=on_gpu)
 
 
 def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:

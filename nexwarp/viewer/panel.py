@@ -152,7 +152,7 @@ class Panel:
         reset = gui.add_button("Back to the start", icon=Icon.HOME)
         reset.on_click(lambda _: self.actions.reset())
         if not names:
-            gui.add_markdown("This run holds no cameras.")
+            gui.add_markdown("This run has no cameras.")
             return
         jump = gui.add_dropdown("Go to", tuple(names), hint="Go to the camera of a photo")
         self._on(jump, self.actions.jump)

@@ -1,0 +1,315 @@
+"""Training from Python: the bits of the command line, own losses and optimizers, callbacks, scenes in memory."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import nexwarp as nw
+from nexwarp.cli import main as cli
+from nexwarp.data import Scene
+from nexwarp.errors import CheckpointError
+from nexwarp.train.config import TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.schedules import OptimizerMaker, ParameterGroup
+from tests.test_trainer import assert_same_state
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+SMALL = nw.Config(
+    iterations=40,
+    max_surfels=120,
+    texture=TextureConfig(levels=4, table_size=2**10, width=16),
+    densify=DensifyConfig(every=5),
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
+
+
+def run(scene: Scene, until: int | None = None, **options: Any) -> nw.Trainer:
+    trainer = nw.Trainer(scene, SMALL, "cpu", **options)
+    trainer.run(until=until)
+    return trainer
+
+
+def test_python_gives_the_bits_of_the_command_line(tiny_folder: Path, scene: Scene, tmp_path: Path) -> None:
+    assert cli.main(["train", str(tiny_folder), "--run", str(tmp_path / "run"), "--device", "cpu"]) == 0
+    model = nw.train(scene, SMALL, device="cpu")
+    ours, theirs = load_file(model.save(tmp_path / "ours")), load_file(tmp_path / "run" / "model.safetensors")
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], value) for name, value in theirs.items())
+    assert model.options == nw.load(tmp_path / "run").options
+
+
+def test_wrong_arguments_are_named(scene: Scene) -> None:
+    wrong: Any
+    for wrong in ({"scene": "demo"}, {"config": {}}, {"callbacks": [3]}, {"losses": {"own": 3}}, {"losses": {3: max}}):
+        with pytest.raises(TypeError, match=rf"^{next(iter(wrong))}"):
+            nw.train(**({"scene": scene, "config": SMALL, "device": "cpu"} | wrong))
+
+
+# Callbacks
+
+
+def test_callbacks_see_each_step_and_stop_the_training(scene: Scene) -> None:
+    class Enough(Exception):
+        pass
+
+    seen: list[nw.StepReport] = []
+
+    def stop(step: nw.StepReport) -> None:
+        if step.iteration == 7:
+            raise Enough
+
+    with pytest.raises(Enough):
+        nw.train(scene, SMALL, device="cpu", callbacks=[seen.append, stop])
+    assert [step.iteration for step in seen] == [*range(1, 8)]
+    assert all(step.image.shape == step.target.shape and step.psnr() > 0 for step in seen)
+    assert seen[0].loss() == pytest.approx(sum(x.item() for x in seen[0].losses.values()), rel=1e-6)
+
+
+# Losses
+
+
+def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
+    targets: list[nw.Target] = []
+
+    def darkness(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
+        targets.append(target)
+        return 20.0 * rendering.image.square().mean()
+
+    reports: list[nw.StepReport] = []
+    with_loss = nw.train(scene, SMALL, device="cpu", callbacks=[reports.append], losses={"darkness": darkness})
+    plain = nw.train(scene, SMALL, device="cpu")
+    assert all("darkness" in step.losses for step in reports) and len(targets) == SMALL.iterations
+    camera = scene.test[0].camera
+    with torch.no_grad():
+        dark, bright = (model.render(camera).image.mean().item() for model in (with_loss, plain))
+    assert dark < 0.95 * bright
+    for target in targets:
+        assert target.photo.shape == (target.camera.height, target.camera.width, 3)
+        assert target.counts is None or target.counts.dtype == torch.bool
+
+
+def test_a_loss_of_zero_changes_nothing(scene: Scene) -> None:
+    own = run(scene, 12, losses={"zero": lambda rendering, target: 0.0 * rendering.alpha.mean()})
+    assert_same_state(own, run(scene, 12))
+
+
+@pytest.mark.parametrize(
+    ("losses", "error", "match"),
+    [
+        ({"l1": lambda r, t: r.alpha.mean()}, ValueError, r"expected names other than l1, .*, got 'l1'"),
+        ({"own": lambda r, t: r.alpha}, ValueError, r"losses\['own'\]: expected a scalar tensor, got shape \(36, 48\)"),
+        ({"own": lambda r, t: 0.5}, TypeError, r"losses\['own'\]: expected a floating scalar tensor, got float"),
+        ({"own": lambda r, t: r.ids.sum()}, TypeError, r"losses\['own'\]: .*, got torch\.int64"),
+    ],
+)
+def test_losses_that_do_not_fit_are_named(
+    scene: Scene, losses: dict[str, Any], error: type[Exception], match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        run(scene, 1, losses=losses)
+
+
+# Optimizers
+
+
+def adam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    return torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+
+def radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    return torch.optim.RAdam(groups, eps=1e-15)
+
+
+def adamw(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    return torch.optim.AdamW(groups, eps=1e-15, weight_decay=1e-4)
+
+
+def sgd(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    return torch.optim.SGD([group | {"lr": 2 * group["lr"]} for group in groups], lr=0.0, momentum=0.9)
+
+
+def adagrad(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    return torch.optim.Adagrad(groups)
+
+
+def test_adam_by_hand_is_the_default(scene: Scene) -> None:
+    own = run(scene, optimizer=adam)
+    assert len(own.surfels) > 60  # surfels were split
+    assert_same_state(own, run(scene))
+
+
+@pytest.mark.parametrize("make", [radam, adamw, sgd, adagrad])
+def test_any_optimizer_follows_densification_and_resumes(scene: Scene, tmp_path: Path, make: OptimizerMaker) -> None:
+    straight = run(scene, optimizer=make)
+    assert len(straight.surfels) > 60
+    for name, parameter in straight._named_parameters():
+        assert torch.isfinite(parameter).all(), name
+        state = straight.optimizer.state[parameter]
+        rows = [x for x in state.values() if isinstance(x, torch.Tensor) and x.ndim]
+        assert rows and all(x.shape == parameter.shape for x in rows), name
+    first = run(scene, 23, optimizer=make)
+    first.save(tmp_path)
+    second = nw.Trainer(scene, SMALL, "cpu", optimizer=make)
+    second.restore(tmp_path)
+    second.run()
+    for (name, value), (_, other) in zip(straight._named_parameters(), second._named_parameters(), strict=True):
+        assert torch.equal(value, other), name
+        for key, x in straight.optimizer.state[value].items():
+            assert torch.equal(torch.as_tensor(x), torch.as_tensor(second.optimizer.state[other][key])), (name, key)
+    with pytest.raises(CheckpointError, match="expected Adam"):
+        nw.Trainer(scene, SMALL, "cpu").restore(tmp_path)
+
+
+@pytest.mark.parametrize(("make", "factor"), [(adam, 1.0), (sgd, 2.0)])
+def test_schedules_drive_the_rates_of_any_optimizer(scene: Scene, make: OptimizerMaker, factor: float) -> None:
+    """From the first rate to the last one; a changed first rate scales both."""
+    trainer, rates = nw.Trainer(scene, SMALL, "cpu", optimizer=make), SMALL.rates
+    found = []
+
+    def note(_: nw.StepReport) -> None:
+        found.append({group["name"]: group["lr"] for group in trainer.optimizer.param_groups})
+
+    trainer.run(note)
+    for index, end in ((0, found[0]), (1, found[-1])):
+        assert end["means"] == pytest.approx(factor * rates.means[index] * scene.scale)
+        assert end["grid"] == pytest.approx(factor * rates.grid[index])
+        assert end["raw_quats"] == pytest.approx(factor * rates.quats)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda groups: 3, TypeError, "optimizer: expected it to return a torch.optim.Optimizer, got int"),
+        (lambda groups: torch.optim.SGD(groups[:3], lr=0.1), ValueError, "to keep the parameter groups means, .*, mlp"),
+        (lambda groups: torch.optim.SGD([g["params"][0] for g in groups], lr=0.1), ValueError, "got None"),
+    ],
+)
+def test_optimizers_that_do_not_fit_are_refused(
+    scene: Scene, make: Callable[..., Any], error: type[Exception], match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        nw.Trainer(scene, SMALL, "cpu", optimizer=make)
+
+
+# Scenes in memory
+
+
+def parts(scene: Scene) -> dict[str, Any]:
+    views = sorted(scene.train + scene.test, key=lambda view: view.name)
+    return {
+        "images": [view.image for view in views],
+        "cameras": [view.camera for view in views],
+        "points": scene.points,
+        "colors": scene.colors,
+        "names": [view.name for view in views],
+    }
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float", "numpy", "stacked"])
+def test_a_scene_in_memory_is_the_scene_of_its_files(scene: Scene, kind: str) -> None:
+    given = parts(scene)
+    if kind == "float":
+        given["images"] = [image / 255.0 for image in given["images"]]
+        given["colors"] = given["colors"].double() / 255.0
+    elif kind == "numpy":
+        given |= {"images": [x.numpy() for x in given["images"]], "points": given["points"].numpy().astype(np.float64)}
+    elif kind == "stacked":
+        given["images"] = torch.stack(given["images"])
+    made = nw.Scene.from_tensors(**given)
+    assert made.scale == pytest.approx(scene.scale, rel=1e-5) and made.path == Path("memory")
+    for ours, theirs in ((made.train, scene.train), (made.test, scene.test)):
+        assert [view.name for view in ours] == [view.name for view in theirs]
+        for one, other in zip(ours, theirs, strict=True):
+            assert torch.equal(one.image, other.image) and one.mask is None
+            assert torch.equal(one.camera.viewmat, other.camera.viewmat) and one.camera.near == other.camera.near
+    assert torch.equal(made.points, scene.points) and torch.equal(made.colors, scene.colors)
+
+
+def test_a_scene_in_memory_keeps_copies_and_trains(scene: Scene) -> None:
+    given = parts(scene)
+    given["masks"] = [None, torch.ones(36, 48, dtype=torch.bool), *[torch.arange(48).expand(36, 48) > 8] * 8]
+    given["images"] = [image.clone() for image in given["images"]]
+    made = nw.Scene.from_tensors(**given | {"test_every": 0, "names": None})
+    given["images"][0].zero_()
+    assert made.train[0].image.any() and not made.test and len(made.train) == 10
+    assert [view.name for view in made.train] == [str(index) for index in range(10)]
+    assert made.train[0].mask is None and made.train[1].mask is None and made.train[2].mask is not None
+    model = nw.train(made, dataclasses.replace(SMALL, iterations=8), device="cpu")
+    assert len(model.surfels) > 0 and model.meta["iteration"] == 8
+
+
+def test_without_points_a_scene_gets_random_ones(scene: Scene) -> None:
+    given = parts(scene)
+    made = nw.Scene.from_tensors(given["images"], given["cameras"])
+    assert len(made.points) == len(made.colors) > 1000 and made.colors.dtype == torch.uint8
+    again = nw.Scene.from_tensors(given["images"], given["cameras"])
+    assert torch.equal(made.points, again.points)
+
+
+def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
+    return lambda values: [value if i == index else x for i, x in enumerate(values)]
+
+
+@pytest.mark.parametrize(
+    ("argument", "change", "error", "match"),
+    [
+        ("images", changed(3, "photo"), TypeError, r"^images\[3\]: expected a torch.Tensor or numpy.ndarray, got str$"),
+        ("images", changed(3, torch.zeros(36, 48)), ValueError, r"^images\[3\]: .* \(H, W, 3\), got \(36, 48\)$"),
+        ("images", changed(3, torch.ones(36, 48, 3).int()), TypeError, r"^images\[3\]: expected uint8, .*int32$"),
+        ("images", changed(3, torch.ones(36, 48, 3) * 2), ValueError, r"^images\[3\]: .* \[0, 1\], got 2 to 2$"),
+        ("images", changed(3, torch.full((36, 48, 3), torch.nan)), ValueError, r"^images\[3\]: .* got nan to nan$"),
+        ("images", changed(3, torch.ones(36, 40, 3)), ValueError, r"^cameras\[3\]: .* 40x36, got 48x36$"),
+        ("images", lambda x: [], ValueError, r"^images: expected at least one, got none$"),
+        ("images", iter, TypeError, r"^images: expected a sequence, got list_iterator$"),
+        ("cameras", lambda x: x[1:], ValueError, r"^cameras: expected 10, one for each image, got 9$"),
+        ("cameras", changed(2, None), TypeError, r"^cameras\[2\]: expected a nexwarp.Camera, got NoneType$"),
+        ("points", lambda x: x.long(), TypeError, r"^points: expected a floating dtype, got torch.int64$"),
+        ("points", lambda x: x[:, :2], ValueError, r"^points: expected shape \(P, 3\) .*, got \(171, 2\)$"),
+        ("points", lambda x: torch.where(x == x[5], torch.inf, x), ValueError, r"^points\[5\]: expected finite"),
+        ("points", lambda x: None, ValueError, r"^colors: expected None without points"),
+        ("colors", lambda x: x[1:], ValueError, r"^colors: expected shape \(171, 3\), got \(170, 3\)$"),
+        ("colors", lambda x: None, ValueError, r"^colors: expected one for each of 171 points, got None$"),
+        ("names", changed(4, 4), TypeError, r"^names\[4\]: expected text, got int$"),
+        ("names", changed(4, "../x"), ValueError, r"^names\[4\]: '../x' leaves the images folder"),
+        ("names", changed(4, "view_002.png"), ValueError, r"^names\[4\]: .* 'view_002.png' as of names\[2\]$"),
+        ("masks", changed(1, torch.ones(36, 48)), TypeError, r"^masks\[1\]: expected dtype torch.bool"),
+        (
+            "masks",
+            changed(1, torch.ones(3, 4) > 0),
+            ValueError,
+            r"^masks\[1\]: .* \(36, 48\), got \(3, 4\)$",
+        ),
+        (
+            "masks",
+            changed(1, torch.zeros(36, 48) > 0),
+            ValueError,
+            r"^masks\[1\]: .* that count, got none$",
+        ),
+        ("test_every", lambda x: 1, ValueError, r"^test_every: expected 0, or at least 2, got 1$"),
+        ("test_every", lambda x: 2.0, TypeError, r"^test_every: expected an int, got float$"),
+    ],
+)
+def test_what_makes_no_scene_is_named(
+    scene: Scene, argument: str, change: Callable[[Any], Any], error: type[Exception], match: str
+) -> None:
+    given = parts(scene) | {"masks": [None] * 10, "test_every": 8}
+    with pytest.raises(error, match=match):
+        nw.Scene.from_tensors(**given | {argument: change(given[argument])})
+
+
+def test_one_image_needs_all_views_for_training(scene: Scene) -> None:
+    one = {name: x[:1] for name, x in parts(scene).items() if name not in ("points", "colors")}
+    with pytest.raises(ValueError, match=r"^test_every: expected 0 for 1 image"):
+        nw.Scene.from_tensors(**one)
+    assert len(nw.Scene.from_tensors(**one, test_every=0).train) == 1
