@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,7 @@ def alternate(checkouts: Sequence[Checkout], repeats: int, measure: Callable[[Ch
     return list(metrics.values())
 
 
-def stage_values(checkout: Checkout, stage: str, *, cuda: bool, data: Path) -> Values:
+def stage_values(checkout: Checkout, *, stage: str, cuda: bool, data: Path) -> Values:
     """Run a stage of a checkout's `python -m benchmarks` and return its medians and peak memory."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.jsonl"
@@ -223,7 +224,7 @@ def compare(given: argparse.Namespace, checkouts: Sequence[Checkout]) -> dict[st
             given.out.write_text(json.dumps(report, indent=1) + "\n")
 
     for stage in filter(None, given.stages.split(",")):
-        part(stage, given.repeats, lambda c, stage=stage: stage_values(c, stage, cuda=cuda, data=given.data))
+        part(stage, given.repeats, partial(stage_values, stage=stage, cuda=cuda, data=given.data))
     if given.demo:
         part("demo", given.repeats, measure_demo)
         print(f"the models' tensors are {'equal' if report['demo_tensors']['equal'] else 'DIFFERENT'}\n")

@@ -4,12 +4,13 @@ python3 -m benchmarks.bench_pixel_block                  # garden-like on CUDA, 
 """
 
 import sys
+from functools import partial
 
 import torch
 import warp as wp
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, entries, geometry, workload
+from benchmarks.scenes import SurfelScene, entries, geometry, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, ratio
 from nexwarp.kernels.collect import collect_kernel
@@ -26,7 +27,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for hits in (2, 4) for m in forward(scene, options, hits)]
 
 
-def forward(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]:
+def forward(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """Old and new in turns; the last of `ROUNDS` measurements of each, and whether the buffers are the same."""
     g = geometry(scene)
     with torch.no_grad():
@@ -63,13 +64,8 @@ def forward(scene: Scene, options: Options, max_hits: int = 2) -> list[Measureme
                 array(buffers["alphas"][:, 0], real),
                 array(stops, wp.int32),
             ]
-            timed[name] = options.time(
-                f"collect, forward, {name}",
-                lambda kernel=kernel, width=width, outputs=outputs: launch_walk(
-                    records, kernel, tiles, inputs, outputs, width
-                ),
-                **facts,
-            )
+            walk = partial(launch_walk, records, kernel, tiles, inputs, outputs, width)
+            timed[name] = options.time(f"collect, forward, {name}", walk, **facts)
             found[name] = [ids, stops, *buffers.values()]
     results = list(timed.values())
     for suffix in ("", ", SIMD") if not options.cuda else ("",):

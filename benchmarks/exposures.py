@@ -61,7 +61,7 @@ def main(scenes: Annotated[tuple[str, ...], tyro.conf.Positional], data: Path = 
     for name in scenes:
         scene = load_scene(name if Path(name).exists() else data / name)
         found = compare(scene.train, scene.test)
-        spread = ", ".join(f"{100 * x:.1f}" for x in found["spread"].tolist())
+        spread = ", ".join(f"{100 * x:.1f}" for x in torch.as_tensor(found["spread"]).tolist())
         errors = " | ".join(f"{100 * found[key]:.1f} %" for key in ("predicted", "ignored", "edge"))
         print(f"| {Path(name).name} | {spread} % | {errors} |")
     return 0

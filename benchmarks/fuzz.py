@@ -18,7 +18,6 @@ import random
 import re
 import resource
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -29,6 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from benchmarks.fuzz_inputs import Files, damage, strategy
 from benchmarks.fuzz_targets import TARGETS, FuzzTarget
@@ -67,7 +67,7 @@ class Result:
     inputs: int = 0
     loaded: int = 0
     seconds: float = 0.0
-    refusals: Counter = field(default_factory=Counter)
+    refusals: Counter[str] = field(default_factory=Counter)
     failures: list[Failure] = field(default_factory=list)
 
 
@@ -149,7 +149,7 @@ def _batch(
             break
         if time.monotonic() - now[1] > HANG:
             hung = True
-            os.kill(process.pid, signal.SIGKILL)
+            process.kill()
             while True:
                 try:
                     _collect(ours.recv(), target, result, folder, failed)
@@ -167,7 +167,7 @@ def _batch(
     return index + 1
 
 
-def _collect(message: tuple, target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
+def _collect(message: tuple[Any, ...], target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
     if message[0] == "failure":
         _, kind, index, detail, kept = message
         result.failures.append(_saved(Failure(target.name, index, kind, detail), Path(kept), failed))
@@ -196,7 +196,7 @@ def _work(
     valid: list[Files],
     folder: Path,
     report: Connection,
-    now: "multiprocessing.Array",
+    now: Any,
     first: int,
     last: int,
     left: float,

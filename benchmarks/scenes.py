@@ -12,6 +12,7 @@ from benchmarks.suite import Options
 from nexwarp import ops
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.paths import look_at
+from nexwarp.representation.surfels import Activated
 from nexwarp.run.folder import CAMERAS_FILE
 
 SH_DC = 0.28209479177387814
@@ -73,7 +74,7 @@ class Geometry:
         pinhole: the image plane.
     """
 
-    shape: tuple[torch.Tensor, ...]
+    shape: Activated
     colors: torch.Tensor
     viewmat: torch.Tensor
     pinhole: ops.Pinhole
@@ -101,7 +102,7 @@ class Geometry:
 def geometry(scene: SurfelScene) -> Geometry:
     """Activate a scene's surfels, and their colours as its camera sees them."""
     s, c = scene.surfels, scene.camera
-    shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
+    shape = Activated(*(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas)))
     colors = ops.plain_colors((s.sh0, s.shN), s.means, c.position, 3).requires_grad_()
     pinhole = ops.Pinhole(c.K, c.width, c.height, c.near)
     return Geometry(shape, colors, c.viewmat, pinhole)

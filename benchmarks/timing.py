@@ -21,6 +21,18 @@ ROOT = Path(__file__).resolve().parents[1]
 MIB = 2**20
 
 
+@functools.cache
+def git_commit() -> str:
+    """Commit of the working tree, with a + when it was changed; "unknown" without git."""
+    try:
+        git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10)
+        head = git(["git", "rev-parse", "--short", "HEAD"]).stdout.strip()
+        changed = git(["git", "status", "--porcelain"]).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return head + ("+" if changed else "")
+
+
 @dataclass(frozen=True)
 class Measurement:
     """One figure, with all facts that are needed to reproduce it.
@@ -51,7 +63,7 @@ class Measurement:
     sizes: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     device_name: str = ""
-    commit: str = field(default_factory=lambda: commit())
+    commit: str = field(default_factory=git_commit)
     date: str = field(default_factory=lambda: datetime.datetime.now(datetime.timezone.utc).isoformat("T", "seconds"))
     versions: str = field(default_factory=lambda: f"torch {torch.__version__}, warp {wp.__version__}")
 
@@ -133,9 +145,9 @@ def figure(
 
 def ratio(name: str, top: Measurement, bottom: Measurement, note: str = "") -> Measurement:
     """Ratio of two medians of one run; its spread is that of `top` alone, over the median of `bottom`."""
-    over = {key: getattr(top, key) / bottom.median for key in ("median", "p10", "p90")}
-    kept = {"scene": top.scene, "sizes": top.sizes, "repeats": top.repeats, "device_name": top.device_name}
-    return Measurement(name=name, device=top.device, unit="x", note=note, **over, **kept)
+    median, p10, p90 = (value / bottom.median for value in (top.median, top.p10, top.p90))
+    kept = dataclasses.replace(top, name=name, unit="x", note=note, peak_mib=None)
+    return dataclasses.replace(kept, median=median, p10=p10, p90=p90)
 
 
 def synchronize(device: torch.device) -> None:
@@ -184,18 +196,6 @@ def device_name(kind: str) -> str:
         model = platform.processor() or platform.machine()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{model}, {cores} cores"
-
-
-@functools.cache
-def commit() -> str:
-    """Commit of the working tree, with a + when it was changed; "unknown" without git."""
-    try:
-        git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10)
-        head = git(["git", "rev-parse", "--short", "HEAD"]).stdout.strip()
-        changed = git(["git", "status", "--porcelain"]).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return head + ("+" if changed else "")
 
 
 def _cuda_clock(run: Callable[[], Any]) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+import nexwarp as nw
 from benchmarks import __main__ as command
 from benchmarks import bench_cpu, bench_frame, bench_peers, bench_sizes
 from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
@@ -34,7 +35,7 @@ def small_scene() -> SurfelScene:
 
 
 def test_timer_finds_the_median_of_a_known_sleep() -> None:
-    calls = []
+    calls: list[None] = []
 
     def nap() -> None:
         calls.append(None)
@@ -58,8 +59,10 @@ def test_ratio_divides_medians() -> None:
 
 
 def test_table_compares_gpu_and_cpu() -> None:
-    facts = {"name": "walk", "scene": "cloud", "p10": 1.0, "p90": 1.0}
-    results = [Measurement(device=d, median=m, **facts) for d, m in (("cuda", 2.0), ("cpu", 50.0))]
+    results = [
+        Measurement(name="walk", scene="cloud", device=device, median=median, p10=1.0, p90=1.0)
+        for device, median in (("cuda", 2.0), ("cpu", 50.0))
+    ]
     assert "times as fast" in table(results)
     assert table(results).splitlines()[-1].split() == ["walk", "cloud", "50", "2", "25"]
     assert "times as fast" not in table(results[:1])
@@ -160,7 +163,7 @@ def test_frames_of_the_trained_scene_are_timed_with_its_options(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, seen = fox(run_folder), []
-    render = model_module.render
+    render = nw.render
 
     def note(surfels: Surfels, texture: NeuralTexture, camera: Camera, *options: Any, **others: Any) -> Any:
         seen.append((texture, options[:5], others["detail_limits"]))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,15 +17,16 @@ import nexwarp as nw
 from benchmarks.quality.__main__ import main
 from benchmarks.quality.curve import curves_of
 from benchmarks.quality.jobs import SCENES, TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
-from benchmarks.quality.results import drop_unfinished, read_results
+from benchmarks.quality.results import Results, drop_unfinished, read_results
 from benchmarks.quality.rows import DEFAULT, GSPLAT, ROWS, Row
-from benchmarks.quality.run import METRIC_FUNCTIONS, config_name, file_name, run_job
+from benchmarks.quality.run import config_name, file_name, run_job
 from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, moved
 from benchmarks.quality.tables import differences, markdown, summary
 from benchmarks.timing import ROOT
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
+from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
@@ -78,13 +80,21 @@ def test_moved_scenes_look_the_same(scene: Scene) -> None:
         assert (pixels - again).abs().max() < 0.01
         assert_close(scaled / 100, depths, kind="gradient", name="depths")
         assert two.camera.near == pytest.approx(100 * one.camera.near)
+        assert one.points is not None and two.points is not None
         seen, _ = two.camera.project(two.points)
         assert (seen - one.camera.project(one.points)[0]).abs().max() < 0.01
 
 
-def result(row: str, seed: int, **figures: float | str) -> dict:
+def result(row: str, seed: int, **changes: object) -> dict[str, Any]:
     job = dataclasses.asdict(TrainingJob("fox", "", row, 40, seed, 100))
-    figures = {"psnr": 30.0, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0, "seconds": 5.0} | figures
+    figures: dict[str, object] = {
+        "psnr": 30.0,
+        "ssim": 0.9,
+        "flip": 0.1,
+        "lpips": None,
+        "megabytes": 2.0,
+        "seconds": 5.0,
+    } | changes
     return job | {"settings": {}, "commit": "abc", "jobs": 1, "peak_mib": 100} | figures
 
 
@@ -179,8 +189,8 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     figures = "-0.75 ± 0.90 | +0.0000 ± 0.0000 | +0.1000 ± 0.0500 |  | +0.50 ± 0.00"
     assert f"| no gamma | {figures} | fox, kitchen |" in text
     (group,) = differences(results, "no gamma")
-    figures = {row["row"]: row["psnr"] for row in group["rows"]}
-    assert figures == {"K = 3": (2.25, None), "default": (-second["psnr"][0], second["psnr"][1])}
+    found = {row["row"]: row["psnr"] for row in group["rows"]}
+    assert found == {"K = 3": (2.25, None), "default": (-second["psnr"][0], second["psnr"][1])}
     text = markdown(results, "no gamma")
     assert "## Mean of the scenes less that of no gamma, 40 primitives, 100 iterations" in text
     assert "| default | +0.75 ± 0.90 |" in text
@@ -195,18 +205,20 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
 def test_trainings_that_began_together_differ_by_pairs() -> None:
     """Their seeds' spread is common; of another commit, or alone, it is not."""
     alike = {"rows": ["default", "K = 3", "K = 4"], "iterations": 9}
-    results = {}
+    results: Results = {}
+    shared: dict[str, object] = {"together": alike}
+    lines: list[tuple[str, int, float, dict[str, object]]] = [
+        ("default", 0, 30.0, shared),
+        ("default", 1, 34.0, shared),
+        ("K = 3", 0, 30.0, shared),
+        ("K = 3", 1, 34.2, shared),
+        ("K = 4", 0, 30.0, shared | {"commit": "abd"}),
+        ("K = 4", 1, 34.2, shared | {"commit": "abd"}),
+        ("K = 1", 0, 30.0, {}),
+        ("K = 1", 1, 34.2, {}),
+    ]
     for scene in ("fox", "kitchen"):
-        for row, seed, figure, more in (
-            ("default", 0, 30.0, {"together": alike}),
-            ("default", 1, 34.0, {"together": alike}),
-            ("K = 3", 0, 30.0, {"together": alike}),
-            ("K = 3", 1, 34.2, {"together": alike}),
-            ("K = 4", 0, 30.0, {"together": alike, "commit": "abd"}),
-            ("K = 4", 1, 34.2, {"together": alike, "commit": "abd"}),
-            ("K = 1", 0, 30.0, {}),
-            ("K = 1", 1, 34.2, {}),
-        ):
+        for row, seed, figure, more in lines:
             job = TrainingJob(scene, "", row, 40, seed, 100)
             results[job] = result(row, seed, psnr=figure) | dataclasses.asdict(job) | more
     (group,) = differences(results)
@@ -237,7 +249,7 @@ def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "table.md").exists()
 
 
-def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     threads = torch.get_num_threads()
     settings = {"texture.levels": 4, "texture.table_size": 1024}
     command = ["train", "--row", f"mine:default:{json.dumps(settings)}", "--scenes", "tiny", "--seeds", "0"]
@@ -255,7 +267,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     (model,) = (tmp_path / "models").glob("*/model.safetensors")
     assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
     trained = nw.load(model)
-    assert trained.texture.residual
+    assert trained.texture is not None and trained.texture.residual
     assert found["quarter_psnr"] == pytest.approx(quarter_psnr(trained, folder / "tiny"), abs=0.05)
     assert main(command) == 0
     assert "0 of 1 trainings to do" in capsys.readouterr().out
@@ -334,7 +346,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
-    differ = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
+    differ: dict[str, dict[str, int]] = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
     rows = {name: settings | small for name, settings in differ.items()}
     command = ["train", "--scenes", "tiny", "--seeds", "1", "--size", "60", "--iterations", "12", "--data", str(folder)]
     command += ["--out", str(out), "--models", str(models)]
@@ -351,7 +363,8 @@ def test_a_training_from_a_shared_start_is_the_training(
         assert alone["views"] == result["views"] and "together" not in alone
         one, other = (nw.load(path / file_name(job)) for path in (models, tmp_path / "alone"))
         assert one.meta == other.meta and one.options.max_hits == rows[job.row].get("max_hits", 2)
-        for part, same in ((one.surfels, other.surfels), (one.texture, other.texture)):
+        assert one.texture is not None and other.texture is not None
+        for part, same in zip((one.surfels, one.texture), (other.surfels, other.texture), strict=True):
             state = same.state_dict()
             assert all(torch.equal(tensor, state[name]) for name, tensor in part.state_dict().items())
         texture.append(one.texture.grid)
@@ -365,7 +378,7 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     command += ["--seeds", "0,1", "--size", "60", "--iterations", "1000000", "--data", str(folder)]
     command += ["--out", str(tmp_path / "out.jsonl")]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout.readline() == b"2 of 2 trainings to do\n"
+        assert process.stdout is not None and process.stdout.readline() == b"2 of 2 trainings to do\n"
         time.sleep(3)
         process.send_signal(how)  # to this process alone
         try:
@@ -426,10 +439,10 @@ A_MEAN = r"\d+\.\d\d ± \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
 A_DIFFERENCE = r"[+-]\d+\.\d\d ± \d\.\d\d, [+-]0\.\d{4} ± 0\.\d{4}, [+-]0\.\d{4} ± 0\.\d{4}"
 
 
-def kept(name: str) -> dict[str, set[tuple]]:
+def kept(name: str) -> dict[str, set[tuple[object, ...]]]:
     """Of which trainings a figure of a document is: (scene, variant, size, row), or (row, against) of a difference."""
     results = read_results([ROOT / "benchmarks" / "results" / f"{name}.jsonl"])
-    found: dict[str, set[tuple]] = {}
+    found: dict[str, set[tuple[object, ...]]] = {}
     for row in summary(results):
         (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
         if spread is not None:

@@ -71,8 +71,9 @@ def test_a_leak_fails_the_command(monkeypatch, capsys):
 def test_memory_is_seen(device):
     before = memory(device)
     if device.type == "cpu":  # from the system: the heap may have had room
-        kept = mmap.mmap(-1, 64 * MIB)
-        kept.write(bytes(64 * MIB))
+        mapped = mmap.mmap(-1, 64 * MIB)
+        mapped.write(bytes(64 * MIB))
+        kept: object = mapped
     else:
         kept = torch.ones(64 * MIB // 4, device=device)
     after = memory(device)

@@ -5,9 +5,9 @@ import json
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from benchmarks.quality.rows import CHANGES, DEFAULT, DEMOS, HITS, NO_TEXTURE, PAPER, PEER, REMOVALS, Row
+from benchmarks.quality.rows import CHANGES, DEFAULT, DEMO_CONFIG, DEMOS, HITS, NO_TEXTURE, PAPER, PEER, REMOVALS, Row
 from nexwarp.train.config import Config
-from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
 
 SCENES = ("fox", "saharov", "kitchen25")
@@ -67,6 +67,7 @@ def table_jobs(
     Raises:
         ValueError: `table` is unknown.
     """
+    rows: tuple[Row, ...]
     sizes: tuple[int, ...] = (size,)
     variants: tuple[str, ...] = ("",)
     if table == "peers":
@@ -87,7 +88,7 @@ def table_jobs(
         rows, variants, scenes = (DEFAULT,), ("", "x100", "moved"), ("fox",)
     elif table == "demo":
         rows, variants, scenes = DEMOS, ("arc",), (DEMO,)
-        sizes, iterations = (DEMO_SETTINGS["max_surfels"],), DEMO_SETTINGS["iterations"]
+        sizes, iterations = (DEMO_CONFIG.max_surfels,), DEMO_CONFIG.iterations
     else:
         raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
     seeds = tuple(seeds)

@@ -152,9 +152,10 @@ def differences(results: Results, against: str = DEFAULT.name) -> list[dict[str,
             both = [scene for scene in scenes if scene in base]
             if len(both) < 2:
                 continue
-            figures = {metric: [_difference(scenes[s], base[s], metric) for s in both] for metric in COMPARED}
-            means = {m: _mean_difference(x) for m, x in figures.items()}
-            shown.append({"row": name, "scenes": sorted(scene for scene, _ in both), "of": both} | means)
+            row: dict[str, Any] = {"row": name, "scenes": sorted(scene for scene, _ in both), "of": both}
+            for metric in COMPARED:
+                row[metric] = _mean_difference([_difference(scenes[s], base[s], metric) for s in both])
+            shown.append(row)
         if shown:
             shown.sort(key=lambda row: -(row["psnr"] or [-math.inf])[0])
             reduced = sorted({downscale for row in shown for _, downscale in row.pop("of")})
@@ -167,8 +168,9 @@ def _difference(one: list[dict[str, Any]], two: list[dict[str, Any]], metric: st
     pairs = {result["seed"]: result for result in two}
     if all(_share_start(result, pairs.get(result["seed"])) for result in one):
         values = [(result.get(metric), pairs[result["seed"]].get(metric)) for result in one]
-        spread = None if any(None in pair for pair in values) else _spread(a - b for a, b in values)
-        return spread and (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
+        known = [x - y for x, y in values if x is not None and y is not None]
+        spread = _spread(known) if len(known) == len(values) else None
+        return None if spread is None else (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
     mine, other = (_spread(result.get(metric) for result in each) for each in (one, two))
     if mine is None or other is None:
         return None
