@@ -1,6 +1,6 @@
-"""Cold start: a fresh process with empty kernel caches, as after an install. What a user waits for.
+"""Cold start: a fresh process with empty kernel caches, as after an install.
 
-And what `nexwarp warmup` takes, which does the compiling ahead of time: at most 60 s of it are meant to be on CUDA.
+Also times `nexwarp warmup`, which compiles ahead of time; its budget on CUDA is 60 s.
 """
 
 import json
@@ -14,7 +14,7 @@ from benchmarks import suite
 from benchmarks.suite import Options
 from benchmarks.timing import ROOT, Measurement, figure
 
-# Times each part; the frame is small, so that they are all compiling and loading.
+# Times each part; the frame is small, so that compiling and loading dominate.
 PROGRAM = """
 import json, sys, time
 seconds = {}
@@ -45,7 +45,7 @@ print(json.dumps(seconds))
 
 
 def run(options: Options) -> list[Measurement]:
-    """With empty caches, then with what the first process left in them; and warmed up, twice, then with that."""
+    """Time a process with empty and with filled caches, `nexwarp warmup` with both, and a process after it."""
     with tempfile.TemporaryDirectory() as cache:
         results = [m for state in ("empty", "filled") for m in parts(state, cache, options)]
     with tempfile.TemporaryDirectory() as cache:
@@ -57,7 +57,7 @@ def run(options: Options) -> list[Measurement]:
 
 
 def parts(state: str, cache: str, options: Options) -> list[Measurement]:
-    """Seconds of each part of PROGRAM with kernel caches in a folder."""
+    """Return the seconds of each part of PROGRAM with kernel caches in a folder."""
     line, _ = fresh_process([sys.executable, "-c", PROGRAM, options.device.type], cache)
     return [
         figure(f"{name}, {state} cache", value, options.device, unit="s", scene="fresh process")
@@ -66,13 +66,13 @@ def parts(state: str, cache: str, options: Options) -> list[Measurement]:
 
 
 def warm_up(state: str, cache: str, options: Options) -> Measurement:
-    """Seconds of the whole command, imports too; the note is what it says itself, with the seconds without those."""
+    """Return the seconds of the whole command with its imports; the note is its own last line, without imports."""
     line, seconds = fresh_process([sys.executable, "-m", "nexwarp", "warmup", "--device", options.device.type], cache)
     return figure(f"nexwarp warmup, {state} cache", seconds, options.device, unit="s", scene="fresh process", note=line)
 
 
 def fresh_process(command: list[str], cache: str) -> tuple[str, float]:
-    """Run a command with kernel caches in a folder; the last line that it prints, and its seconds."""
+    """Run a command with kernel caches in a folder; return the last line that it prints, and its seconds."""
     environment = os.environ | {"WARP_CACHE_PATH": f"{cache}/warp", "CUDA_CACHE_PATH": f"{cache}/cuda"}
     start = time.perf_counter()
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)

@@ -5,7 +5,7 @@ import sys
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, entries, geometry, outputs, random_like, workload
+from benchmarks.scenes import SurfelScene, entries, geometry, outputs, random_like, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
@@ -15,7 +15,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for m in (*walk(scene, options), *stage(scene, options))]
 
 
-def walk(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]:
+def walk(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """The pass alone, given projection and tile lists."""
     g = geometry(scene)
     with torch.no_grad():
@@ -36,7 +36,7 @@ def walk(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]
     ]
 
 
-def stage(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]:
+def stage(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """Activated surfels to hits, and back."""
     g = geometry(scene)
     with torch.no_grad():

@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, cloud, geometry, outputs, random_like
+from benchmarks.scenes import SurfelScene, cloud, geometry, outputs, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, ratio
 from nexwarp import ops
@@ -25,10 +25,10 @@ def run(options: Options) -> list[Measurement]:
     return collection(cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320), options)
 
 
-def collection(scene: Scene, options: Options) -> list[Measurement]:
-    """Forward + backward of the pass alone, with 1 and 2 threads; ours should agree bit for bit.
+def collection(scene: SurfelScene, options: Options) -> list[Measurement]:
+    """Time the pass alone, forward + backward, with 1 and 2 threads; our results must agree bit for bit.
 
-    Torch is held to its better number of threads: on a busy machine its second one may cost more than it brings.
+    Torch is compared at its better number of threads: on a busy machine its second thread may slow it down.
     """
     g = geometry(scene)
     with torch.no_grad():
@@ -49,7 +49,7 @@ def collection(scene: Scene, options: Options) -> list[Measurement]:
         with threads(count):
             bits.append(ours())
             theirs()
-    # In turns, so that a machine that gets slower or faster meanwhile does so for all.
+    # In turns, so that a machine that gets slower or faster meanwhile affects all alike.
     times: dict[tuple[str, int], list[float]] = {
         (who, count): [] for who in ("ours", "torch by tile") for count in (1, 2)
     }

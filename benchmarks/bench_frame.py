@@ -1,4 +1,4 @@
-"""A whole frame as a user renders it: camera in, image out, no gradients. And what a steady state must not do."""
+"""A whole frame as a user renders it (`Model.render`, no gradients): time, memory growth, waits of the host."""
 
 import sys
 import time
@@ -10,10 +10,10 @@ import warp as wp
 
 import nexwarp as nw
 from benchmarks import suite
-from benchmarks.scenes import Scene, texture, workload
+from benchmarks.scenes import SurfelScene, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import MIB, Measurement, figure, process_memory, synchronize
-from nexwarp.finish.detail_limits import seen_footprints
+from nexwarp.finish.detail_limits import measure_detail_limits
 
 STEADY_FRAMES = 50
 
@@ -22,16 +22,12 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for m in frame(scene, options)]
 
 
-def frame(scene: Scene, options: Options) -> list[Measurement]:
-    field = texture(scene)
-    surfels = scene.surfels
-    if surfels.far_footprints is None:  # a trained model has both
-        surfels.footprints = None
-        surfels.footprints, surfels.far_footprints = seen_footprints(surfels, [scene.camera], options=scene.options)
+def frame(scene: SurfelScene, options: Options) -> list[Measurement]:
+    model = finished(scene)
 
     @torch.no_grad()
     def render() -> torch.Tensor:
-        return nw.render(scene.surfels, field, scene.camera, **scene.options).image
+        return model.render(scene.camera).image
 
     return [
         options.time("frame", render, **scene.facts),
@@ -41,8 +37,17 @@ def frame(scene: Scene, options: Options) -> list[Measurement]:
     ]
 
 
-def back_to_back(render: Callable[[], torch.Tensor], scene: Scene, options: Options) -> Measurement:
-    """Frames without a pause between them, as in a video: wall time over their number."""
+def finished(scene: SurfelScene) -> nw.Model:
+    """Return the scene's model with a texture and detail limits, which a trained model has already."""
+    trained = scene.model
+    model = nw.Model(trained.surfels, texture(scene), trained.exposures, trained.detail_limits, trained.options)
+    if model.detail_limits is None:
+        model.detail_limits = measure_detail_limits(model, [scene.camera])
+    return model
+
+
+def back_to_back(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> Measurement:
+    """Time frames without a pause between them, as in a video: wall time over their number."""
     count = 3 if options.quick or not options.cuda else STEADY_FRAMES
     synchronize(options.device)
     start = time.perf_counter()
@@ -53,8 +58,8 @@ def back_to_back(render: Callable[[], torch.Tensor], scene: Scene, options: Opti
     return figure(f"frame, of {count} back to back", elapsed, options.device, **scene.facts)
 
 
-def allocator_growth(render: Callable[[], torch.Tensor], scene: Scene, options: Options) -> Measurement:
-    """How much more memory is held after 50 more frames: by torch's and Warp's pools, or by the process on a CPU."""
+def allocator_growth(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> Measurement:
+    """Return the growth of memory over 50 more frames: of torch's and Warp's pools, or of the process on a CPU."""
     before = _held(options.device)
     for _ in range(3 if options.quick else STEADY_FRAMES):
         render()
@@ -62,8 +67,8 @@ def allocator_growth(render: Callable[[], torch.Tensor], scene: Scene, options: 
     return figure("frame, memory growth", grown, options.device, unit="MiB", **scene.facts)
 
 
-def waits(render: Callable[[], torch.Tensor], scene: Scene, options: Options) -> list[Measurement]:
-    """How often torch makes the host wait for the GPU in a frame; Warp's own waits do not show."""
+def waits(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> list[Measurement]:
+    """Return how often torch makes the host wait for the GPU in a frame; Warp's own waits are not counted."""
     if not options.cuda:
         return []
     with warnings.catch_warnings(record=True) as caught:

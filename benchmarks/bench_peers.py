@@ -12,7 +12,7 @@ import torch
 
 from benchmarks import suite
 from benchmarks.bench_collect import stage
-from benchmarks.scenes import Geometry, Scene, garden, geometry, random_like
+from benchmarks.scenes import Geometry, SurfelScene, garden, geometry, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, ratio
 
@@ -39,7 +39,7 @@ def run(options: Options) -> list[Measurement]:
     return [*ours, *theirs, *ratios]
 
 
-def gsplat_2dgs(scene: Scene, options: Options, gsplat) -> list[Measurement]:
+def gsplat_2dgs(scene: SurfelScene, options: Options, gsplat) -> list[Measurement]:
     rasterize, leaves = gsplat_call(geometry(scene), gsplat)
     with torch.no_grad():
         signals = random_like(rasterize())
@@ -53,10 +53,10 @@ def gsplat_2dgs(scene: Scene, options: Options, gsplat) -> list[Measurement]:
 
 
 def gsplat_call(g: Geometry, gsplat) -> tuple[Rasterize, list[torch.Tensor]]:
-    """A function that gives gsplat's (1, H, W, 3) colours and (1, H, W, 1) alphas, and what it differentiates.
+    """Return a function that renders with gsplat, and its leaf tensors.
 
-    Colours that are not spherical harmonics must be there for every camera: its check of (N, 3) ones passes, but the
-    rasterisation then fails.
+    The function returns (1, H, W, 3) colours and (1, H, W, 1) alphas. Colours that are not spherical harmonics need a
+    camera dimension: gsplat's check accepts (N, 3), but its rasterisation then fails.
     """
     means, quats, scales, opacities, _ = (x.detach() for x in g.shape)
     # A surfel has no third scale; 2DGS ignores it.

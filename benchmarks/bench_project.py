@@ -5,7 +5,7 @@ import sys
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, geometry, random_like, workload
+from benchmarks.scenes import SurfelScene, geometry, random_like, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
@@ -15,7 +15,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for m in (*plain_colors(scene, options), *project(scene, options))]
 
 
-def plain_colors(scene: Scene, options: Options) -> list[Measurement]:
+def plain_colors(scene: SurfelScene, options: Options) -> list[Measurement]:
     """SH of degree 3 of every surfel."""
     s = scene.surfels
     leaves = [x.detach().clone().requires_grad_() for x in (s.sh0, s.shN, s.means)]
@@ -34,7 +34,7 @@ def plain_colors(scene: Scene, options: Options) -> list[Measurement]:
     ]
 
 
-def project(scene: Scene, options: Options) -> list[Measurement]:
+def project(scene: SurfelScene, options: Options) -> list[Measurement]:
     g = geometry(scene)
     records = g.project().records
     (signal,) = random_like((records,))

@@ -1,6 +1,7 @@
-"""Time and memory against surfels, pixels and K, one changed at a time: a whole frame, and one with its backward.
+"""Time and memory of a frame, and of a frame + backward, over the number of surfels, of pixels, and over K.
 
-Every row tells what its step from the next smaller size costs; one that costs more than its share is a cliff.
+One size changes at a time. The note of each row is the cost of the step from the next smaller size. A step that costs
+more than its share is marked as a cliff.
 """
 
 import sys
@@ -11,7 +12,7 @@ import torch
 
 import nexwarp as nw
 from benchmarks import suite
-from benchmarks.scenes import Scene, cloud, random_like, texture
+from benchmarks.scenes import SurfelScene, cloud, random_like, texture
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure
 
@@ -31,11 +32,11 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """Sizes to measure at: `base`, and for each of its fields the values that it takes while the others stay.
+    """Sizes to measure at: one sweep for each field of `base`, the other fields as in `base`.
 
     Attributes:
-        base: where the sweeps meet.
-        surfels, megapixels, hits: values, with or without that of `base`.
+        base: the size that all sweeps contain.
+        surfels, megapixels, hits: the values of each sweep; that of `base` is added.
         table_size: of the texture.
         limit: a step that would make a frame and its backward longer than this, in seconds, is left out.
         repeats: how `timing.measure` repeats.
@@ -72,7 +73,7 @@ QUICK = Sweep(Point(500, 0.003, 2), (1_000,), (0.006,), (0,), 2**15, 10.0, {})
 
 
 def run(options: Options) -> list[Measurement]:
-    """Sweep one size after the other; the largest memory comes last, since Warp's high-water mark never falls."""
+    """Run the sweeps; that with the largest memory comes last, since Warp's high-water mark never falls."""
     sweep = QUICK if options.quick else CUDA if options.cuda else CPU
     results = [m for axis in ("hits", "megapixels", "surfels") for m in along(axis, sweep, options)]
     steps = [m for m in results if " for x" in m.note]
@@ -82,7 +83,7 @@ def run(options: Options) -> list[Measurement]:
 
 
 def along(axis: str, sweep: Sweep, options: Options) -> list[Measurement]:
-    """Measure along one axis as far as the device can take it; the base anew, to compare what was measured together."""
+    """Measure along one axis until memory or time run out; measure the base again, beside its neighbours."""
     found: list[list[Measurement]] = []
     points = sweep.along(axis)
     scene = None
@@ -109,12 +110,12 @@ def along(axis: str, sweep: Sweep, options: Options) -> list[Measurement]:
 
 
 def share(axis: str, before: Point, after: Point) -> float | None:
-    """How many times as much work a step is, at most; None from K = 0, which has no texture at all."""
+    """Return the largest factor that a step's work may grow by; None from K = 0, which has no texture."""
     return getattr(after, axis) / getattr(before, axis) if getattr(before, axis) else None
 
 
 def growth(before: Measurement, after: Measurement, step: float | None) -> str:
-    """What a step costs in time and memory, against its share of the work."""
+    """Return a note: the factors of a step in time and memory, beside its share of the work."""
     ratios = {"time": after.median / before.median}
     if before.peak_mib and after.peak_mib:
         ratios["memory"] = after.peak_mib / before.peak_mib
@@ -125,23 +126,23 @@ def growth(before: Measurement, after: Measurement, step: float | None) -> str:
 
 
 def left_out(last: Measurement, axis: str, points: list[Point], reason: str) -> Measurement:
-    """Say in the last row that was measured what was not."""
+    """Return the last measured row with a note on the sizes that were left out."""
     note = f"left out, {reason}: {axis} {', '.join(f'{getattr(point, axis):,}' for point in points)}"
     return replace(last, note="; ".join(filter(None, (last.note, note))))
 
 
-def scene_at(point: Point, before: Scene | None, sweep: Sweep, options: Options) -> Scene:
-    """Make a cloud and its texture, or see the ones before in an image of another size."""
+def scene_at(point: Point, before: SurfelScene | None, sweep: Sweep, options: Options) -> SurfelScene:
+    """Make a cloud and its texture, or keep the ones before and change the image's size."""
     height = round((1e6 * point.megapixels / ASPECT) ** 0.5)
     width = round(ASPECT * height)
     if before is None or len(before.surfels) != point.surfels:
         made = cloud(point.surfels, width, height).to(options.device)
-        return replace(made, texture=texture(made, table_size=sweep.table_size))
+        return replace(made, model=nw.Model(made.surfels, texture(made, table_size=sweep.table_size)))
     seen = cloud(1, width, height).to(options.device)
     return replace(before, name=f"cloud {point.surfels:,} at {width}x{height}", cameras=seen.cameras)
 
 
-def at_size(scene: Scene, hits: int, sweep: Sweep, options: Options) -> list[Measurement]:
+def at_size(scene: SurfelScene, hits: int, sweep: Sweep, options: Options) -> list[Measurement]:
     field = texture(scene) if hits else None
     leaves = [*scene.surfels.parameters(), *(field.parameters() if field else ())]
 

@@ -5,7 +5,7 @@ import sys
 import torch
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, geometry, random_like, texture, workload
+from benchmarks.scenes import SurfelScene, geometry, random_like, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
@@ -15,7 +15,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for m in texturing(scene, options)]
 
 
-def texturing(scene: Scene, options: Options, max_hits: int = 2) -> list[Measurement]:
+def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """The hits are those of the scene, so that neighbouring ones lie as near each other as they do in use."""
     field = texture(scene)
     g = geometry(scene)

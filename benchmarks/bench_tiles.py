@@ -3,7 +3,7 @@
 import sys
 
 from benchmarks import suite
-from benchmarks.scenes import Scene, entries, geometry, workload
+from benchmarks.scenes import SurfelScene, entries, geometry, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 
@@ -12,7 +12,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in workload(options) for m in tiles(scene, options)]
 
 
-def tiles(scene: Scene, options: Options) -> list[Measurement]:
+def tiles(scene: SurfelScene, options: Options) -> list[Measurement]:
     g = geometry(scene)
     projection = g.project()
     facts = scene.facts

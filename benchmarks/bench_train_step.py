@@ -1,6 +1,6 @@
-"""One default training step, in the middle of a run: degree 3, blended errors watched, all losses, Adam.
+"""One default training step in the middle of a run: SH of degree 3, splat errors, all losses, Adam.
 
-And one of the looks for floaters, which come every so often once densification is over.
+And one search for floaters, which training repeats once densification is over.
 """
 
 import sys
@@ -10,11 +10,10 @@ import torch
 
 import nexwarp as nw
 from benchmarks import suite
-from benchmarks.scenes import GARDEN, Scene, cloud, garden, saharov
+from benchmarks.scenes import GARDEN, SurfelScene, cloud, garden, saharov
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, synchronize
-from nexwarp.data import Scene as Photos
-from nexwarp.data import View
+from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.floaters import floaters, nearest_depth
@@ -35,7 +34,7 @@ def run(options: Options) -> list[Measurement]:
     return [m for scene in scenes for m in step(scene, options)]
 
 
-def step(scene: Scene, options: Options) -> list[Measurement]:
+def step(scene: SurfelScene, options: Options) -> list[Measurement]:
     trainer = make_trainer(scene, options)
     one = options.time("training step", trainer.step, **scene.facts)
     count = 3 if options.quick else 200 if options.cuda else 5
@@ -47,22 +46,26 @@ def step(scene: Scene, options: Options) -> list[Measurement]:
     rate = count / (time.perf_counter() - start)
     note = f"{count} steps in a row, density control included as it falls due. {scene.note}".strip()
     facts = scene.facts | {"note": note}
-    return [one, figure("training rate", rate, options.device, unit="it/s", **facts), look(scene, trainer, options)]
+    return [
+        one,
+        figure("training rate", rate, options.device, unit="it/s", **facts),
+        floater_search(scene, trainer, options),
+    ]
 
 
-def look(scene: Scene, trainer: Trainer, options: Options) -> Measurement:
-    """Time what the trainer does to find floaters, in all of the training views and as many between or more."""
+def floater_search(scene: SurfelScene, trainer: Trainer, options: Options) -> Measurement:
+    """Time the trainer's search for floaters, in all training views and at least as many views between them."""
     cameras = [view.camera for view in trainer.scene.train]
     nearest = [nearest_depth(view, trainer.scene.points) for view in trainer.scene.train]
-    render_options = trainer.render_options()
+    model = trainer.model()
 
     def find() -> None:
-        floaters(trainer.surfels, cameras, nearest, torch.Generator().manual_seed(0), options=render_options)
+        floaters(model, cameras, nearest, torch.Generator().manual_seed(0))
 
     return options.time("look for floaters", find, **scene.facts)
 
 
-def make_trainer(scene: Scene, options: Options) -> Trainer:
+def make_trainer(scene: SurfelScene, options: Options) -> Trainer:
     """Trainer with default settings (small tables on scenes for a CPU) that goes on from the scene's surfels."""
     count = len(scene.surfels)
     large = count >= 20_000
@@ -73,7 +76,7 @@ def make_trainer(scene: Scene, options: Options) -> Trainer:
     )
     config = Config(max_surfels=count, texture=shape)
     surfels = scene.surfels.to(options.device)
-    trainer = Trainer(photos(scene, options), config, options.device)
+    trainer = Trainer(training_scene(scene, options), config, options.device)
     # Trainer starts from few surfels; before the first step its optimizer has no state that the new ones must fit.
     for name, parameter in trainer.surfels.named_parameters():
         parameter.data = getattr(surfels, name).detach().clone()
@@ -83,8 +86,8 @@ def make_trainer(scene: Scene, options: Options) -> Trainer:
 
 
 @torch.no_grad()
-def photos(scene: Scene, options: Options) -> Photos:
-    """What the trainer wants: the scene's photos, or else its surfels rendered without a texture."""
+def training_scene(scene: SurfelScene, options: Options) -> Scene:
+    """Return a scene to train on: with the scene's photos, or else with renderings of its surfels alone."""
     images = scene.photos
     cameras = scene.cameras
     if not images:
@@ -93,13 +96,13 @@ def photos(scene: Scene, options: Options) -> Photos:
     generator = torch.Generator().manual_seed(3)
     chosen = torch.randperm(len(scene.surfels), generator=generator)[:POINTS]
     points = scene.surfels.means.detach().cpu()[chosen]
-    # With points of its own a view has depths to compare and an exposure, as photos have.
+    # With points of its own a view has depths to compare with and an exposure, as photos have.
     views = [
         View(camera.to("cpu"), image, None, f"{i:03d}", points=points)
         for i, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]
     centers = torch.stack([camera.position for camera in cameras]).cpu()
-    return Photos(
+    return Scene(
         train=views,
         test=[],
         points=points,

@@ -2,9 +2,9 @@
 
     python -m benchmarks.exposures fox saharov kitchen25
 
-estimates the gains of each scene's training photos, predicts those of its test views from their poses, and compares
-with the gains that the test photos have when they are estimated together with the others (only here are test photos
-looked at). On a CPU; nothing is trained.
+estimates the gains of each scene's training photos, predicts those of its test views from their poses, and compares the
+predictions with the gains of the test photos, estimated together with the training photos. Only this benchmark reads
+gains from test photos. Runs on a CPU; nothing is trained.
 """
 
 import math
@@ -22,7 +22,7 @@ from nexwarp.train.exposure_calibration import photo_gains
 
 
 def gains_of(views: list[View]) -> tuple[torch.Tensor, tuple[float, float, float]]:
-    """Log gains (V, 3) of photos, mean 0, and the falloff of their lens."""
+    """Return log gains (V, 3) of photos, with mean 0, and the falloff of their lens."""
     points = [torch.zeros(0, 3) if view.points is None else view.points for view in views]
     cameras, photos = [view.camera for view in views], [view.image for view in views]
     log_gains, falloff = photo_gains(cameras, photos, points, [view.mask for view in views])
@@ -30,14 +30,15 @@ def gains_of(views: list[View]) -> tuple[torch.Tensor, tuple[float, float, float
 
 
 def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | float]:
-    """Spread of the training photos' gains by channel (3,), and the test views' errors as root mean squares.
+    """Return the spread of the training photos' gains, and the root mean square errors of the test views' gains.
 
     Returns:
-        "spread": standard deviation of the log gains; "predicted": error of what the pose predicts; "ignored": that of
-        a gain of 1; "edge": what the lens leaves of the light where its falloff ends, mostly the corners.
+        "spread": (3,) standard deviation of the log gains by channel; "predicted": error of the prediction from the
+        pose; "ignored": error of a gain of 1; "edge": the share of light that the lens passes where its falloff ends,
+        mostly in the corners.
     """
     (mine, falloff), (all_together, _) = gains_of(train), gains_of([*train, *test])
-    # Both have the mean 0 of their own photos.
+    # The log gains of each set have mean 0.
     own = all_together[len(train) :] - (all_together[: len(train)] - mine).mean(0)
     exposures = Exposures.of(mine, [view.camera for view in train])
     predicted = torch.stack([exposures.gains(view.camera).double().log() for view in test])

@@ -1,10 +1,10 @@
-"""What a finished model has beside what was trained: far looks, smooth SH, and exposures of other cameras.
+"""Quality of each stage that turns trained surfels into a finished model: detail limits, SH smoothing, auto exposure.
 
     python -m benchmarks.finished_model runs/fox/model.safetensors fox
 
-renders the test views of a trained model at the photos' size, a half, a quarter and an eighth of it, and compares with
-the photos reduced by area: as its file was before each of the three was there, and as it is finished now, whatever its
-file has; but SH that are smooth already, with whatever strength, stay. On a CPU or CUDA; nothing is trained.
+renders the test views of a trained model at the photos' size, a half, a quarter and an eighth of it, and compares them
+with the photos reduced by area. The stages are applied one after the other, whatever the model's file holds; only SH
+that are smooth already stay as they are. Runs on a CPU or CUDA; nothing is trained.
 """
 
 import statistics
@@ -18,89 +18,104 @@ import tyro
 
 import nexwarp as nw
 from benchmarks.exposures import gains_of
-from benchmarks.quality import arc, smaller
+from benchmarks.quality.metrics import RenderImage, smaller
+from benchmarks.quality.scenes import held_out_arc
 from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, load_scene
 from nexwarp.data.images import downscale_image
-from nexwarp.finish.auto_exposure import metered
-from nexwarp.finish.detail_limits import seen_footprints
+from nexwarp.finish.auto_exposure import with_auto_exposure
+from nexwarp.finish.detail_limits import measure_detail_limits
 from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.pictures import save_png, side_by_side, to_uint8
+from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.metrics import flip, psnr, ssim
 from nexwarp.train.config import Config
 
 FACTORS = (1, 2, 4, 8)
 
+Figures = list[tuple[float, float, float | None]]
+
 
 @torch.no_grad()
-def compare(model: nw.Model, scene: Scene) -> dict[str, list[tuple[float, float, float | None]]]:
-    """Finish a model anew, and judge its test views.
+def compare(model: nw.Model, scene: Scene) -> dict[str, Figures]:
+    """Finish a model anew, stage by stage, and judge its test views after each stage.
 
     Args:
         model: changed: it is left finished.
         scene: with the training photos of the model; test views are compared without their masks.
 
     Returns:
-        By form of the model, for each of `FACTORS`, the means of PSNR [dB], SSIM and FLIP (None without its package):
-        "before", "far looks", "smooth SH" (but where the file has them), "finished" (with metered exposures, too),
-        and "finished, full size reduced".
+        After each stage, for each of `FACTORS`, the means of PSNR [dB], SSIM and FLIP (None without its package):
+        "nearest limits": detail limits for close views alone, and exposures predicted from poses; "detail limits": for
+        distant views too; "smooth SH": left out where the file has them; "auto exposure": the finished model; and
+        "auto exposure, full size reduced": its renderings at full size, reduced by area.
     """
-    surfels, options = model.surfels, model.render_options
     cameras = [view.camera for view in scene.train]
-    if surfels.exposures is not None:
+    if model.exposures is not None:
         gains, falloff = gains_of(scene.train)
-        surfels.exposures = Exposures.of(gains, cameras, falloff).to(surfels.device)
-    surfels.footprints = surfels.far_footprints = None
-    closest, farthest = seen_footprints(surfels, cameras, options=options)
-    smooth = (
-        None if model.meta.get("smooth_sh") else smooth_sh(surfels, scene.train, Config().smooth_sh, options=options)
-    )
+        model.exposures = Exposures.of(gains, cameras, falloff).to(model.device)
+    limits = measure_detail_limits(model, cameras)
+    smooth = None if model.meta.get("smooth_sh") else smooth_sh(model, scene.train, Config().smooth_sh)
 
     def image(camera: Camera) -> torch.Tensor:
-        return nw.render(surfels, model.texture, camera.to(surfels.device), **options).image.cpu()
+        return model.render(camera).image.cpu()
 
-    def looked() -> list[tuple[float, float, float | None]]:
+    def judge_smaller() -> Figures:
         return judge(scene, lambda camera, factor: image(smaller(camera, factor)))
 
-    surfels.footprints = closest
-    found = {"before": looked()}
-    surfels.far_footprints = farthest
-    found["far looks"] = looked()
+    model.detail_limits = DetailLimits(limits.nearest, torch.full_like(limits.farthest, NEVER))
+    found = {"nearest limits": judge_smaller()}
+    model.detail_limits = limits
+    found["detail limits"] = judge_smaller()
     if smooth is not None:
-        surfels.sh0.data, surfels.shN.data = smooth
-        found["smooth SH"] = looked()
-    if surfels.exposures is not None:
-        exposures = metered(surfels.exposures, surfels, model.texture, cameras, options=options)
-        surfels.exposures = exposures.to(surfels.device)
-    found["finished"] = looked()
-    found["finished, full size reduced"] = judge(
-        scene,
-        lambda camera, factor: torch.nn.functional.avg_pool2d(image(camera).permute(2, 0, 1), factor).permute(1, 2, 0),
-    )
+        model.surfels.sh0.data, model.surfels.shN.data = smooth
+        found["smooth SH"] = judge_smaller()
+    if model.exposures is not None:
+        model.exposures = with_auto_exposure(model.exposures, model, cameras).to(model.device)
+    found["auto exposure"] = judge_smaller()
+    found["auto exposure, full size reduced"] = judge(scene, reduced(image))
     return found
 
 
-def judge(scene: Scene, image: Callable[[Camera, int], torch.Tensor]) -> list[tuple[float, float, float | None]]:
-    """Means over test views, for each of `FACTORS`."""
-    found = []
+def reduced(image: RenderImage) -> Callable[[Camera, int], torch.Tensor]:
+    """Return a function that renders at full size and reduces the rendering by area."""
+
+    def render(camera: Camera, factor: int) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(image(camera).permute(2, 0, 1), factor).permute(1, 2, 0)
+
+    return render
+
+
+def judge(scene: Scene, image: Callable[[Camera, int], torch.Tensor]) -> Figures:
+    """Return the means over the test views, for each of `FACTORS`.
+
+    Args:
+        scene: its test views count.
+        image: renders a camera (H, W, 3), reduced by a factor.
+    """
+    found: Figures = []
     for factor in FACTORS:
         pairs = [
             (to_uint8(image(view.camera, factor)), downscale_image(to_uint8(view.image), factor)) for view in scene.test
         ]
-        each = [[metric(*pair) for pair in pairs] for metric in (psnr, ssim, flip)]
-        found.append(tuple(None if None in figures else statistics.fmean(figures) for figures in each))
+        flips = [figure for pair in pairs if (figure := flip(*pair)) is not None]
+        found.append(
+            (
+                statistics.fmean(psnr(*pair) for pair in pairs),
+                statistics.fmean(ssim(*pair) for pair in pairs),
+                statistics.fmean(flips) if flips else None,
+            )
+        )
     return found
 
 
 @torch.no_grad()
-def picture(model: nw.Model, scene: Scene, folder: Path) -> None:
-    """Save each test view, photo and render side by side, in a folder."""
+def save_pictures(model: nw.Model, scene: Scene, folder: Path) -> None:
+    """Save each test view, photo and rendering side by side, in a folder."""
     for view in scene.test:
-        camera = view.camera.to(model.surfels.device)
-        image = nw.render(model.surfels, model.texture, camera, **model.render_options).image
-        both = [to_uint8(view.image), to_uint8(image).cpu()]
+        both = [to_uint8(view.image), to_uint8(model.render(view.camera).image).cpu()]
         save_png(folder / f"{Path(view.name).stem}.png", side_by_side(both, captions=["photo", "render"]))
 
 
@@ -118,17 +133,16 @@ def main(
         model: file of a trained model, or its run folder.
         scene: folder of its scene, or the name of one of those in --data.
         downscale: of the photos it was trained on.
-        held_out: test views: every 8th, or the arc of `benchmarks.quality`.
+        held_out: test views: every 8th view, or the held-out arc of `benchmarks.quality`.
         data: folder of scenes.
-        pictures: folder for photo and render of each test view, as finished.
+        pictures: folder for photo and rendering of each test view, by the finished model.
     """
     photos = load_scene(scene if Path(scene).exists() else data / scene, downscale=downscale)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    views = arc(photos) if held_out == "arc" else photos
-    finished = nw.load(model).to(device)
+    views = held_out_arc(photos) if held_out == "arc" else photos
+    finished = nw.load(model).to("cuda" if torch.cuda.is_available() else "cpu")
     found = compare(finished, views)
     if pictures is not None:
-        picture(finished, views, pictures)
+        save_pictures(finished, views, pictures)
     print("| PSNR [dB], SSIM, FLIP | " + " | ".join(f"1/{factor}" for factor in FACTORS) + " |")
     print("|---" * (len(FACTORS) + 1) + "|")
     for name, figures in found.items():

@@ -1,13 +1,13 @@
-"""Hostile input to every reader: `python -m benchmarks.fuzz --seconds 60`.
+"""Fuzzing of every reader with damaged files: `python -m benchmarks.fuzz --seconds 60`.
 
-An input is a small valid one, damaged: bytes flipped, cut, spliced, extreme numbers put where numbers lie, JSON with
-values of other types, keys twice, deep nesting. It passes when its reader loads it or refuses it with a documented
-exception of one line; it fails when the process dies, takes longer than 5 s, needs more than 1 GB beyond what it had,
-or raises anything else. Inputs run in forked processes, many to a process; one that fails is saved. The same seed gives
-the same inputs.
+An input is a small valid file with damage: bytes flipped, cut or spliced, numbers replaced by extreme ones, JSON with
+values of other types, repeated keys, deep nesting. An input passes when its reader loads it or refuses it with a
+documented exception of one line. It fails when the process dies, takes longer than 5 s, needs more than 1 GB of
+additional memory, or raises another exception. Inputs run in forked processes, many per process; failing inputs are
+saved. The same seed gives the same inputs.
 
-`--driver hypothesis` draws JSON and numbers from Hypothesis' strategies, `--driver atheris` lets atheris look for new
-paths in nexwarp's code (one target, in a process of its own; `pip install atheris`).
+`--driver hypothesis` draws JSON and numbers from Hypothesis' strategies. `--driver atheris` searches for new paths in
+nexwarp's code (one target, in a process of its own; `pip install atheris`).
 """
 
 import argparse
@@ -31,10 +31,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from benchmarks.fuzz_inputs import Files, damage, strategy
-from benchmarks.fuzz_targets import TARGETS, Target
+from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
 HANG = 5.0  # seconds an input
-MEMORY = 10**9  # bytes beyond what the process has before its first input
+MEMORY = 10**9  # bytes that the process may have beyond those before its first input
 BATCH = 2000  # inputs a process
 DOCUMENTED = (ValueError, TypeError, FileNotFoundError)
 M_ARENA_MAX = -8  # of glibc's mallopt: an arena a thread would count as 64 MB of address space
@@ -43,7 +43,7 @@ NO_MEMORY = ("can't allocate", "bad_alloc", "not enough memory", "Unable to allo
 
 @dataclass(frozen=True)
 class Failure:
-    """An input that a reader did not stand: where it is saved, and what happened."""
+    """An input on which a reader failed: where it is saved, and how the reader failed."""
 
     target: str
     index: int
@@ -54,13 +54,13 @@ class Failure:
 
 @dataclass
 class Result:
-    """What a target's inputs came to.
+    """Outcomes of a target's inputs.
 
     Attributes:
         inputs: how many ran.
         loaded: how many of them loaded; the others were refused.
-        seconds: that they took.
-        refusals: how often which documented exception came.
+        seconds: for all inputs.
+        refusals: count of each documented exception.
         failures: one for each input that failed.
     """
 
@@ -96,7 +96,7 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
     return "loaded"
 
 
-def fuzz(target: Target, *, seconds: float, inputs: int, seed: int, driver: str, failed: Path) -> Result:
+def fuzz(target: FuzzTarget, *, seconds: float, inputs: int, seed: int, driver: str, failed: Path) -> Result:
     """Run a target until time or inputs are used up.
 
     Args:
@@ -121,7 +121,7 @@ def fuzz(target: Target, *, seconds: float, inputs: int, seed: int, driver: str,
 
 
 def _batch(
-    target: Target,
+    target: FuzzTarget,
     valid: list[Files],
     folder: Path,
     result: Result,
@@ -132,7 +132,7 @@ def _batch(
     driver: str,
     failed: Path,
 ) -> int:
-    """Run inputs in one forked process, and return the index to go on with."""
+    """Run inputs in one forked process, and return the index to continue with."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
     now = context.RawArray("d", [float(first), time.monotonic()])
@@ -167,7 +167,7 @@ def _batch(
     return index + 1
 
 
-def _collect(message: tuple, target: Target, result: Result, folder: Path, failed: Path) -> None:
+def _collect(message: tuple, target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
     if message[0] == "failure":
         _, kind, index, detail, kept = message
         result.failures.append(_saved(Failure(target.name, index, kind, detail), Path(kept), failed))
@@ -192,7 +192,7 @@ def _saved(failure: Failure, folder: Path, failed: Path) -> Failure:
 
 
 def _work(
-    target: Target,
+    target: FuzzTarget,
     valid: list[Files],
     folder: Path,
     report: Connection,
@@ -203,7 +203,7 @@ def _work(
     seed: int,
     driver: str,
 ) -> None:
-    """Body of the forked process; what it reports counts only inputs that ended."""
+    """Body of the forked process; its reports count only inputs that ended."""
     os.environ["NEXWARP_CACHE"] = str(folder.parent / "cache")
     sys.stdout = sys.stderr = open(os.devnull, "w")
     null = os.open(os.devnull, os.O_WRONLY)
@@ -259,7 +259,7 @@ def _limit_memory() -> None:
 
     import torch
 
-    # The threads of torch that were there before the fork are not; without this it may ask for them.
+    # Torch's threads do not survive the fork; without this it may wait for them.
     torch.set_num_threads(1)
     if not sys.platform.startswith("linux"):
         return
@@ -270,7 +270,7 @@ def _limit_memory() -> None:
 
 
 def _draw(
-    target: Target, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], None]
+    target: FuzzTarget, valid: list[Files], first: int, last: int, seed: int, run: Callable[[int, Files], None]
 ) -> None:
     """Run inputs that Hypothesis draws."""
     import hypothesis
@@ -295,8 +295,8 @@ def _draw(
     one()
 
 
-def drive_atheris(target: Target, seconds: float, failed: Path) -> None:
-    """Let atheris choose the bytes of a target's first file, watching nexwarp's code; ends the process."""
+def drive_atheris(target: FuzzTarget, seconds: float, failed: Path) -> None:
+    """Let atheris choose the bytes of a target's first file, guided by nexwarp's code; ends the process."""
     try:
         import atheris
     except ImportError:

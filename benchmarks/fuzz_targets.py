@@ -1,4 +1,4 @@
-"""The readers of files that others made, each with small valid files to damage."""
+"""The readers of nexwarp's input files, each with small valid files to damage."""
 
 import dataclasses
 import json
@@ -22,7 +22,9 @@ from nexwarp.data.ply import read_ply, write_ply
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
+from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.run.folder import SceneSource, create_run, read_run
@@ -32,14 +34,14 @@ WIDTH, HEIGHT, VIEWS = 12, 9, 3
 
 
 @dataclass(frozen=True)
-class Target:
+class FuzzTarget:
     """A reader.
 
     Attributes:
         name: of the reader.
         make: writes valid inputs below a folder and returns them.
         read: loads the input in a folder.
-        fuzzed: ends of names of the files that are damaged; the others stay.
+        fuzzed: suffixes of the files to damage; other files stay as they are.
     """
 
     name: str
@@ -207,11 +209,12 @@ def _blender(folder: Path) -> list[Files]:
 
 def _model(folder: Path) -> list[Files]:
     texture = NeuralTexture(levels=2, table_size=16, width=8, hidden_layers=1, sh_degree=1)
-    meta = {"max_hits": 2, "background": (0.1, 0.2, 0.3), "sh_degree": 1, "low_pass": False, "clamp_texture": False}
-    surfels = _surfels()
-    save_model(folder / "a", Model(surfels, texture, {**meta, "near": 0.01, "scene_scale": 1.5, "preset": "default"}))
-    surfels.footprints, surfels.far_footprints = torch.ones(5), torch.full((5,), 2.0)
-    save_model(folder / "b", Model(surfels, texture, meta))
+    options = RenderOptions(background=(0.1, 0.2, 0.3), sh_degree=1)
+    surfels, limits = _surfels(), DetailLimits(torch.ones(5), torch.full((5,), 2.0))
+    meta = {"near": 0.01, "scene_scale": 1.5, "preset": "default"}
+    save_model(folder / "a", Model(surfels, texture, options=options, meta=meta))
+    save_model(folder / "b", Model(surfels, texture, detail_limits=limits, options=options))
+    load(folder / "a")  # the first load imports modules for seconds, which no input must pay for
     return [_files(folder / "a"), _files(folder / "b")]
 
 
@@ -259,7 +262,7 @@ def _images(folder: Path) -> list[Files]:
 
 
 def _read_images(folder: Path) -> None:
-    """As a mask and as a photo; what refuses a file does so for each."""
+    """Read a file as a mask and as a photo; raise the first reader's error."""
     outcomes = []
     for read in (read_mask, read_image, read_transparent):
         try:
@@ -287,20 +290,20 @@ def _masked_scene(folder: Path) -> object:
 TARGETS = {
     target.name: target
     for target in (
-        Target("colmap_binary", _colmap(False), load_scene, (".bin",)),
-        Target("colmap_text", _colmap(True), load_scene, (".txt",)),
-        Target("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
-        Target("blender", _blender, _masked_scene, (".json",)),
-        Target("model", _model, load, (".safetensors",)),
-        Target("config", _config, read_run, (".json",)),
-        Target("cameras", _run_cameras, lambda folder: load_cameras(folder / "cameras.json"), (".json",)),
-        Target("camera_path", _camera_path, lambda folder: load_camera_path(folder / "path.json"), (".json",)),
-        Target("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
-        Target("surfels_ply", _surfels_ply, lambda folder: load_surfels_ply(folder / "surfels.ply"), (".ply",)),
-        Target("masks", _images, _read_images, ("mask",)),
-        Target("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
+        FuzzTarget("colmap_binary", _colmap(False), load_scene, (".bin",)),
+        FuzzTarget("colmap_text", _colmap(True), load_scene, (".txt",)),
+        FuzzTarget("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
+        FuzzTarget("blender", _blender, _masked_scene, (".json",)),
+        FuzzTarget("model", _model, load, (".safetensors",)),
+        FuzzTarget("config", _config, read_run, (".json",)),
+        FuzzTarget("cameras", _run_cameras, lambda folder: load_cameras(folder / "cameras.json"), (".json",)),
+        FuzzTarget("camera_path", _camera_path, lambda folder: load_camera_path(folder / "path.json"), (".json",)),
+        FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
+        FuzzTarget("surfels_ply", _surfels_ply, lambda folder: load_surfels_ply(folder / "surfels.ply"), (".ply",)),
+        FuzzTarget("masks", _images, _read_images, ("mask",)),
+        FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }
-# One thread: a forked process has none of its parent's.
+# One thread: a forked process does not inherit its parent's threads.
 torch.set_num_threads(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")

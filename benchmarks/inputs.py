@@ -1,8 +1,8 @@
-"""The demo scene as others would hand it over, and what training makes of each form.
+"""Quality of trainings on the demo scene in each input format.
 
 `python -m benchmarks.inputs FOLDER` writes the demo as a COLMAP model, binary and text, as nerfstudio's and Blender's
-JSON, and photographed through distorted lenses, trains each of them and tells the PSNR on held-out views: of the
-scene's own photos, and of the pinhole demo's cameras and photos, which are the same for all.
+JSON, and photographed through distorted lenses. It trains each form and prints the PSNR on held-out views: of the
+form's own photos, and of the pinhole demo's cameras and photos, which are the same for all forms.
 """
 
 import json
@@ -84,7 +84,7 @@ def write_text(demo: Path, folder: Path) -> Path:
 
 
 def cloud_of(demo: Path) -> Cloud:
-    """All that COLMAP knows of the demo's points."""
+    """Return the demo's points with COLMAP's tracks and errors."""
     points = [point for _, point in sorted(reconstruction_of(demo).points3D.items())]
     pairs = {(element.image_id, index) for index, point in enumerate(points) for element in point.track.elements}
     return Cloud(
@@ -115,7 +115,7 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray, form: str =
 def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED, tracks: bool = True) -> Path:
     """Write a COLMAP scene of one camera as nerfstudio does, its world moved by `applied` (3, 4).
 
-    With `tracks` the points also say what COLMAP knows of them; nerfstudio's own do not.
+    With `tracks` the points have COLMAP's tracks and errors, which nerfstudio's own exports lack.
     """
     model = reconstruction_of(demo)
     camera = model.camera(1)
@@ -150,8 +150,8 @@ def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED, tr
 def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool = True) -> Path:
     """Write a COLMAP scene of one camera as Blender's NeRF exports are, every eighth photo in the test file.
 
-    The format has one angle for square pixels and a centred image; what `centred` leaves out goes into fl_x and so on.
-    With `points` there is a points3d.ply with what COLMAP knows of them.
+    The format has one angle, for square pixels and a centred image; without `centred` the intrinsics go into fl_x,
+    fl_y, cx and cy. With `points` there is a points3d.ply with COLMAP's tracks and errors.
     """
     model = reconstruction_of(demo)
     camera = model.camera(1)
@@ -183,7 +183,7 @@ def main(
     """Train forms of the demo with the settings of `nexwarp train demo` and print a line each.
 
     Args:
-        base: folder for the scenes; those that are there are taken as they are.
+        base: folder for the scenes; existing ones are used as they are.
         names: which forms; by default all.
     """
     from nexwarp.run.evaluate import evaluate
@@ -217,10 +217,7 @@ def main(
         trainer = Trainer(scene, config, "cpu")
         trainer.run()
         model = trainer.finish()
-        own, same = (
-            evaluate(model.surfels, model.texture, views, options=model.render_options)["psnr"]
-            for views in (scene.test, reference.test)
-        )
+        own, same = (evaluate(model, views)["psnr"] for views in (scene.test, reference.test))
         size = scene.train[0].camera
         print(
             f"{name:14}  {size.width}x{size.height}  own test photos {own:.2f} dB, "

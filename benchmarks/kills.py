@@ -1,9 +1,9 @@
-"""SIGKILL at random moments of a training, each resumed: is the model that of the run that nobody disturbed?
+"""Kills trainings at random moments, resumes them, and compares the models with that of an undisturbed training.
 
     python -m benchmarks.kills --count 20
 
-trains the demo on the CPU, shortened, and lists each kill: after how many seconds, what it left, and whether the
-resumed run ended with the same bytes. The exit code is 1 unless all did. A GPU repeats itself only when told to:
+trains a short demo on the CPU and lists each kill: its time, the checkpoints that it left, and whether the resumed run
+ended with the same bytes. The exit code is 1 unless all did. A GPU repeats its results only with --deterministic:
 
     python -m benchmarks.kills --device cuda --deterministic --count 5 --iterations 600 --checkpoint-every 20
 """
@@ -35,9 +35,9 @@ class Kill:
 
     Attributes:
         seconds: after the run folder got its config.
-        left: iterations of the whole checkpoints that it left, the newest first.
-        writing: whether a checkpoint was being written.
-        same: whether the resumed run's model is the expected one, byte for byte.
+        left: iterations of the complete checkpoints that it left, the newest first.
+        writing: whether it interrupted the writing of a checkpoint.
+        same: whether the resumed run's model has the expected bytes.
     """
 
     seconds: float
@@ -133,7 +133,7 @@ class Kills:
             return subprocess.run([*train, "--run", str(run), "--resume"], stdout=subprocess.DEVNULL).returncode
 
         with tempfile.TemporaryDirectory() as folder:
-            # The first one may compile kernels, so that the second one tells how long a run takes.
+            # The first run may compile kernels; the second one is timed.
             first, _ = undisturbed(start, Path(folder) / "first")
             expected, length = undisturbed(start, Path(folder) / "whole")
             if first != expected:

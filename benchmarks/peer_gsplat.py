@@ -1,8 +1,8 @@
 """gsplat's 3DGS with its MCMC strategy, trained as its own example trainer does, on our scenes and views.
 
 gsplat is optional: `pip install gsplat==1.5.3`, with a CUDA compiler to build it. Its library does the rendering and
-the density control; what stands here is the loop around them, with the settings of its example (`simple_trainer.py
-mcmc`): scene centred on the cameras and scaled to their median distance, points as initial means, opacity 0.5, scale a
+the density control; this module is the loop around them, with the settings of its example (`simple_trainer.py mcmc`):
+scene centred on the cameras and scaled to their median distance, points as initial means, opacity 0.5, scale a
 tenth of the distance to 3 neighbours, L1 + 0.2 D-SSIM, opacity and scale regularised by 0.01. D-SSIM is ours, with
 "same" padding in place of "valid".
 """
@@ -44,7 +44,7 @@ class Gaussians:
         return len(self.splats["means"]) * FLOATS * 4 / 1e6
 
     def render(self, camera: Camera, degree: int = SH_DEGREE) -> tuple[torch.Tensor, dict]:
-        """Image (H, W, 3), not clamped, over black, and what the strategy wants to know."""
+        """Return an image (H, W, 3), not clamped, over black, and gsplat's intermediate results for its strategy."""
         from gsplat.rendering import rasterization
 
         s = self.splats

@@ -1,10 +1,10 @@
-"""One training several times, each a process of its own: the same bytes, or how far apart?
+"""Repeats one training, each time in a process of its own, and compares the models byte by byte.
 
     python -m benchmarks.repeat --scene fox --device cuda --iterations 2000 --deterministic --runs 2
     python -m benchmarks.repeat --scene fox --device cuda --iterations 2000 --runs 5
 
 prints Markdown: SHA-256 of each model, PSNR on the test views and speed, then mean and spread over the runs. With
---deterministic, and on a CPU, the exit code is 1 unless all models are the same, byte for byte.
+--deterministic, and on a CPU, the exit code is 1 unless all models have the same bytes.
 """
 
 import hashlib
@@ -41,14 +41,14 @@ class Run:
 
 
 def read(folder: Path) -> Run:
-    """Read what a training left in its run folder."""
+    """Read the result of a training from its run folder."""
     metrics = json.loads((folder / METRICS_FILE).read_bytes())
     digest = hashlib.sha256((folder / MODEL_FILE).read_bytes()).hexdigest()
     return Run(digest, metrics.get("psnr"), metrics["iterations_per_second"])
 
 
 def table(runs: Sequence[Run], title: str) -> str:
-    """Markdown of the runs, and what they have in common."""
+    """Return Markdown of the runs, with mean and spread."""
     lines = [f"{title}:", "", "| run | SHA-256 of the model | test PSNR | it/s |", "|---|---|---|---|"]
     for number, run in enumerate(runs, 1):
         psnr = "" if run.psnr is None else f"{run.psnr:.4f} dB"
@@ -117,7 +117,7 @@ class Repeat:
                     print(f"training {number} ended with exit code {done.returncode}", file=sys.stderr)
                     return 2
                 runs.append(read(run))
-                # Each as it comes: hours of training are not to be lost with the table.
+                # Printed at once, so that an interruption does not lose the finished trainings.
                 print(f"{number}: {runs[-1].digest}, {runs[-1].psnr} dB, {runs[-1].rate:.1f} it/s", file=sys.stderr)
         print(table(runs, f"`nexwarp {' '.join(command[3:])}`"))
         repeats = self.deterministic or self.device == "cpu"

@@ -1,12 +1,12 @@
-"""Small training steps and a frame, for compute-sanitizer to look at every access of every kernel.
+"""Small training steps and a frame under compute-sanitizer, which checks every access of every kernel.
 
     python -m benchmarks.sanitize --tool memcheck,racecheck
 
-runs itself under each tool, prints a line for each, and exits with 1 when one found an error (2: there is no
-compute-sanitizer). `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by hand.
+runs itself under each tool, prints a line for each, and exits with 1 when a tool found an error, with 2 when there is
+no compute-sanitizer. `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by hand.
 
-torch and Warp keep freed memory to hand it out again, which hides an access beyond the end of an array. Here each array
-is an allocation of its own.
+The allocators of torch and Warp reuse freed memory, which hides an access beyond the end of an array. This benchmark
+makes each array an allocation of its own.
 """
 
 import dataclasses
@@ -24,7 +24,6 @@ import torch
 import tyro
 import warp as wp
 
-import nexwarp as nw
 from nexwarp.run import warmup
 from nexwarp.train.presets import preset
 from nexwarp.train.trainer import Trainer
@@ -35,7 +34,7 @@ ITERATIONS = (10_001, 10_100)
 SURFELS = 200
 PACKAGED = ("nvidia/cu13/compute-sanitizer", "nvidia/cuda_sanitizer_api/bin")  # nvidia-cuda-sanitizer-api, by version
 PLACES = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
-# Racecheck looks at shared memory. Of others' kernels it would have much to say, and take long.
+# Racecheck checks shared memory; restricted to our kernels, since others are slow to check and give false reports.
 OURS = ("--kernel-name", "kernel_substring=_cuda_kernel_")
 SUMMARIES = (
     re.compile(r"^=+ RACECHECK SUMMARY: (?P<hazards>\d+) hazards? displayed \((?P<errors>\d+) errors?, .*\)", re.M),
@@ -46,11 +45,11 @@ SHOWN = 30  # lines of a report that found errors
 
 @dataclass(frozen=True)
 class Report:
-    """What a tool found.
+    """The result of a tool.
 
     Attributes:
-        errors: None when it did not come to its summary.
-        told: the summary, or what stands in its place.
+        errors: how many; None when the tool printed no summary.
+        told: the summary, or the last line in its place.
     """
 
     errors: int | None
@@ -62,14 +61,14 @@ def parse(output: str) -> Report:
     for summary in SUMMARIES:
         found = list(summary.finditer(output))
         if found:
-            # One a process: Python may start others.
+            # One summary per process: Python may start several.
             return Report(sum(int(match["errors"]) for match in found), found[-1][0].strip("= "))
     said = [line.strip("= ") for line in output.splitlines() if line.startswith("=") and line.strip("= ")]
     return Report(None, said[-1] if said else "no output of compute-sanitizer")
 
 
 def find_tool() -> str | None:
-    """Return where compute-sanitizer is: where pip put it, on the PATH, or where CUDA toolkits put it."""
+    """Return the path of compute-sanitizer: installed by pip, on the PATH, or in a CUDA toolkit; None without one."""
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     packages = [str(Path(folder) / place) for folder in sys.path for place in PACKAGED]
     places = [os.environ.get("PATH", ""), *([f"{home}/bin", f"{home}/compute-sanitizer"] if home else [])]
@@ -94,9 +93,10 @@ def work(device: torch.device) -> dict[str, int]:
             trainer.step()
             done["steps"] += 1
         trainer.check()
+    model = trainer.model()
     with torch.no_grad():
         for camera in (scene.test[0].camera.to(device), scene.test[0].camera.to(device).crop(-5, 7, 33, 50)):
-            out = nw.render(trainer.surfels, trainer.texture, camera, **trainer.render_options())
+            out = model.render(camera)
             out.splat_error(out.alpha)
             if not bool(torch.isfinite(out.image).all()):
                 raise RuntimeError("the frame is not finite")
@@ -115,7 +115,7 @@ def isolate_arrays(device: torch.device) -> None:
 
 
 def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str] = ()) -> bool:
-    """Run a command under a tool, print what it found, and return whether that is nothing."""
+    """Run a command under a tool, print its result, and return whether it found no error."""
     options = [*(OURS if tool == "racecheck" else ()), *extra]
     environment = os.environ | {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
     run = subprocess.run(
@@ -171,12 +171,11 @@ class Sanitize:
             print("compute-sanitizer: expected on the PATH or in a CUDA toolkit, found none", file=sys.stderr)
             return 2
         command = [sys.executable, "-m", "benchmarks.sanitize", "--device", self.device]
-        # Once without: what does not run at all, need not be looked at; and all kernels are compiled then.
+        # Once without a tool, to compile all kernels and to see that the work runs at all.
         alone = subprocess.run(command)
         if alone.returncode != 0:
             print(f"without a tool it ended with exit code {alone.returncode}", file=sys.stderr)
             return 1
-        # Every one of them, whatever the others found.
         clean = [check(tool, sanitizer, command, self.extra.split()) for tool in tools]
         return 0 if all(clean) else 1
 

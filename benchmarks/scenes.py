@@ -1,6 +1,6 @@
 """Seeded scenes that all benchmarks share. Made on the CPU, so that they are the same on every device."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,43 +23,43 @@ GROUND_RADIUS, BALL_RADIUS, DOME_RADIUS = 3.0, 0.5, 4.0
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Surfels and where they are seen from.
+class SurfelScene:
+    """A model and the cameras that see it.
 
     Attributes:
-        name: tells the sizes too.
-        surfels: SH of degree 3, and gamma = 1 (but for 1e-6) unless they were trained.
-        cameras: the first one is timed, training takes turns.
+        name: of the scene, with its sizes.
+        model: its surfels have SH of degree 3, and gamma = 1 (but for 1e-6) unless they were trained; only a trained
+            one has a texture, exposures, detail limits and options of its own.
+        cameras: benchmarks of frames time the first one; training draws from all.
         photos: (H, W, 3) uint8 of these cameras, where there are any.
-        note: where the scene is not what was asked for.
-        texture: the trained one, where there is one.
-        options: keyword arguments of `nexwarp.render` that the scene was trained with.
+        note: how the scene differs from the one that was asked for.
     """
 
     name: str
-    surfels: nw.Surfels
+    model: nw.Model
     cameras: tuple[nw.Camera, ...]
     photos: tuple[torch.Tensor, ...] = ()
     note: str = ""
-    texture: nw.NeuralTexture | None = None
-    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def surfels(self) -> nw.Surfels:
+        """The model's surfels."""
+        return self.model.surfels
 
     @property
     def camera(self) -> nw.Camera:
-        """The camera that is timed."""
+        """The camera of the timed frame."""
         return self.cameras[0]
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What every measurement on this scene says of it."""
+        """Facts of the scene that every measurement on it records."""
         sizes = {"surfels": len(self.surfels), "width": self.camera.width, "height": self.camera.height}
         return {"scene": self.name, "sizes": sizes, "note": self.note}
 
-    def to(self, device: torch.device | str) -> "Scene":
-        """Return this scene on a device; the photos stay. Moves surfels and texture in place, as modules do."""
-        texture = None if self.texture is None else self.texture.to(device)
-        cameras = tuple(c.to(device) for c in self.cameras)
-        return replace(self, surfels=self.surfels.to(device), texture=texture, cameras=cameras)
+    def to(self, device: torch.device | str) -> "SurfelScene":
+        """Return this scene on a device; the photos stay on the CPU. Moves the model in place, as modules do."""
+        return replace(self, model=self.model.to(device), cameras=tuple(c.to(device) for c in self.cameras))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Geometry:
 
     @property
     def leaves(self) -> tuple[torch.Tensor, ...]:
-        """All that takes a gradient."""
+        """The tensors that need gradients."""
         return (*self.shape, self.colors)
 
     def project(self) -> ops.Projection:
@@ -92,13 +92,13 @@ class Geometry:
         return ops.intersect_tiles(*self.shape, projection, self.viewmat, self.pinhole)
 
     def hits(self, max_hits: int = 2) -> ops.Hits:
-        """The whole collection stage: project, tiles, collect."""
+        """Run the whole collection stage: project, tiles, collect."""
         projection = self.project()
         return ops.collect(projection, self.tiles(projection), self.pinhole, max_hits=max_hits)
 
 
 @torch.no_grad()
-def geometry(scene: Scene) -> Geometry:
+def geometry(scene: SurfelScene) -> Geometry:
     """Activate a scene's surfels, and their colours as its camera sees them."""
     s, c = scene.surfels, scene.camera
     shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
@@ -108,25 +108,30 @@ def geometry(scene: Scene) -> Geometry:
 
 
 def entries(tiles: ops.Tiles) -> int:
-    """How many (tile, surfel) entries there are; waits for a GPU."""
+    """Return the number of (tile, surfel) entries; waits for a GPU."""
     return int(tiles.ends[-1]) if len(tiles.ends) else 0
 
 
 def outputs(hits: ops.Hits) -> tuple[torch.Tensor, ...]:
-    """The differentiable buffers."""
+    """Return the differentiable buffers of hits."""
     return hits.plain, hits.depths, hits.weights, hits.alpha
 
 
 def random_like(tensors: tuple[torch.Tensor, ...], seed: int = 1) -> list[torch.Tensor]:
-    """Seeded normal values, to stand for gradients."""
+    """Return seeded normal values, used as incoming gradients."""
     generator = torch.Generator().manual_seed(seed)
     return [torch.randn(x.shape, generator=generator, dtype=x.dtype).to(x.device) for x in tensors]
 
 
-def texture(scene: Scene, **shape: Any) -> nw.NeuralTexture:
-    """The scene's own field, or a random one: a table of 2^20 on large scenes, of 2^15 on those that a CPU takes."""
-    if scene.texture is not None:
-        return scene.texture
+def texture(scene: SurfelScene, **shape: Any) -> nw.NeuralTexture:
+    """Return the scene's own texture, or a random one.
+
+    Args:
+        scene: a random texture has a table of 2^20 on scenes of 40,000 surfels or more, else of 2^15.
+        shape: arguments of `NeuralTexture` for a random texture.
+    """
+    if scene.model.texture is not None:
+        return scene.model.texture
     large = len(scene.surfels) >= SAHAROV
     defaults = {"table_size": 2**20 if large else 2**15, "min_resolution": 16.0, "max_resolution": 1024.0}
     with torch.random.fork_rng(devices=[]):
@@ -137,8 +142,8 @@ def texture(scene: Scene, **shape: Any) -> nw.NeuralTexture:
     return made.to(scene.surfels.device)
 
 
-def workload(options: Options) -> list[Scene]:
-    """Scenes for a pass: the garden on CUDA, the trained fox, and one that any CPU can take, to compare devices by."""
+def workload(options: Options) -> list[SurfelScene]:
+    """Return the scenes for a stage: the garden on CUDA, a small cloud for any device, and the trained fox if named."""
     small = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
     scenes = [small]
     if options.cuda:
@@ -149,7 +154,7 @@ def workload(options: Options) -> list[Scene]:
     return [scene.to(options.device) for scene in scenes]
 
 
-def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = Options.data) -> Scene:
+def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = Options.data) -> SurfelScene:
     """Surfels of random orientations over Mip-NeRF 360 "garden"; a synthetic cloud where its points are absent."""
     file = data / "garden_points.npz"
     if not file.is_file():
@@ -163,10 +168,11 @@ def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = 
         K = torch.from_numpy(K).float()
         K[:2] *= width / GARDEN_WIDTH
         cameras.append(nw.Camera(torch.from_numpy(viewmat).float(), K, width, height))
-    return Scene(f"garden {_sizes(n, width, height)}", _cover(points, colors, n, GARDEN_SPREAD), tuple(cameras))
+    surfels = _cover(points, colors, n, GARDEN_SPREAD)
+    return SurfelScene(f"garden {_sizes(n, width, height)}", nw.Model(surfels, None), tuple(cameras))
 
 
-def saharov(n: int = SAHAROV, data: Path = Options.data) -> Scene:
+def saharov(n: int = SAHAROV, data: Path = Options.data) -> SurfelScene:
     """Surfels over the sparse points of "saharov", with its photos; a synthetic cloud where it is absent."""
     folder = data / "saharov"
     if not folder.is_dir():
@@ -176,14 +182,14 @@ def saharov(n: int = SAHAROV, data: Path = Options.data) -> Scene:
     surfels = _cover(loaded.points, loaded.colors.float() / 255, n)
     cameras = tuple(view.camera for view in loaded.train)
     name = f"saharov {_sizes(n, cameras[0].width, cameras[0].height)}"
-    return Scene(name, surfels, cameras, tuple(view.image for view in loaded.train))
+    return SurfelScene(name, nw.Model(surfels, None), cameras, tuple(view.image for view in loaded.train))
 
 
-def fox(model: Path, data: Path = Options.data) -> Scene:
-    """Take surfels, texture and options from a run of `nexwarp train` on "fox", and the cameras of its views.
+def fox(model: Path, data: Path = Options.data) -> SurfelScene:
+    """Take the model of a run of `nexwarp train` on "fox", and the cameras of its training views.
 
     Unlike those of the other scenes, these surfels are as training leaves them: of all sizes, in layers, most of them
-    behind others.
+    hidden by others.
     """
     trained = nw.load(model)
     file = model / CAMERAS_FILE
@@ -192,10 +198,10 @@ def fox(model: Path, data: Path = Options.data) -> Scene:
     else:
         cameras = tuple(view.camera for view in nw.load_scene(data / "fox").train)
     name = f"fox, trained, {_sizes(len(trained.surfels), cameras[0].width, cameras[0].height)}"
-    return Scene(name, trained.surfels, cameras, texture=trained.texture, options=trained.render_options)
+    return SurfelScene(name, trained, cameras)
 
 
-def cloud(n: int, width: int, height: int) -> Scene:
+def cloud(n: int, width: int, height: int) -> SurfelScene:
     """Make a synthetic scene as large as the garden: a ball on a disc under a dome.
 
     The surfels' sizes follow n, so that they cover as much for any n.
@@ -217,7 +223,7 @@ def cloud(n: int, width: int, height: int) -> Scene:
     target, up = torch.tensor([0.0, 0.0, 0.3]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
     centers = [torch.tensor([1.5 * np.cos(a), 1.5 * np.sin(a), 0.8]) for a in np.linspace(0, 2 * np.pi, 8, False)]
     cameras = tuple(nw.Camera(look_at(c, target, up).float(), K, width, height) for c in centers)
-    return Scene(f"cloud {_sizes(n, width, height)}", surfels, cameras)
+    return SurfelScene(f"cloud {_sizes(n, width, height)}", nw.Model(surfels, None), cameras)
 
 
 def _sizes(n: int, width: int, height: int) -> str:

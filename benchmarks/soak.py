@@ -1,9 +1,9 @@
-"""Does memory stay as it is, however long it goes on? Frames of the demo, and small training steps on it.
+"""Searches for memory leaks: renders many frames of the demo and trains many small steps on it.
 
     python -m benchmarks.soak --device cuda --frames 5000 --steps 20000
 
-lists the memory of the GPU and of the host on the way, and compares its mean over the first thousand frames (and steps)
-after a warm-up with that over the last thousand. The exit code is 1 unless each pair is within 1 %.
+prints the memory of the GPU and of the host, and compares its mean over the first thousand frames (and steps) after a
+warm-up with that over the last thousand. The exit code is 1 unless each pair agrees within 1 %.
 """
 
 import dataclasses
@@ -30,21 +30,21 @@ from nexwarp.train.trainer import Trainer
 MIB = 2**20
 WARMUP, WINDOW = 500, 1000
 TOLERANCE = 0.01
-SLACK = MIB // 4  # what a page, a segment or a cache line more of something small may make
-SAMPLES = 500  # of a phase: a look at the memory of a GPU takes time
+SLACK = MIB // 4  # bytes that a change may always have: memory grows by pages and segments
+SAMPLES = 500  # of memory in a phase: each takes time on a GPU
 ROWS = 8  # of the table
-EVERYONES = "all processes"  # listed, but what others take is not for us to judge
+EVERYONES = "all processes"  # printed, but not judged: other processes change it
 SIZES = ((1.0, 0.75), (0.67, 0.5), (0.34, 0.73), (0.84, 0.26), (0.5, 0.5), (1.0, 0.18), (0.17, 0.17))  # of the width
-CYCLE = 84  # different cameras, so that the warm-up has seen all of them
-# Soaking wants many steps, not large ones.
+CYCLE = 84  # different cameras; the warm-up renders all of them
+# Many small steps.
 SMALL = Config(
     sh_every=1,
     texture=TextureConfig(levels=8, table_size=2**13, width=32),
-    # The budget is met within the warm-up. Pruning makes room for rounds until the end.
+    # The budget is reached within the warm-up. Pruning lets rounds add surfels until the end.
     densify=DensifyConfig(start=0, stop=60_000, every=30, fraction=1.0, prune_opacity=0.02),
 )
 
-Look = tuple[int, dict[str, int]]
+MemorySample = tuple[int, dict[str, int]]
 
 
 @dataclass(frozen=True)
@@ -63,42 +63,42 @@ class Verdict:
 
     @property
     def change(self) -> float:
-        """Relative change; 0 where there is none to speak of."""
+        """Relative change; 0 where both are 0."""
         return (self.last - self.first) / self.first if self.first else float(self.last > 0)
 
     @property
     def flat(self) -> bool:
-        """Whether first and last are the same, as near as memory comes in pieces."""
+        """Whether first and last agree within `TOLERANCE`, or within `SLACK`."""
         return abs(self.last - self.first) <= max(TOLERANCE * self.first, SLACK)
 
 
 def spans(count: int) -> tuple[range, range]:
-    """First and last thousand of `count` frames or steps (from 1), after a warm-up; fewer where there are few."""
+    """Return the first and last thousand of `count` frames or steps (from 1) after a warm-up; fewer of a few."""
     warmup = min(WARMUP, count // 4)
     window = max(min(WINDOW, (count - warmup) // 2), 1)
     return range(warmup + 1, warmup + window + 1), range(count - window + 1, count + 1)
 
 
-def judge(looks: Sequence[Look], count: int) -> list[Verdict]:
+def judge(samples: Sequence[MemorySample], count: int) -> list[Verdict]:
     """Compare the memory at the beginning and at the end.
 
     Args:
-        looks: frame or step, from 1, and bytes by kind of memory.
+        samples: frame or step, from 1, and bytes by kind of memory.
         count: how many frames or steps there were.
 
     Raises:
-        ValueError: nobody looked in the first or in the last span.
+        ValueError: there is no sample in the first or in the last span.
     """
-    chosen = [[memory for number, memory in looks if number in span] for span in spans(count)]
+    chosen = [[memory for number, memory in samples if number in span] for span in spans(count)]
     if not all(chosen):
-        raise ValueError(f"looks: expected some in {spans(count)}, got {[number for number, _ in looks]}")
-    names = looks[0][1]
+        raise ValueError(f"samples: expected some in {spans(count)}, got {[number for number, _ in samples]}")
+    names = samples[0][1]
     first, last = ({name: sum(x[name] for x in part) / len(part) for name in names} for part in chosen)
     return [Verdict(name, first[name], last[name]) for name in names if name != EVERYONES]
 
 
 def memory(device: torch.device) -> dict[str, int]:
-    """Bytes that this process has, of the host's memory and of the GPU's, and those that all processes have there."""
+    """Return the bytes of host and GPU memory of this process, and the GPU memory of all processes."""
     found = {"host": psutil.Process().memory_info().rss}
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
@@ -111,15 +111,15 @@ def memory(device: torch.device) -> dict[str, int]:
     return found
 
 
-def phase(name: str, count: int, looks: Sequence[Look]) -> bool:
+def phase(name: str, count: int, samples: Sequence[MemorySample]) -> bool:
     """Print the table of a phase and its verdicts; returns whether all are flat."""
-    kinds = list(looks[0][1])
+    kinds = list(samples[0][1])
     print(f"{name}: MiB after so many")
     print("".join(f"{title:>17}" for title in ("", *kinds)))
-    shown = sorted({round(i * (len(looks) - 1) / (ROWS - 1)) for i in range(ROWS)})
-    for number, found in (looks[i] for i in shown):
+    shown = sorted({round(i * (len(samples) - 1) / (ROWS - 1)) for i in range(ROWS)})
+    for number, found in (samples[i] for i in shown):
         print(f"{number:17,}" + "".join(f"{found[kind] / MIB:17,.2f}" for kind in kinds))
-    verdicts = judge(looks, count)
+    verdicts = judge(samples, count)
     first, last = spans(count)
     told = f"{first.start:,} to {first.stop - 1:,} and {last.start:,} to {last.stop - 1:,}"
     for v in verdicts:
@@ -144,19 +144,19 @@ def cycle(scene: Scene, device: torch.device, seed: int) -> list[nw.Camera]:
     return made
 
 
-def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, look: Callable[[int], None]) -> None:
-    """Render what the trainer has, over and over, as the viewer does."""
+def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, sample: Callable[[int], None]) -> None:
+    """Render the trainer's finished model `count` times, as the viewer does."""
     model = trainer.finish()
     for i in range(count):
         with torch.no_grad():
-            out = nw.render(model.surfels, model.texture, cameras[i % len(cameras)], **model.render_options)
+            out = model.render(cameras[i % len(cameras)])
         del out
-        look(i + 1)
+        sample(i + 1)
 
 
 @dataclass
 class Soak:
-    """Render and train for long, and see whether memory stays as it is."""
+    """Render and train for long, and check that memory stays constant."""
 
     device: Annotated[str, tyro.conf.arg(metavar="{cuda,cpu}")] = "cuda"
     """Where."""
@@ -187,41 +187,41 @@ class Soak:
         trainer = Trainer(scene, config, device)
         flat = True
         if self.steps:
-            looks, least, most = self._train(trainer, device)
+            samples, least, most = self._train(trainer, device)
             rounds = sum(trainer.densifier.due(i) for i in range(1, self.steps + 1))
             print(f"{rounds:,} rounds of density control; {least:,} to {most:,} surfels when compared")
-            flat &= phase("training steps", self.steps, looks)
+            flat &= phase("training steps", self.steps, samples)
         if self.frames:
-            looks = []
-            render_frames(trainer, cycle(scene, device, self.seed), self.frames, _looker(looks, self.frames, device))
-            flat &= phase("frames", self.frames, looks)
+            samples = []
+            render_frames(trainer, cycle(scene, device, self.seed), self.frames, _sampler(samples, self.frames, device))
+            flat &= phase("frames", self.frames, samples)
         print("flat: first and last are within 1 % throughout" if flat else "NOT FLAT: memory is not what it was")
         return 0 if flat else 1
 
-    def _train(self, trainer: Trainer, device: torch.device) -> tuple[list[Look], int, int]:
-        """Train; returns what was seen, and the least and most surfels in the steps that are compared."""
-        looks: list[Look] = []
+    def _train(self, trainer: Trainer, device: torch.device) -> tuple[list[MemorySample], int, int]:
+        """Train; return the memory samples, and the least and most surfels in the compared steps."""
+        samples: list[MemorySample] = []
         extremes: list[int] = []
-        look, (first, _) = _looker(looks, self.steps, device), spans(self.steps)
+        sample, (first, _) = _sampler(samples, self.steps, device), spans(self.steps)
 
         def observe(step: StepReport) -> None:
             if step.iteration >= first.start:
                 extremes[:] = [min([step.surfels, *extremes]), max([step.surfels, *extremes])]
-            look(step.iteration)
+            sample(step.iteration)
 
         trainer.run(observe)
-        return looks, *extremes
+        return samples, *extremes
 
 
-def _looker(looks: list[Look], count: int, device: torch.device) -> Callable[[int], None]:
-    """What notes the memory now and then."""
+def _sampler(samples: list[MemorySample], count: int, device: torch.device) -> Callable[[int], None]:
+    """Return a function that samples the memory at regular intervals."""
     every = max(count // SAMPLES, 1)
 
-    def look(number: int) -> None:
+    def sample(number: int) -> None:
         if number % every == 0 or number in (1, count):
-            looks.append((number, memory(device)))
+            samples.append((number, memory(device)))
 
-    return look
+    return sample
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Does another program draw our exported Gaussians as we do? A trained run's splats.ply in gsplat, test view by view.
+"""Compares renderings of exported Gaussians by gsplat with our own, for each test view of a trained run.
 
     python -m benchmarks.splats runs/fox
 
-renders the run without its texture and with gamma = 1, draws what `nexwarp export` writes with gsplat 1.5.3 and its
-defaults (its blur of 0.3 pixel^2 included), and lists the PSNR between the two. Needs CUDA, gsplat and plyfile.
+renders the run without its texture and with gamma = 1, renders the file of `nexwarp export` with gsplat 1.5.3 and its
+defaults (with its blur of 0.3 pixel^2), and prints the PSNR between the two. Needs CUDA, gsplat and plyfile.
 """
 
 import statistics
@@ -26,7 +26,7 @@ UNIT_GAMMA = -40.0  # raw: gamma = 1 + exp(raw)
 
 
 def read_ply(path: Path) -> dict[str, torch.Tensor]:
-    """Vertices of a PLY file by property, as a reader of others sees them."""
+    """Return the vertices of a PLY file by property, read by plyfile."""
     import numpy as np
     from plyfile import PlyData
 
@@ -35,7 +35,7 @@ def read_ply(path: Path) -> dict[str, torch.Tensor]:
 
 
 def draw(path: Path, camera: nw.Camera, background: tuple[float, float, float]) -> torch.Tensor:
-    """(H, W, 3) of a 3DGS PLY by gsplat, on the camera's device."""
+    """Render a 3DGS PLY with gsplat on the camera's device: (H, W, 3)."""
     import gsplat
 
     columns = {name: x.to(camera.viewmat.device) for name, x in read_ply(path).items()}
@@ -62,7 +62,7 @@ def draw(path: Path, camera: nw.Camera, background: tuple[float, float, float]) 
 
 
 def untextured(surfels: nw.Surfels) -> nw.Surfels:
-    """The same surfels with gamma = 1, as Gaussians can show them."""
+    """Return the same surfels with gamma = 1, which Gaussians can represent."""
     raw = {name: x.clone() for name, x in surfels.state_dict().items()}
     raw["raw_gammas"].fill_(UNIT_GAMMA)
     return nw.Surfels(raw)
@@ -83,17 +83,18 @@ def main(
         return 2
     model = nw.load(run)
     surfels = untextured(model.surfels).to("cuda")
+    degree = model.options.sh_degree
     sets = load_cameras(run / CAMERAS_FILE)
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "splats.ply"
         cameras = [camera for members in sets.values() for camera in members.values()]
-        save_splats_ply(path, surfels, model.meta["sh_degree"], cameras=cameras)
+        save_splats_ply(path, surfels, degree, cameras=cameras)
         count = len(read_ply(path)["x"])
         for name, camera in list(sets["test"].items())[:max_views]:
             camera = camera.to("cuda")
             with torch.no_grad():
-                mine = nw.render(surfels, None, camera, sh_degree=model.meta["sh_degree"]).image
+                mine = nw.render(surfels, None, camera, sh_degree=degree).image
             figures.append(psnr(to_uint8(draw(path, camera, (0.0, 0.0, 0.0))).cpu(), to_uint8(mine).cpu()))
             print(f"{name}: {figures[-1]:.2f} dB", flush=True)
     print(

@@ -21,9 +21,9 @@ class Options:
 
     Attributes:
         device: where.
-        quick: tiny scenes and few repeats: does everything run?
+        quick: tiny scenes and few repeats, to see that everything runs.
         data: folder with garden_points.npz and the scenes.
-        model: run folder of a trained fox, None to leave that scene out.
+        model: run folder of a trained fox; None leaves that scene out.
     """
 
     device: torch.device
@@ -37,7 +37,7 @@ class Options:
         return self.device.type == "cuda"
 
     def time(self, name: str, run: Callable[[], Any], **facts: Any) -> Measurement:
-        """`timing.measure` on this device, briefly when quick."""
+        """Call `timing.measure` on this device, with few repeats when quick."""
         brief = {"seconds": 0.0, "warmup": 1, "least": 2} if self.quick else {}
         return measure(name, run, self.device, **(facts | brief))
 
@@ -46,7 +46,7 @@ Stage = Callable[[Options], list[Measurement]]
 
 
 def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
-    """Run stages on the devices asked for, print the table; 1 when a stage failed."""
+    """Run stages on the given devices and print the table; return 1 when a stage failed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure nexwarp.")
     parser.add_argument("--only", help=f"stages, comma-separated: {', '.join(stages)}")
     parser.add_argument("--device", choices=("cuda", "cpu", "both"), help="default: all that there is")
@@ -73,7 +73,7 @@ def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
             try:
                 found = stages[name](Options(device, given.quick, given.data, given.model))
             except Exception:
-                # The other stages' figures must not be lost to this one's trouble.
+                # A failing stage must not lose the other stages' figures.
                 traceback.print_exc()
                 failed.append(f"{name} on {kind}")
                 continue
@@ -90,7 +90,7 @@ def main(stages: dict[str, Stage], arguments: list[str] | None = None) -> int:
 
 
 def table(results: list[Measurement]) -> str:
-    """One row a measurement, then GPU against CPU wherever both did the same."""
+    """Return a row for each measurement, then GPU against CPU where both were measured."""
     if not results:
         return "nothing was measured"
     header = ("", "scene", "on", "median", "p10", "p90", "unit", "runs", "peak MiB", "note")

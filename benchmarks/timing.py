@@ -1,4 +1,4 @@
-"""One timer: warm-up, CUDA events or the wall clock, median and spread, peak memory; one JSON line a measurement."""
+"""The benchmarks' timer: warm-up, CUDA events or the wall clock, median and spread, peak memory, JSON lines."""
 
 import dataclasses
 import datetime
@@ -23,7 +23,7 @@ MIB = 2**20
 
 @dataclass(frozen=True)
 class Measurement:
-    """One figure, and all that is needed to make it again.
+    """One figure, with all facts that are needed to reproduce it.
 
     Attributes:
         name: what was measured.
@@ -35,8 +35,8 @@ class Measurement:
         peak_mib: peak memory during the runs, MiB: on CUDA, of torch's allocator plus the high-water mark of Warp's
             pool; on a CPU, of the whole process (Linux only).
         sizes: surfels, width, height and the like.
-        note: anything a reader must know.
-        device_name, commit, date, versions: where, of what and when.
+        note: remarks for the reader.
+        device_name, commit, date, versions: of the measurement.
     """
 
     name: str
@@ -75,7 +75,7 @@ def measure(
 ) -> Measurement:
     """Time a function after warming it up.
 
-    On CUDA each run lies between two events and is waited for, so that a launch that the CPU cannot keep up with shows.
+    On CUDA each run lies between two events and is waited for, so that launches that are slower than the kernels count.
 
     Args:
         name: of the measurement.
@@ -112,7 +112,7 @@ def figure(
     note: str = "",
     peak_mib: float | None = None,
 ) -> Measurement:
-    """Make a measurement of values that something else measured."""
+    """Make a measurement of given values."""
     values = values if isinstance(values, list) else [values]
     p10, median, p90 = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
     return Measurement(
@@ -156,7 +156,7 @@ def reset_peak(device: torch.device) -> None:
 
 
 def peak(device: torch.device) -> float | None:
-    """Peak memory since `reset_peak`, MiB; None where the system does not tell."""
+    """Return the peak memory since `reset_peak` in MiB; None where the system does not provide it."""
     if device.type == "cuda":
         pool = wp.get_mempool_used_mem_high(f"cuda:{device.index or 0}")
         return (torch.cuda.max_memory_allocated(device) + pool) / MIB

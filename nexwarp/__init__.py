@@ -22,7 +22,7 @@ from nexwarp.train.report import StepReport
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

@@ -1,4 +1,4 @@
-"""All passes of a rendering, those that follow from it too, and their OpenEXR file (see docs/outputs.md)."""
+"""All buffers of a rendering, and their OpenEXR file; docs/outputs.md describes it."""
 
 import os
 from dataclasses import dataclass
@@ -32,12 +32,12 @@ SLOTS = ("ids", "depths", "weights", "colors")
 
 @dataclass(frozen=True)
 class Buffers:
-    """Every pass of one rendering, float32 unless said. Nothing is differentiable.
+    """All buffers of one rendering, float32 unless stated otherwise; not differentiable.
 
-    Adds up to rounding: image = plain + textured + (1 - alpha) background, textured = sum over k of weights * colors.
+    Up to rounding, image = plain + textured + (1 - alpha) background, and textured = sum over k of weights * colors.
 
     Attributes:
-        image: (H, W, 3) the picture, not clamped.
+        image: (H, W, 3) the final image, not clamped.
         plain: (H, W, 3) blended colours of the hits that are not textured, without background.
         textured: (H, W, 3) sum over the K textured hits of weight * colour.
         alpha: (H, W) 1 - final transmittance.
@@ -46,13 +46,13 @@ class Buffers:
         weights: (H, W, K) their blending weights; 0 in empty slots.
         colors: (H, W, K, 3) their textured colours; 0 in empty slots.
         expected_depth: (H, W) mean z-depth of all hits, weighted by their blending weights; 0 where nothing is hit.
-        median_depth: (H, W) z-depth of the hit that takes the transmittance to 1/2; of the last hit where it stays
-            above; 0 where nothing is hit.
+        median_depth: (H, W) z-depth of the hit at which the transmittance falls to 1/2; of the last hit if it stays
+            above 1/2; 0 where nothing is hit.
         top_depth: (H, W) z-depth of the heaviest hit; 0 where nothing is hit.
-        normals: (H, W, 3) unit, world frame: mean of all hits' normals, weighted by their blending weights, each on the
-            side that faces the camera; 0 where nothing is hit.
-        camera: what was looked through.
-        background: (3,) colour behind everything; (H, W, 3) where a lens darkens it towards the corners.
+        normals: (H, W, 3) unit, world frame: mean of all hits' normals, each facing the camera, weighted by their
+            blending weights; 0 where nothing is hit.
+        camera: the camera of the rendering.
+        background: (3,) background colour, with the exposure applied; (H, W, 3) if the lens has falloff.
     """
 
     image: torch.Tensor
@@ -73,7 +73,7 @@ class Buffers:
 
 @torch.no_grad()
 def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges]) -> Buffers:
-    """Render every pass of a model; arguments and errors are those of `Model.render`."""
+    """Render all buffers of a model; arguments and errors are those of `Model.render`."""
     camera = camera.to(model.device)
     out = model.render(camera, **changes)
     background = torch.tensor(model.options.background).to(out.image)
@@ -84,15 +84,16 @@ def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges
 
 
 def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
-    """Write one multi-part OpenEXR file: a part a pass, and a slot of it where there are K.
+    """Write one multi-part OpenEXR file, with one part per buffer, or per slot of a buffer that has K slots.
 
     Parts: `image`, `plain`, `textured`, `normals`, `colors.0` to `colors.K-1` (channels R, G, B); `alpha`,
     `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty
-    slots). Camera, background and K are in the text attribute `nexwarp`, as JSON; a background of one colour a pixel is
-    a part `background` (R, G, B), and null there.
+    slots). The text attribute `nexwarp` holds camera, background and K as JSON. A background of shape (H, W, 3) is null
+    there, and a part `background` (R, G, B).
 
     Raises:
-        TypeError: buffers that are not float32; OSError: `path` cannot be written.
+        TypeError: a buffer is not float32.
+        OSError: `path` cannot be written.
     """
     parts: dict[str, torch.Tensor] = {}
     for name in PASSES:
@@ -121,31 +122,32 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
 
 
 def load_buffers(path: str | os.PathLike[str]) -> Buffers:
-    """Read what `save_buffers` wrote, bit for bit, onto the CPU.
+    """Read a file of `save_buffers` onto the CPU, bit for bit.
 
     Raises:
-        FileNotFoundError: no such file; ValueError: it is no such file, or it is damaged.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format, or is damaged.
     """
     path = Path(path)
     parts, metadata = load_exr(path)
     try:
         if metadata["format"] != FORMAT:
-            raise ValueError(f"format {metadata['format']}, expected {FORMAT}")
-        known = metadata["camera"]
-        viewmat, K = (torch.tensor(known[name], dtype=torch.float32) for name in ("viewmat", "K"))
-        camera = Camera(viewmat, K, known["width"], known["height"], known["near"])
+            raise ValueError(f"format: expected {FORMAT}, got {metadata['format']}")
+        stored = metadata["camera"]
+        viewmat, K = (torch.tensor(stored[name], dtype=torch.float32) for name in ("viewmat", "K"))
+        camera = Camera(viewmat, K, stored["width"], stored["height"], stored["near"])
         slots = range(metadata["max_hits"])
-        found: dict[str, torch.Tensor] = {}
+        buffers: dict[str, torch.Tensor] = {}
         for name in PASSES:
             if name not in SLOTS:
-                found[name] = parts[name]
+                buffers[name] = parts[name]
             elif slots:
-                found[name] = torch.stack([parts[f"{name}.{k}"] for k in slots], dim=2)
+                buffers[name] = torch.stack([parts[f"{name}.{k}"] for k in slots], dim=2)
             else:
                 shape = (camera.height, camera.width, 0, *((3,) if name == "colors" else ()))
-                found[name] = torch.empty(shape, dtype=torch.int32 if name == "ids" else torch.float32)
+                buffers[name] = torch.empty(shape, dtype=torch.int32 if name == "ids" else torch.float32)
         color = metadata["background"]
         background = parts["background"] if color is None else torch.tensor(color, dtype=torch.float32)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: expected the passes of a nexwarp rendering ({error})") from None
-    return Buffers(**found, camera=camera, background=background)
+        raise ValueError(f"{path}: expected the buffers of a nexwarp rendering ({error})") from None
+    return Buffers(**buffers, camera=camera, background=background)

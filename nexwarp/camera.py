@@ -1,4 +1,4 @@
-"""Pinhole cameras: world to camera, x right, y down, z forward (OpenCV, as COLMAP writes them)."""
+"""Pinhole cameras, with OpenCV axes as in COLMAP: x right, y down, z forward."""
 
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any
@@ -14,15 +14,15 @@ ROTATION_TOLERANCE = 1e-3
 class Camera:
     """A pinhole camera.
 
-    Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5); the ray through pixel coordinates (x, y) has
-    the camera-frame direction ((x - cx) / fx, (y - cy) / fy, 1), so that depths along it are z-depths.
+    Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). The ray through pixel coordinates (x, y) has the
+    camera-frame direction ((x - cx) / fx, (y - cy) / fy, 1): distances along it, in units of that vector, are z-depths.
 
     Attributes:
         viewmat: (4, 4) float, world to camera, a rigid motion. Rendering is differentiable with respect to it.
-        K: (3, 3) float, intrinsics in pixels, no skew; the principal point may lie anywhere.
+        K: (3, 3) float, intrinsics in pixels, without skew; the principal point may lie outside the image.
         width: image width in pixels.
         height: image height in pixels.
-        near: hits with a z-depth of at most this (world units) are ignored.
+        near: hits with a z-depth of at most this are ignored, world units.
         fx, fy, cx, cy: focal lengths and principal point in pixels, the numbers in `K`.
 
     Args:
@@ -31,8 +31,8 @@ class Camera:
 
     Raises:
         TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
-        ValueError: wrong shapes, values that are not finite, a `viewmat` whose rotation is further than 1e-3 from
-            orthonormal or mirrors, a `K` with skew or a focal length <= 0, sizes < 1, `near` < 0.
+        ValueError: a shape is wrong; a value is not finite; the rotation of `viewmat` is a reflection, or differs from
+            orthonormal by more than 1e-3; `K` has skew or a focal length <= 0; a size is < 1; `near` is < 0.
     """
 
     viewmat: torch.Tensor
@@ -71,7 +71,7 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """Geometric mean of the focal lengths, in pixels: f of the down-weighting, paper Eq. 4."""
+        """Geometric mean of the focal lengths, in pixels (f of paper Eq. 4)."""
         return (self.fx * self.fy) ** 0.5
 
     @property
@@ -85,14 +85,14 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), those behind included."""
+        """Return pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), of those behind the camera too."""
         x = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         depths = x[:, 2]
         columns, rows = self.fx * x[:, 0] / depths + self.cx, self.fy * x[:, 1] / depths + self.cy
         return torch.stack([columns, rows], dim=-1), depths
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """Return the camera of a window of this one's image, in pixels; the window may reach beyond the image."""
+        """Return the camera of a window of this image, in pixels; the window may extend beyond the image."""
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
@@ -100,7 +100,7 @@ class Camera:
         return replace(self, K=K, width=width, height=height, checked=checked)
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
-        """Return this camera with `viewmat` and `K` moved like `torch.Tensor.to` does."""
+        """Return a copy with `viewmat` and `K` moved or converted; arguments as of `torch.Tensor.to`."""
         return Camera(self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near)
 
 
@@ -180,30 +180,33 @@ def _check_intrinsics(intrinsics: torch.Tensor) -> None:
 def visible_points(
     pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Return `places` and `expected` of `depth_loss` for the points that an image shows; None when it shows none.
+    """Select the points that project into an image.
 
     Args:
-        pixels: (M, 2) pixel coordinates of the points, x and y, of any size or none behind the camera.
-        depths: (M,) their z-depths, those <= 0 being behind the camera.
-        width: of the image.
-        height: of the image.
-        mask: (H, W) bool, True where the photograph counts; None is everywhere.
+        pixels: (M, 2) pixel coordinates of the points, x and y; may be infinite or NaN behind the camera.
+        depths: (M,) z-depths of the points; <= 0 is behind the camera.
+        width: image width in pixels.
+        height: image height in pixels.
+        mask: (H, W) bool, True for included pixels; None includes all.
+
+    Returns:
+        Indices (P,) int64 of the points' pixels, row-major, and z-depths (P,); None if there are no such points.
     """
     size = torch.tensor([width, height], device=pixels.device)
     inside = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
     column, row = pixels[inside].long().unbind(-1)
     places, expected = row * width + column, depths[inside]
     if mask is not None:
-        counts = mask.flatten()[places]
-        places, expected = places[counts], expected[counts]
+        included = mask.flatten()[places]
+        places, expected = places[included], expected[included]
     return (places, expected) if len(places) else None
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera with another image size, in pixels, that sees what it did from top to bottom.
+    """Return the camera with another image size in pixels and the same vertical field of view.
 
-    Pixels keep their shape: another aspect ratio shows more or less at the sides. The principal point keeps its
-    offset from the middle, relative to the height.
+    Pixels keep their aspect ratio: another aspect ratio of the image shows more or less at the sides. The principal
+    point keeps its offset from the centre, relative to the height.
     """
     check_range("width", width, 1)
     check_range("height", height, 1)
@@ -218,7 +221,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def reduced(camera: Camera, height: int) -> Camera:
-    """Return the camera with an image that is at most `height` pixels tall, and as wide as that asks."""
+    """Return the camera with an image at most `height` pixels tall, in the same aspect ratio."""
     if camera.height <= height:
         return camera
     return resized(camera, max(round(camera.width * height / camera.height), 1), height)

@@ -1,4 +1,4 @@
-"""Validation with messages that name the argument, what was expected and what came."""
+"""Argument checks; each message names the argument, the expected value and the given one."""
 
 from collections.abc import Mapping
 
@@ -11,20 +11,20 @@ def check_tensors(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> dict[str, int]:
-    """Check types, shapes, dtypes and devices in one go.
+    """Check the types, shapes, dtypes and devices of several tensors.
 
     Args:
-        tensors: argument name -> (tensor, shape); a string in a shape is a dimension that must agree
-            wherever it appears again.
-        dtype: dtype that all must have; by default that of the first one, which must be floating.
-        device: device that all must be on; by default that of the first one.
+        tensors: argument name -> (tensor, shape); a string in a shape names a dimension, which must
+            have the same size wherever the name occurs.
+        dtype: dtype of all tensors; by default that of the first one, which must be floating.
+        device: device of all tensors; by default that of the first one.
 
     Returns:
         The sizes of the named dimensions.
 
     Raises:
-        TypeError: a value is not a floating tensor or has another dtype.
-        ValueError: a shape or device does not fit.
+        TypeError: a value is not a tensor or has another dtype.
+        ValueError: a tensor has another shape or is on another device.
     """
     sizes: dict[str, int] = {}
     for name, (tensor, shape) in tensors.items():

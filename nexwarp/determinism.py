@@ -1,16 +1,23 @@
-"""Random seeds, and sums whose order does not depend on threads."""
+"""Random seeds, and operations whose results do not depend on the order of threads."""
 
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol, cast
 
 import numpy as np
 import torch
 
 
+class _DeterministicModule(Protocol):
+    """The part of `torch.utils.deterministic` that is used here."""
+
+    fill_uninitialized_memory: bool
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Sums of several threads are other sums, and a rounding's other side can be another file."""
+    """Run torch on one thread: how threads split a sum changes its rounding, and files must be reproducible."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -21,22 +28,28 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def deterministic(wanted: bool) -> Iterator[None]:
-    """Let torch's operations, and ours with them, give the same bits whatever the order of threads."""
+    """Make the results of torch's operations and of nexwarp's kernels independent of the order of threads.
+
+    Args:
+        wanted: False changes nothing.
+    """
     if not wanted or torch.are_deterministic_algorithms_enabled():
         yield
         return
-    fill = torch.utils.deterministic.fill_uninitialized_memory
+    # The module replaces its own class to make this a property, which torch's stubs do not declare.
+    memory = cast(_DeterministicModule, torch.utils.deterministic)
+    fill = memory.fill_uninitialized_memory
     torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # all of it is written before it is read
+    memory.fill_uninitialized_memory = False  # every buffer is written before it is read
     try:
         yield
     finally:
         torch.use_deterministic_algorithms(False)
-        torch.utils.deterministic.fill_uninitialized_memory = fill
+        memory.fill_uninitialized_memory = fill
 
 
 def seed_everything(seed: int) -> None:
-    """Seed the generators of Python, numpy and torch."""
+    """Seed the global generators of Python, numpy and torch."""
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
     torch.manual_seed(seed)

@@ -1,74 +1,74 @@
-"""What nexwarp raises where it meets the world: one family, whose members are also the built-in errors akin to them.
+"""Errors of user input, files and resources. Each is a NexwarpError and also the built-in error named here.
 
     NexwarpError
-      SettingError      (ValueError)         an option or setting that is out of its range, or does not suit another
+      SettingError      (ValueError)         an option or setting that is out of range or conflicts with another one
       SceneError        (ValueError)         a scene that cannot be used
-      FormatError       (ValueError)         a file that is damaged, or of another kind or version
-        CheckpointError                      a checkpoint that is damaged, or of another run
-      RunError          (ValueError)         a run folder that is not in the state that a command wants
-      MissingError      (FileNotFoundError)  a file or folder that is not there
+      FormatError       (ValueError)         a file that is damaged or has another format or version
+        CheckpointError                      a checkpoint that is damaged or belongs to another run
+      RunError          (ValueError)         a run folder in a state that the command cannot use
+      MissingError      (FileNotFoundError)  a file or folder that does not exist
       StorageError      (OSError)            a disk that is full, read-only or failing
       DivergedError     (RuntimeError)       a training whose numbers are no longer finite
-      OutOfMemoryError  (MemoryError)        a GPU, or a computer, that is too small for what was asked
+      OutOfMemoryError  (MemoryError)        a GPU or computer with too little memory for the task
 
-Arguments of Python functions that are out of their range or of another type raise plain ValueErrors and TypeErrors.
+Arguments of Python functions that are out of range or of another type raise plain ValueError and TypeError.
 """
 
 import os
-from typing import Any
+from collections.abc import Mapping
 
 
 class NexwarpError(Exception):
-    """Whatever nexwarp refuses or gives up: the message is one line that says what, where, and what was expected."""
+    """Base class of these errors. The message is one line: the place, what was expected, what was found."""
 
 
 class SettingError(NexwarpError, ValueError):
-    """An option or setting that is out of its range, or does not suit another."""
+    """An option or setting is out of range or conflicts with another one."""
 
 
 class SceneError(NexwarpError, ValueError):
-    """A scene that cannot be used."""
+    """A scene cannot be used."""
 
 
 class FormatError(NexwarpError, ValueError):
-    """A file that is damaged, or of another kind or version than expected."""
+    """A file is damaged or has another format or version than expected."""
 
 
 class CheckpointError(FormatError):
-    """A checkpoint that is damaged, or of another run."""
+    """A checkpoint is damaged or belongs to another run."""
 
 
 class RunError(NexwarpError, ValueError):
-    """A run folder that is not in the state that a command wants."""
+    """A run folder is in a state that the command cannot use."""
 
 
 class MissingError(NexwarpError, FileNotFoundError):
-    """A file or folder that is not there."""
+    """A file or folder does not exist."""
 
 
 class StorageError(NexwarpError, OSError):
-    """A disk that is full, read-only or failing; `errno` and `filename` say what and where."""
+    """A disk is full, read-only or failing; `errno` and `filename` give the reason and the file."""
 
     def __str__(self) -> str:
         return super().__str__() if self.filename is None else f"{self.filename}: cannot be written ({self.strerror})"
 
     @classmethod
     def at(cls, path: str | os.PathLike[str], error: OSError) -> "StorageError":
-        """Return the error that writing `path` met."""
+        """Return the error for a failed write to `path`, with the number and text of the operating system's error."""
         return cls(error.errno, error.strerror or str(error), str(path))
 
 
 class DivergedError(NexwarpError, RuntimeError):
-    """A training whose numbers are no longer finite.
+    """A training produced NaN or infinity.
 
     Attributes:
-        report: what is known of it, as plain JSON values.
+        report: facts about the failure, as JSON values.
     """
 
-    def __init__(self, message: str, report: dict[str, Any] | None = None) -> None:
+    def __init__(self, message: str, report: Mapping[str, object] | None = None) -> None:
         super().__init__(message)
-        self.report = report or {}
+        self.report: dict[str, object] = dict(report or {})
 
 
 class OutOfMemoryError(NexwarpError, MemoryError):
-    """A GPU, or a computer, that is too small for what was asked; the message says what to lower."""
+    """A GPU or computer has too little memory for the task; the message says which settings to lower."""

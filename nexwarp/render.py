@@ -23,17 +23,17 @@ Color = float | Sequence[float] | torch.Tensor
 
 @dataclass(frozen=True)
 class Intermediates:
-    """What the stages of one rendering hand on, for what a `Rendering` computes on request.
+    """Results of the stages of a rendering, from which `Rendering` computes further buffers on request.
 
     Attributes:
-        projection: of the surfels.
-        tiles: the lists that the collection pass walked along.
-        hits: what it found.
-        pinhole: the image plane.
+        projection: projected surfels.
+        tiles: depth-sorted lists of the surfels in each tile.
+        hits: result of the collection pass.
+        pinhole: intrinsics of the image.
         viewmat: (4, 4) world to camera.
-        low_pass: as given to `render`.
-        texels: (H, W, K, 3) the texture's colours of the hits; None without a texture.
-        residual: whether the texture's colours are added to the plain ones.
+        low_pass: argument of `render`.
+        texels: (H, W, K, 3) textured colours of the hits; None without a texture.
+        residual: whether the texture's colours are added to the plain colours.
         factors: (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure.
     """
 
@@ -52,19 +52,19 @@ class Intermediates:
 class Rendering:
     """The buffers of one rendering.
 
-    Differentiable: all fields but `ids`. Computed on first access, without a second rendering: `expected_depth`,
-    `median_depth`, `top_depth`, `normals` and `colors`; the first four are not differentiable.
+    All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals` and `colors` are
+    computed on first access, without a second rendering; the first four are not differentiable.
 
     Attributes:
-        image: (H, W, 3) = plain + textured + (1 - alpha) background; not clamped.
-        plain: (H, W, 3) blended colours of the hits that are not textured, N of paper Eq. 6; without background.
+        image: (H, W, 3) plain + textured + (1 - alpha) background (paper Eq. 7, with a background); not clamped.
+        plain: (H, W, 3) blended colours of the hits that are not textured (N of paper Eq. 6), without background.
         textured: (H, W, 3) sum over the K textured hits of weight * colour. Without a texture the colour is the hit's
             plain colour; with a residual texture it is the plain colour plus the texture's.
         ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
         depths: (H, W, K) their z-depths, world units; 0 in empty slots.
         weights: (H, W, K) their blending weights; 0 in empty slots.
         alpha: (H, W) 1 - final transmittance.
-        intermediates: what the stages handed on.
+        intermediates: results of the stages.
     """
 
     image: torch.Tensor
@@ -83,9 +83,9 @@ class Rendering:
 
     @property
     def median_depth(self) -> torch.Tensor:
-        """(H, W) z-depth of the hit that takes the transmittance to 1/2, world units.
+        """(H, W) z-depth of the hit at which the transmittance falls to 1/2, world units.
 
-        Where the transmittance stays above 1/2, that of the last hit; 0 where nothing is hit.
+        If the transmittance stays above 1/2, it is that of the last hit; 0 where nothing is hit.
         """
         return self._surface.median_depth
 
@@ -96,36 +96,38 @@ class Rendering:
 
     @property
     def normals(self) -> torch.Tensor:
-        """(H, W, 3) unit normals, world frame: the mean of all hits' normals, weighted by their blending weights.
+        """(H, W, 3) unit normals, world frame: mean of all hits' normals, weighted by their blending weights.
 
-        Each hit's normal is taken on the side that faces the camera; 0 where nothing is hit.
+        Each hit's normal is oriented to face the camera; 0 where nothing is hit.
         """
         return self._surface.normals
 
     @cached_property
     def colors(self) -> torch.Tensor:
-        """(H, W, K, 3) colours of the K hits, so that textured = sum over k of weights * colors; 0 in empty slots."""
-        made, empty = self.intermediates, (self.ids < 0)[..., None]
-        colors = self.weights.new_zeros(*self.ids.shape, 3) if made.texels is None else made.texels
-        if (made.texels is None or made.residual) and len(made.projection.records):
-            colors = colors + made.projection.records[:, 3, :3][self.ids.clamp_min(0).long()]
-        if made.factors is not None:
-            colors = colors * (made.factors if made.factors.ndim == 1 else made.factors[:, :, None])
+        """(H, W, K, 3) colours of the K hits: textured = sum over k of weights * colors; 0 in empty slots."""
+        stages, empty = self.intermediates, (self.ids < 0)[..., None]
+        colors = self.weights.new_zeros(*self.ids.shape, 3) if stages.texels is None else stages.texels
+        if (stages.texels is None or stages.residual) and len(stages.projection.records):
+            colors = colors + stages.projection.records[:, 3, :3][self.ids.clamp_min(0).long()]
+        if stages.factors is not None:
+            colors = colors * (stages.factors if stages.factors.ndim == 1 else stages.factors[:, :, None])
         return colors.masked_fill(empty, 0.0)
 
     @cached_property
     def _surface(self) -> ops.Surface:
-        made = self.intermediates
-        return ops.surface(made.projection, made.tiles, made.hits, made.pinhole, made.viewmat, low_pass=made.low_pass)
+        stages = self.intermediates
+        return ops.surface(
+            stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat, low_pass=stages.low_pass
+        )
 
     def request_splat_error(self, errors: torch.Tensor) -> ops.SplatErrorRequest:
-        """Ask the coming backward pass for `splat_error(errors)`, at hardly any cost.
+        """Request `splat_error(errors)` from the backward pass, which computes it at almost no cost.
 
         Args:
             errors: (H, W) error of each pixel, >= 0.
 
         Returns:
-            A request whose `sums_after_backward` (N,) the backward pass fills.
+            A request; the backward pass writes its `sums_after_backward` (N,).
         """
         request = self.intermediates.hits.error_request
         check_tensors({"errors": (errors, self.alpha.shape)}, dtype=self.alpha.dtype, device=self.alpha.device)
@@ -133,9 +135,11 @@ class Rendering:
         return request
 
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
-        """Return (N,): each surfel's sum over pixels of blending weight * errors (H, W). Not differentiable."""
-        made = self.intermediates
-        return ops.splat_error(made.projection, made.tiles, made.hits, made.pinhole, errors, low_pass=made.low_pass)
+        """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W). Not differentiable."""
+        stages = self.intermediates
+        return ops.splat_error(
+            stages.projection, stages.tiles, stages.hits, stages.pinhole, errors, low_pass=stages.low_pass
+        )
 
 
 def render(
@@ -153,30 +157,27 @@ def render(
     exposures: Exposures | None = None,
     detail_limits: DetailLimits | None = None,
 ) -> Rendering:
-    """Render surfels as a camera sees them. A trained scene is rendered by `Model.render`.
+    """Render surfels from a camera (paper Sec. 4.2). `Model.render` renders a trained scene.
 
-    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`; `exposures` and
-    `detail_limits` are constants.
+    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`.
 
     Args:
-        surfels: the N surfels, N may be 0.
-        texture: the neural texture, on the same device; None gives the textured hits their plain colour instead.
+        surfels: the N surfels, N >= 0.
+        texture: the neural texture, on the same device; None leaves all hits their plain colours.
         camera: the camera, on the same device.
-        max_hits: K, how many hits a pixel textures, 0 to 8.
-        background: a number, three numbers or a (3,) tensor, seen through what is left of the transmittance.
-        sh_degree: 0 to 3, limits the degree of both appearances.
-        low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
-        clamp_texture: limit textured colours to >= 0; not for residual textures.
-        depth_jitter: for training: standard deviation, in pixels at that depth, of random shifts along the ray of the
-            points at which the texture is looked up. The buffers' depths stay. A tensor holds the factors on the
-            depths themselves, as `jitter_factors` draws them.
-        generator: of those random numbers, on the surfels' device; None is torch's own.
-        exposures: multiplies all colours, the background's too, by the gains predicted for this camera and by the
-            lens's falloff; None is the mean exposure.
-        detail_limits: of the N surfels; None limits nothing.
+        max_hits: K, number of hits textured in each pixel, 0 to 8.
+        background: a number, three numbers or a (3,) tensor, weighted by the final transmittance.
+        sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
+        low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
+        clamp_texture: clamp textured colours to >= 0; not for residual textures.
+        depth_jitter: for training, random shifts of the texture's points along their rays. A number is their standard
+            deviation in pixels at the hit's depth; a tensor (H, W, K) holds the factors of `jitter_factors`.
+        generator: random generator of the jitter, on the surfels' device; None is torch's default.
+        exposures: multiply the image by the camera's gains and lens falloff; None is the mean exposure.
+        detail_limits: detail limits of the N surfels; None limits nothing.
 
     Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+        TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
     """
     _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
     background = _background(background, surfels.means)
@@ -189,24 +190,34 @@ def render(
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     texels = None
     if texture is not None:
-        if not isinstance(depth_jitter, torch.Tensor) and depth_jitter > 0:
-            depth_jitter = jitter_factors(camera, max_hits, depth_jitter, hits.depths.dtype, generator)
-        looked_up = hits.depths * depth_jitter if isinstance(depth_jitter, torch.Tensor) else hits.depths
-        positions, directions = ops.unproject(looked_up, camera.viewmat, pinhole)
+        jittered = _jittered(hits.depths, camera, depth_jitter, generator)
+        positions, directions = ops.unproject(jittered, camera.viewmat, pinhole)
         depths = limited_depths(hits.ids, hits.depths, detail_limits, camera.focal)
         texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
     residual = texture is not None and texture.residual
     base = hits.base if texture is None or residual else None
-    plain = hits.plain
-    blended = (hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0])
-    if texels is not None:
-        blended = (texels, hits.weights)
-    image, textured = ops.compose(plain, *blended, hits.alpha, background, base)
+    blended = _no_texels(hits) if texels is None else (texels, hits.weights)
+    image, textured = ops.compose(hits.plain, *blended, hits.alpha, background, base)
     factors = None if exposures is None else exposures.factors(camera).to(image)
-    if factors is not None:
-        image, plain, textured = image * factors, plain * factors, textured * factors
-    made = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
-    return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, made)
+    image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
+    intermediates = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
+    return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, intermediates)
+
+
+def _jittered(
+    depths: torch.Tensor, camera: Camera, jitter: float | torch.Tensor, generator: torch.Generator | None
+) -> torch.Tensor:
+    """Return depths (H, W, K) times the factors of a `depth_jitter`."""
+    if not isinstance(jitter, torch.Tensor):
+        if not jitter > 0:
+            return depths
+        jitter = jitter_factors(camera, depths.shape[2], jitter, depths.dtype, generator)
+    return depths * jitter
+
+
+def _no_texels(hits: ops.Hits) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return empty colours (H, W, 0, 3) and weights (H, W, 0), for a composition without texture."""
+    return hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
 
 
 def jitter_factors(
@@ -216,14 +227,17 @@ def jitter_factors(
     dtype: torch.dtype = torch.float32,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draw what `render` multiplies depths by for a `depth_jitter`: (H, W, K) normal, 1 +- jitter / focal.
+    """Draw random factors on depths for the `depth_jitter` of `render`.
 
     Args:
-        camera: to render with.
+        camera: the camera of the rendering.
         max_hits: K.
         jitter: standard deviation in pixels.
-        dtype: of the surfels.
-        generator: on the camera's device; None is torch's own.
+        dtype: dtype of the surfels.
+        generator: random generator, on the camera's device; None is torch's default.
+
+    Returns:
+        (H, W, K), normally distributed with mean 1 and standard deviation jitter / focal.
     """
     shape = (camera.height, camera.width, max_hits)
     noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)
@@ -231,21 +245,22 @@ def jitter_factors(
 
 
 def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -> Activated:
-    """Return the N surfels' geometry for a camera, blurred where it is farther away than any training view was.
+    """Return the N surfels' activated geometry, with those blurred that are farther away than in any training view.
 
     Differentiable with respect to the surfels and `camera.viewmat`.
 
     Args:
         surfels: the surfels.
         camera: the camera.
-        limits: of the surfels; None blurs nothing.
+        limits: detail limits of the N surfels; None blurs nothing.
     """
     shape = surfels.activated()
     if limits is None or not len(surfels):
         return shape
     row = camera.viewmat[2].to(shape.means)
     depths = torch.addmv(row[3], shape.means, row[:3])
-    focal = (camera.fx * camera.fy) ** 0.5  # of the image's own pixels: a camera may lower `focal` for the texture
+    # Focal length of the image's pixels: `camera.focal` may be lower, to limit the detail of the texture.
+    focal = (camera.fx * camera.fy) ** 0.5
     blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, focal)
     return Activated(shape.means, shape.quats, *blurred)
 
@@ -253,19 +268,19 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
 def limited_depths(
     ids: torch.Tensor, depths: torch.Tensor, limits: DetailLimits | None, focal: float | torch.Tensor
 ) -> torch.Tensor:
-    """Return depths for the texture's down-weighting: the hits', clamped to the range in which training saw them.
+    """Return depths for the texture's down-weighting: the hits' depths, clamped to the range of the training views.
 
     Args:
-        ids: (H, W, K) surfels, -1 in empty slots.
-        depths: (H, W, K) their z-depths.
-        limits: of the surfels; None clamps nothing.
-        focal: of the camera, in pixels.
+        ids: (H, W, K) surfels of the hits, -1 in empty slots.
+        depths: (H, W, K) z-depths of the hits.
+        limits: detail limits of the surfels; None clamps nothing.
+        focal: focal length in pixels.
     """
     if limits is None or not len(limits):
         return depths
     indices = ids.clamp_min(0).long()
     clamped = torch.minimum(depths, focal * limits.farthest[indices])
-    # The nearest limit comes last: where training never saw a texture, there is none.
+    # `nearest` is applied last: where no training view saw the texture, it is NEVER and removes all detail.
     clamped = torch.maximum(clamped, focal * limits.nearest[indices])
     return torch.where(ids >= 0, clamped, depths)
 
@@ -332,7 +347,7 @@ def _check_tensors(
     depth_jitter: float | torch.Tensor,
     limits: DetailLimits | None,
 ) -> None:
-    """Check shapes, dtypes and devices only, so as never to wait for a GPU."""
+    """Check shapes, dtypes and devices; checking values would wait for the GPU."""
     expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
         "camera.viewmat": (camera.viewmat, (4, 4)),
         "background": (background, (3,)),

@@ -26,10 +26,10 @@ from nexwarp.kernels.tiles import (
     MAX_CORNERS,
     check_entries,
     depth_keys_kernel,
-    footprint_kernel,
     list_kernels,
     surfel_ids_kernel,
     tile_offsets_kernel,
+    tile_polygon_kernel,
 )
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernel
@@ -127,9 +127,9 @@ def plain_colors(
     _silent(kernels.forward, len(means), [sh0, shN, means, position], [colors])
 
     def backward() -> None:
-        seen, lanes = [means, position, colors, colors.grad], 1 + shN.shape[1]
+        seen, sharing = [means, position, colors, colors.grad], 1 + shN.shape[1]
         *grads, grad_rays = (_new(x, x.shape, x.dtype, requires_grad=False) for x in (sh0, shN, means))
-        _silent(kernels.coefficients_backward, len(means) * lanes, [lanes, *seen], grads)
+        _silent(kernels.coefficients_backward, len(means) * sharing, [sharing, *seen], grads)
         _silent(kernels.rays_backward, len(means), [shN, *seen], [grad_rays])
         # These kernels write their outputs; a tape adds to what is there.
         for x, grad in zip((sh0, shN, means), (*grads, grad_rays), strict=True):
@@ -203,10 +203,10 @@ def intersect_tiles(
     reaches, corners = reals(count, t.vec2), reals((count, MAX_CORNERS), t.vec2)
     margins, discs = reals(count, real), reals(count if low_pass else 1, t.vec3)
     surfels = [means, quats, scales, opacities, gammas, viewmat, image.matrices(means), image.near, rows]
-    footprints = [corners, shapes, margins, discs]
-    _silent(footprint_kernel(real, low_pass, tile_size), count, surfels, [reaches, *footprints])
+    polygons = [corners, shapes, margins, discs]
+    _silent(tile_polygon_kernel(real, low_pass, tile_size), count, surfels, [reaches, *polygons])
     kernels = list_kernels(real, low_pass, tile_size)
-    arguments = [order, *footprints, wp.vec2i(columns, rows), 1]
+    arguments = [order, *polygons, wp.vec2i(columns, rows), 1]
     total = 0
     if count:
         _silent(depth_keys_kernel(real), count, [centers], [keys, order])
@@ -292,9 +292,10 @@ def hashgrid(
     one = wp.ones(1, dtype=real, device=table.device)
 
     def backward() -> None:
-        points = _new(positions, count, types(real).vec4, requires_grad=False)
-        _silent(kernels.backward, count, [*inputs, encoded.grad, one, None], [table.grad, points, None])
-        _silent(_add_points, count, [points], [positions.grad, depths.grad])
+        points = _new(positions, (1, count), types(real).vec4, requires_grad=False)
+        arguments = [*inputs, encoded.grad, one, None, levels]
+        _silent(kernels.backward, (1, count), arguments, [table.grad, points, None])
+        _silent(_add_points, count, [points.flatten()], [positions.grad, depths.grad])
 
     tape.record_func(backward, [table, positions, depths, encoded])
     return encoded

@@ -1,4 +1,4 @@
-"""What the notebooks draw with: rows of pictures with titles, each with the colour bar that it needs."""
+"""Figures of the notebooks: rows of pictures with titles and colour bars, and plots."""
 
 import math
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ plt.rcParams.update(
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One picture: RGB, which needs no colour bar, or numbers and how they are coloured."""
+class ImagePanel:
+    """One picture of a figure: RGB without a colour bar, or numbers with a colour map."""
 
     title: str
     values: np.ndarray
@@ -36,28 +36,28 @@ class Panel:
     norm: Normalize | None = None
 
 
-def colour(title: str, image: torch.Tensor) -> Panel:
+def colour(title: str, image: torch.Tensor) -> ImagePanel:
     """An (H, W, 3) image, uint8 or float, limited to [0, 1]."""
     image = image.detach().cpu()
-    return Panel(title, image.numpy() if image.dtype == torch.uint8 else image.clamp(0, 1).numpy())
+    return ImagePanel(title, image.numpy() if image.dtype == torch.uint8 else image.clamp(0, 1).numpy())
 
 
-def scalar(title: str, values: torch.Tensor, low: float | None = None, high: float | None = None) -> Panel:
+def scalar(title: str, values: torch.Tensor, low: float | None = None, high: float | None = None) -> ImagePanel:
     """(H, W) numbers, dark to bright; NaN is white."""
-    return Panel(title, values.detach().cpu().numpy(), "viridis", Normalize(low, high))
+    return ImagePanel(title, values.detach().cpu().numpy(), "viridis", Normalize(low, high))
 
 
-def logarithmic(title: str, values: torch.Tensor, low: float, high: float) -> Panel:
-    """(H, W) numbers on a logarithmic scale; what is below `low` is white."""
+def logarithmic(title: str, values: torch.Tensor, low: float, high: float) -> ImagePanel:
+    """(H, W) numbers on a logarithmic scale; numbers below `low` are white."""
     values = values.detach().cpu().double()
-    return Panel(title, torch.where(values >= low, values, math.nan).numpy(), "viridis", LogNorm(low, high))
+    return ImagePanel(title, torch.where(values >= low, values, math.nan).numpy(), "viridis", LogNorm(low, high))
 
 
-def signed(title: str, values: torch.Tensor, limit: float | None = None) -> Panel:
+def signed(title: str, values: torch.Tensor, limit: float | None = None) -> ImagePanel:
     """(H, W) numbers, blue below 0, white at 0, red above."""
     array = values.detach().cpu().numpy()
     limit = max(float(np.nanmax(np.abs(array))), 1e-12) if limit is None else limit
-    return Panel(title, array, "RdBu_r", Normalize(-limit, limit))
+    return ImagePanel(title, array, "RdBu_r", Normalize(-limit, limit))
 
 
 def surfel_colours(ids: torch.Tensor) -> torch.Tensor:
@@ -67,7 +67,7 @@ def surfel_colours(ids: torch.Tensor) -> torch.Tensor:
     return torch.where((ids >= 0)[..., None], palette[ids.clamp_min(0)], 1.0)
 
 
-def show(panels: Sequence[Panel], columns: int | None = None, width: float = WIDTH) -> np.ndarray:
+def show(panels: Sequence[ImagePanel], columns: int | None = None, width: float = WIDTH) -> np.ndarray:
     """Draw panels row by row and return their axes, an array of rows."""
     columns = columns or len(panels)
     rows = -(-len(panels) // columns)

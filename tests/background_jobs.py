@@ -1,10 +1,10 @@
 """Long work that tests wait for, done on a second core beside the tests that do not need it.
 
-A test marked `background_job(work, *arguments)` gets what `work(folder, *arguments)` gave, or raises what it raised, as the
-fixture `background_job`. Such tests come last in a run of many. The work should be done in a process of its own: beside others
-it is called in a thread, and had better not touch files there, for tests may have them fail. `folder` is empty and its
-own. Tests with the same mark share one call. Work without arguments is marked `background_job.with_args(work)`, for pytest
-takes a mark called with one function for that function's own mark.
+A test marked `background_job(work, *arguments)` gets what `work(folder, *arguments)` gave, or raises what it raised, as
+the fixture `background_job`. Such tests come last in a run of many. The work should be done in a process of its own:
+beside others it is called in a thread, and had better not touch files there, for tests may have them fail. `folder` is
+empty and its own. Tests with the same mark share one call. Work without arguments is marked
+`background_job.with_args(work)`, for pytest takes a mark called with one function for that function's own mark.
 """
 
 import subprocess

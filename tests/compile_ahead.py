@@ -10,7 +10,7 @@ import warp as wp
 
 from nexwarp.kernels import launch
 from nexwarp.kernels.catalogue import thread_kernels
-from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel
+from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.warmup import Build, compile_all
 
@@ -24,8 +24,8 @@ def builds() -> Iterator[Build]:
             yield Build(kernel, 1)
         for hits in HITS:
             for low_pass in (False, True):
-                yield Build(collect_rows_kernel(real, hits, low_pass, TILE_SIZE), 1)
-                yield Build(collect_rows_backward_kernel(real, hits, low_pass, TILE_SIZE, False), 1)
+                yield Build(collect_simd_kernel(real, hits, low_pass, TILE_SIZE), 1)
+                yield Build(collect_simd_backward_kernel(real, hits, low_pass, TILE_SIZE, False), 1)
 
 
 if __name__ == "__main__":

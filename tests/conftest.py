@@ -17,13 +17,22 @@ from tests import background_jobs
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests on CUDA are skipped where there is none; of many tests, those that wait for work beside them come last."""
+    """Tests on CUDA are skipped where there is none; of many tests, those that wait for work beside them come last.
+
+    The forms of `form` are forms of CPU kernels, so that tests on CUDA run once.
+    """
+    items[:] = [item for item in items if not _twice_on_cuda(item)]
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("cuda"):
                 item.add_marker(pytest.mark.skip(reason="no CUDA device"))
     if len(items) >= background_jobs.MANY:
         items.sort(key=lambda item: background_jobs.key(item) is not None)
+
+
+def _twice_on_cuda(item: pytest.Item) -> bool:
+    parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+    return parameters.get("device") == "cuda" and parameters.get("form") == "scalar"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -46,6 +55,13 @@ def background_job(request: pytest.FixtureRequest, begun: background_jobs.Backgr
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Device to run on: the CPU always, CUDA with `-m cuda`."""
     return torch.device(request.param)
+
+
+@pytest.fixture(params=["simd", "scalar"])
+def form(request: pytest.FixtureRequest) -> Iterator[launch.CpuForm]:
+    """Both forms of the kernels on a CPU: the one written for CPUs, and the bodies that run on CUDA."""
+    with launch.cpu_form(request.param):
+        yield request.param
 
 
 @pytest.fixture(autouse=True)

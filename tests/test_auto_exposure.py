@@ -9,8 +9,8 @@ import torch
 import nexwarp as nw
 from nexwarp.camera import Camera
 from nexwarp.data import write_demo
-from nexwarp.finish import auto_exposure as metering
-from nexwarp.finish.auto_exposure import PLACES, brightness, metered, predict
+from nexwarp.finish import auto_exposure
+from nexwarp.finish.auto_exposure import PLACES, brightness, predict, with_auto_exposure
 from nexwarp.representation import exposures as exposures_module
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config, TextureConfig
@@ -18,7 +18,7 @@ from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
-OPTIONS = {"max_hits": 2, "background": (0.2, 0.5, 0.9), "sh_degree": 3}
+OPTIONS = nw.RenderOptions(max_hits=2, background=(0.2, 0.5, 0.9), sh_degree=3)
 
 
 def looking(x: float, y: float = 0.0) -> Camera:
@@ -84,27 +84,23 @@ def test_what_goes_wrong_with_all_channels_tells_no_more_than_one() -> None:
 
 
 def test_brightness_is_that_of_light(device: torch.device) -> None:
-    """Of a mean over light, not over sRGB; without the gains that renderings get, which come back after it."""
+    """Of a mean over light, not over sRGB; at the mean exposure, whatever exposures the model has."""
     scene = random_scene(40, device=device)
-    surfels, texture = make_surfels(scene), make_texture(device=device)
+    exposures = Exposures.of(torch.full((1, 3), 0.5), [looking(0.0)]).to(device)
+    model = nw.Model(make_surfels(scene), make_texture(device=device), exposures, options=OPTIONS)
     away = Camera(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), K, 64, 480)  # nothing is there
     camera = make_camera(scene)
-    kept = surfels.exposures = Exposures.of(torch.full((1, 3), 0.5), [looking(0.0)]).to(device)
-    found = brightness(surfels, texture, [away, camera], options=OPTIONS)
-    assert surfels.exposures is kept
-    torch.testing.assert_close(found[0], torch.tensor(OPTIONS["background"]).double().log(), atol=1e-6, rtol=0)
-    surfels.exposures = None
-    image = nw.render(surfels, texture, camera, **OPTIONS).image.detach().cpu().double().clamp(0, 1)
+    found = brightness(model, [away, camera])
+    assert model.exposures is exposures and model.options is OPTIONS
+    torch.testing.assert_close(found[0], torch.tensor(OPTIONS.background).double().log(), atol=1e-6, rtol=0)
+    image = nw.Model(model.surfels, model.texture, options=OPTIONS).render(camera).image
+    image = image.detach().cpu().double().clamp(0, 1)
     expected = image.pow(2.2).mean((0, 1)).log() / 2.2
     torch.testing.assert_close(found[1], expected, atol=1e-5, rtol=0)
-    surfels.exposures = kept
-    with pytest.raises(ValueError, match="max_hits"):
-        brightness(surfels, texture, [camera], options=OPTIONS | {"max_hits": 99})
-    assert surfels.exposures is kept
 
 
 @pytest.fixture
-def walls(device: torch.device) -> tuple[nw.Surfels, list[Camera]]:
+def walls(device: torch.device) -> tuple[nw.Model, list[Camera]]:
     """Grey quads of brightness that changes along x, and cameras that go along with gaps; each sees a few."""
     count = 24
     generator = torch.Generator().manual_seed(4)
@@ -115,23 +111,24 @@ def walls(device: torch.device) -> tuple[nw.Surfels, list[Camera]]:
     shape = (means, quats, torch.tensor([0.26, 3.0]).expand(count, 2), torch.full((count,), 0.98))
     surfels = nw.Surfels.from_activated(*shape, torch.full((count, 2), 20.0), sh).to(device)
     places = torch.linspace(0, 8, 49)
-    return surfels, [looking(x) for i, x in enumerate(places.tolist()) if i % 8 not in (3, 4, 5)]
+    model = nw.Model(surfels, None, options=OPTIONS)
+    return model, [looking(x) for i, x in enumerate(places.tolist()) if i % 8 not in (3, 4, 5)]
 
 
 def test_cameras_between_get_the_gains_that_they_would_have_set(
-    walls: tuple[nw.Surfels, list[Camera]], device: torch.device
+    walls: tuple[nw.Model, list[Camera]], device: torch.device
 ) -> None:
     """Where photos leave gaps, exposures that were metered there are several times closer than the poses' alone."""
-    surfels, cameras = walls
+    model, cameras = walls
 
     def own(each: list[Camera]) -> torch.Tensor:
-        return -0.7 * (brightness(surfels, None, each, options=OPTIONS) - offset)
+        return -0.7 * (brightness(model, each) - offset)
 
-    offset = brightness(surfels, None, cameras, options=OPTIONS).mean(0)
+    offset = brightness(model, cameras).mean(0)
     gains = own(cameras)
     assert gains.std() > 0.05
     exposures = Exposures.of(gains, cameras, (-0.1, -0.2, 0.3)).to(device)
-    found = metered(exposures, surfels, None, cameras, options=OPTIONS)
+    found = with_auto_exposure(exposures, model, cameras)
     assert PLACES <= len(found.log_gains) - len(cameras) < PLACES + len(cameras)
     assert torch.equal(found.falloff, exposures.falloff.cpu())
     torch.testing.assert_close(found.log_gains[: len(cameras)].double(), gains, atol=1e-6, rtol=0)
@@ -143,15 +140,15 @@ def test_cameras_between_get_the_gains_that_they_would_have_set(
         return (there - expected).square().mean().sqrt().item()
 
     assert error(found) < 0.4 * error(exposures)
-    again = metered(exposures.to(device), surfels, None, cameras, options=OPTIONS)
+    again = with_auto_exposure(exposures.to(device), model, cameras)
     for name, tensor in again.tensors().items():
         torch.testing.assert_close(tensor, found.tensors()[name], atol=1e-4, rtol=0)
 
 
 @pytest.fixture
-def followed(walls: tuple[nw.Surfels, list[Camera]]) -> tuple[nw.Surfels, list[Camera], torch.Tensor]:
+def followed(walls: tuple[nw.Model, list[Camera]]) -> tuple[nw.Model, list[Camera], torch.Tensor]:
     """The walls, the cameras, and log gains that follow what those see."""
-    seen = brightness(walls[0], None, walls[1], options=OPTIONS)
+    seen = brightness(*walls)
     return *walls, -0.7 * (seen - seen.mean(0))
 
 
@@ -159,48 +156,48 @@ def positions(cameras: list[Camera]) -> list[float]:
     return [camera.position[0].item() for camera in cameras]
 
 
-def test_exposures_that_brightness_does_not_tell_stay(walls: tuple[nw.Surfels, list[Camera]]) -> None:
-    surfels, cameras = walls
+def test_exposures_that_brightness_does_not_tell_stay(walls: tuple[nw.Model, list[Camera]]) -> None:
+    model, cameras = walls
     course = 0.2 * torch.linspace(0, 3, len(cameras)).double().sin()[:, None].expand(len(cameras), 3)
     exposures = Exposures.of(course, cameras)
-    assert metered(exposures, surfels, None, cameras, options=OPTIONS) is exposures
+    assert with_auto_exposure(exposures, model, cameras) is exposures
 
 
 def test_many_photos_leave_room_for_few_places(
-    followed: tuple[nw.Surfels, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
+    followed: tuple[nw.Model, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No more than 1,000 count in all; places are spread over the capture, or there are none."""
-    surfels, cameras, gains = followed
-    monkeypatch.setattr(metering, "PLACES", 15)
+    model, cameras, gains = followed
+    monkeypatch.setattr(auto_exposure, "PLACES", 15)
     for room, count in ((16, 16), (20, 16), (31, 31), (15, 11)):
-        monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + room)
-        found = metered(Exposures.of(gains, cameras), surfels, None, cameras, options=OPTIONS)
+        monkeypatch.setattr(auto_exposure, "MOST_PHOTOS", len(cameras) + room)
+        found = with_auto_exposure(Exposures.of(gains, cameras), model, cameras)
         places = found.positions[len(cameras) :, 0]
         assert len(places) == count
         assert places.min() < 1 and places.max() > 7 and places.sort().values.diff().max() < 2
-    monkeypatch.setattr(metering, "MOST_PHOTOS", len(cameras) + 14)
+    monkeypatch.setattr(auto_exposure, "MOST_PHOTOS", len(cameras) + 14)
     exposures = Exposures.of(gains, cameras)
-    assert metered(exposures, surfels, None, cameras, options=OPTIONS) is exposures
+    assert with_auto_exposure(exposures, model, cameras) is exposures
 
 
 def test_of_very_many_photos_each_keeps_its_own_gains(
-    followed: tuple[nw.Surfels, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
+    followed: tuple[nw.Model, list[Camera], torch.Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cameras are thinned as their gains were."""
-    surfels, cameras, gains = followed
-    for module in (metering, exposures_module):
+    model, cameras, gains = followed
+    for module in (auto_exposure, exposures_module):
         monkeypatch.setattr(module, "MOST_PHOTOS", 26)
-    monkeypatch.setattr(metering, "PLACES", 5)
+    monkeypatch.setattr(auto_exposure, "PLACES", 5)
     exposures = Exposures.of(gains, cameras)
     assert len(exposures.log_gains) == 16
-    found = metered(exposures, surfels, None, cameras, options=OPTIONS)
+    found = with_auto_exposure(exposures, model, cameras)
     assert 16 < len(found.log_gains) <= 26
     torch.testing.assert_close(found.log_gains[:16].double(), gains[::2], atol=1e-6, rtol=0)
     torch.testing.assert_close(found.positions[:16], exposures.positions)
 
 
 def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
-    """Footprints and metered exposures are a rendering's: steps are those of a training that was never looked at."""
+    """Finishing changes nothing of the training: steps are those of a training that was never finished."""
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=20, max_surfels=40, texture=texture)
@@ -217,10 +214,8 @@ def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
     assert len(seen["smoothing SH"]) == len(seen["measuring footprints"]) == views
     assert len(seen["metering exposures"]) in (views, seen["metering exposures"][0][1])
     assert seen["metering exposures"][0][1] >= views + PLACES
-    assert model.surfels.footprints is not None and model.surfels.far_footprints is not None
-    assert model.surfels.exposures is not None
+    assert model.detail_limits is not None and model.exposures is not None
     for trainer in (one, other):
         trainer.run()
-    assert one.surfels.footprints is one.surfels.far_footprints is one.surfels.exposures is None
     for (name, mine), theirs in zip(one.surfels.named_parameters(), other.surfels.parameters(), strict=True):
         assert torch.equal(mine, theirs), name

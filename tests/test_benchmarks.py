@@ -14,21 +14,22 @@ import torch
 
 from benchmarks import __main__ as command
 from benchmarks import bench_cpu, bench_frame, bench_peers, bench_sizes
-from benchmarks.scenes import Scene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
+from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
 from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
-from nexwarp import Camera, NeuralTexture, ops
+from nexwarp import Camera, NeuralTexture, Surfels, ops
 from nexwarp.cameras.cameras_file import save_cameras
-from nexwarp.finish.detail_limits import NEVER
+from nexwarp.model import model as model_module
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import save_model
+from nexwarp.model.options import RenderOptions
 from nexwarp.ops import Pinhole
+from nexwarp.representation.detail_limits import NEVER
 from tests.tolerances import assert_close
 
 CPU = torch.device("cpu")
 
 
-def small_scene() -> Scene:
+def small_scene() -> SurfelScene:
     return cloud(300, 43, 30)
 
 
@@ -124,15 +125,17 @@ def test_command_writes_well_formed_json(tmp_path: Path, capsys: pytest.CaptureF
     assert all(name in shown for name in names)
 
 
+OPTIONS = RenderOptions(max_hits=1, background=(0.0, 1.0, 0.0), sh_degree=2, clamp_texture=True)
+
+
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
     """What `nexwarp train` leaves behind, as far as the benchmarks need it."""
     folder = tmp_path / "run"
     folder.mkdir()
     scene = small_scene()
-    options = {"max_hits": 1, "background": [0.0, 1.0, 0.0], "sh_degree": 2, "low_pass": False, "clamp_texture": True}
     field = NeuralTexture(levels=4, table_size=2**8, width=16)
-    save_model(folder, Model(scene.surfels, field, options))
+    Model(scene.surfels, field, options=OPTIONS).save(folder)
     cameras = {str(i): camera for i, camera in enumerate(scene.cameras)}
     save_cameras(folder / "cameras.json", {"train": cameras, "test": {}})
     return folder
@@ -142,8 +145,8 @@ def test_trained_scene_is_that_of_the_run(run_folder: Path) -> None:
     scene, made = fox(run_folder), small_scene()
     assert torch.equal(scene.surfels.means, made.surfels.means)
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(scene.cameras, made.cameras, strict=True))
-    assert texture(scene) is scene.texture and scene.texture.config["table_size"] == 2**8
-    assert scene.options["max_hits"] == 1 and scene.options["clamp_texture"]
+    assert texture(scene) is scene.model.texture and texture(scene).config["table_size"] == 2**8
+    assert scene.model.options == OPTIONS
     assert "fox" in scene.name and "300 at 43x30" in scene.name
 
 
@@ -156,24 +159,29 @@ def test_trained_scene_takes_part_only_when_it_is_named(run_folder: Path) -> Non
 def test_frames_of_the_trained_scene_are_timed_with_its_options(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = []
-    render = bench_frame.nw.render
+    scene, seen = fox(run_folder), []
+    render = model_module.render
 
-    def note(*args: Any, **options: Any) -> Any:
-        seen.append(options)
-        return render(*args, **options)
+    def note(surfels: Surfels, texture: NeuralTexture, camera: Camera, *options: Any, **others: Any) -> Any:
+        seen.append((texture, options[:5], others["detail_limits"]))
+        return render(surfels, texture, camera, *options, **others)
 
-    monkeypatch.setattr(bench_frame.nw, "render", note)
-    scene = fox(run_folder)
+    monkeypatch.setattr(model_module, "render", note)
     bench_frame.frame(scene, Options(CPU, quick=True))
-    assert seen and all(options == scene.options for options in seen)
+    # The first rendering measures the detail limits, which this model lacks.
+    (_, _, first), *frames = seen
+    assert first is None and len(frames) > 2
+    expected = (OPTIONS.max_hits, OPTIONS.background, OPTIONS.sh_degree, OPTIONS.low_pass, OPTIONS.clamp_texture)
+    assert all(options == expected for _, options, _ in frames)
+    assert all(field is scene.model.texture and limits is not None for field, _, limits in frames)
 
 
 def test_frames_of_an_untrained_scene_have_what_a_finished_model_has() -> None:
-    scene = small_scene()
-    assert scene.options == {} and scene.surfels.far_footprints is None
-    bench_frame.frame(scene, Options(CPU, quick=True))
-    assert (scene.surfels.footprints < NEVER).any() and (scene.surfels.far_footprints < NEVER).any()
+    model = bench_frame.finished(small_scene())
+    assert model.texture is not None and model.detail_limits is not None
+    assert (model.detail_limits.nearest < NEVER).any() and (model.detail_limits.farthest < NEVER).any()
+    again = bench_frame.finished(replace(small_scene(), model=model))
+    assert again.texture is model.texture and again.detail_limits is model.detail_limits
 
 
 def test_command_names_the_trained_scene_or_says_that_it_is_absent(

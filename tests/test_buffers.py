@@ -9,22 +9,26 @@ import torch
 import nexwarp as nw
 from nexwarp.buffers import Buffers, load_buffers, render_buffers, save_buffers
 from nexwarp.io.pictures import load_exr, save_exr
+from nexwarp.representation.detail_limits import DetailLimits
 from tests.reference.collect import camera_rays, pixel_centers, rotations
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.tolerances import assert_close
+from tests.tolerances import FLIPS, assert_close
 
 BACKGROUND = (0.3, 0.9, 0.1)
 PASSES = [f.name for f in fields(Buffers) if f.name not in ("camera", "background")]
 
 
-def make(count: int = 24, max_hits: int = 2, textured: bool = True, device: torch.device | str = "cpu") -> Buffers:
+def make(
+    count: int = 24, max_hits: int = 2, textured: bool | str = True, device: torch.device | str = "cpu"
+) -> Buffers:
     scene = random_scene(count, device=device)
     texture = make_texture(device=device, residual=textured == "residual") if textured else None
     surfels, camera = make_surfels(scene), make_camera(scene)
+    limits = None
     if textured == "residual":
-        surfels.footprints = torch.full((len(surfels),), 3.5 / camera.focal, device=device)
-        surfels.far_footprints = torch.full((len(surfels),), 4.0 / camera.focal, device=device)
-    return render_buffers(surfels, texture, camera, max_hits, BACKGROUND)
+        limits = DetailLimits(*(torch.full((len(surfels),), x / camera.focal, device=device) for x in (3.5, 4.0)))
+    options = nw.RenderOptions(max_hits=max_hits, background=BACKGROUND)
+    return render_buffers(nw.Model(surfels, texture, detail_limits=limits, options=options), camera)
 
 
 @pytest.mark.parametrize(("max_hits", "textured"), [(2, True), (2, False), (8, True), (0, False), (2, "residual")])
@@ -67,10 +71,9 @@ def test_file_holds_named_channels(tmp_path: Path) -> None:
         ids = next(p for p in file.parts if p.name() == "ids.1").channels["Y"].pixels
     three, one = dict.fromkeys("RGB", np.float32), {"Y": np.float32}
     assert kinds == {
-        **dict.fromkeys(["image", "plain", "textured", "normal", "colors.0", "colors.1"], three),
-        **dict.fromkeys(
-            ["alpha", "expected_depth", "top_depth", *(f"{n}.{k}" for n in ("depths", "weights") for k in (0, 1))], one
-        ),
+        **dict.fromkeys(["image", "plain", "textured", "normals", "colors.0", "colors.1"], three),
+        **dict.fromkeys(["alpha", "expected_depth", "median_depth", "top_depth"], one),
+        **dict.fromkeys([f"{n}.{k}" for n in ("depths", "weights") for k in (0, 1)], one),
         "ids.0": {"Y": np.uint32},
         "ids.1": {"Y": np.uint32},
     }
@@ -84,28 +87,52 @@ def test_expected_depth_is_the_mean_over_all_hits(device: torch.device) -> None:
     expected = (full.weights.double() * full.depths).sum(-1) / total.clamp_min(1e-30)
     assert_close(full.expected_depth, expected, kind="value", name="expected_depth")
     missed = total == 0
-    assert missed.any() and (full.expected_depth[missed] == 0).all() and (full.normal[missed] == 0).all()
+    assert missed.any()
+    for name in ("expected_depth", "median_depth", "top_depth", "normals"):
+        assert (getattr(full, name)[missed] == 0).all(), name
     # All hits' weights: nothing is missing from the mean.
     assert_close(full.weights.sum(-1), full.alpha, kind="value", name="weights")
     for max_hits in (0, 1, 2):
         fewer = make(count=8, max_hits=max_hits, device=device)
-        assert fewer.expected_depth.equal(full.expected_depth)
-        assert fewer.top_depth.equal(full.depths[..., 0]) and fewer.normal.equal(full.normal)
+        for name in ("expected_depth", "median_depth", "normals"):
+            assert getattr(fewer, name).equal(getattr(full, name)), name
+        assert fewer.top_depth.equal(full.depths[..., 0])
 
 
-def test_normals_are_the_heaviest_surfels_and_face_the_camera(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    buffers = make(device=device)
-    hit = buffers.ids[..., 0] >= 0
+def test_median_depth_is_where_half_of_the_light_is_left(device: torch.device) -> None:
+    """Hits are blended in the order of their surfels' centres; the first that leaves at most half is the median's."""
+    scene = random_scene(8, device=device)
+    full = make(count=8, max_hits=8, device=device)
+    viewmat = scene["viewmat"].double()
+    centres = scene["means"].double() @ viewmat[2, :3] + viewmat[2, 3]
+    order = torch.where(full.ids >= 0, centres[full.ids.clamp_min(0).long()], torch.inf).argsort(dim=-1, stable=True)
+    weights, depths = (x.gather(-1, order).double() for x in (full.weights, full.depths))
+    left = 1 - weights.cumsum(-1) + weights  # transmittance before each hit
+    last = ((left > 0.5) & (weights > 0)).sum(-1, keepdim=True) - 1
+    hit = last[..., 0] >= 0
+    expected = torch.where(hit, depths.gather(-1, last.clamp_min(0))[..., 0], 0.0)
+    assert 0.1 < (full.alpha > 0.5).double().mean() < 0.9 and ((last > 0) & (full.alpha > 0.5)[..., None]).any()
+    assert_close(full.median_depth, expected, kind="value", name="median_depth", allow_flips=FLIPS)
+
+
+def test_normals_are_the_mean_over_all_hits_and_face_the_camera(device: torch.device) -> None:
+    """Each hit's normal counts by its weight, on the side that its ray comes from."""
+    scene = random_scene(8, device=device)
+    full = make(count=8, max_hits=8, device=device)
+    there = full.ids >= 0
+    hit = there.any(-1)
     axes = rotations(scene["quats"].double())[..., 2]
-    own = axes[buffers.ids[..., 0].clamp_min(0).long()]
+    own = axes[full.ids.clamp_min(0).long()]
     viewmat = scene["viewmat"].double()
     intrinsics = (scene["K"][0, 0], scene["K"][1, 1], scene["K"][0, 2], scene["K"][1, 2])
     pixels = pixel_centers(scene["width"], scene["height"], viewmat)
     rays = (camera_rays(pixels, *intrinsics) @ viewmat[:3, :3]).view(*hit.shape, 3)
-    cosine = (buffers.normal * own).sum(-1)[hit]
-    assert (cosine.abs() - 1).abs().max() < 1e-5 and (cosine < 0).any() and (cosine > 0).any()
-    assert ((buffers.normal * rays).sum(-1)[hit] < 0).all()
+    facing = torch.where((own * rays[:, :, None]).sum(-1, keepdim=True) > 0, -own, own)
+    assert (facing != own).any() and (facing == own).any()
+    expected = torch.nn.functional.normalize((full.weights.double()[..., None] * facing).sum(2), dim=-1)
+    assert_close(full.normals[hit], expected[hit], kind="value", name="normals")
+    assert ((full.normals * rays).sum(-1)[hit] < 0).all()
+    assert ((full.normals.norm(dim=-1)[hit] - 1).abs() < 1e-5).all()
 
 
 def test_a_single_quad_has_its_depths_and_normal() -> None:
@@ -120,10 +147,11 @@ def test_a_single_quad_has_its_depths_and_normal() -> None:
         torch.zeros(1, 1, 3),
     )
     camera = nw.Camera(eye, torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
-    buffers = render_buffers(surfels, None, camera, max_hits=0)
+    buffers = render_buffers(nw.Model(surfels, None), camera, max_hits=0)
     two = torch.full((16, 16), 2.0)
-    assert torch.allclose(buffers.expected_depth, two) and torch.allclose(buffers.top_depth, two)
-    assert buffers.normal.equal(torch.tensor([0.0, 0.0, -1.0]).expand(16, 16, 3))
+    for name in ("expected_depth", "median_depth", "top_depth"):
+        assert torch.allclose(getattr(buffers, name), two), name
+    assert buffers.normals.equal(torch.tensor([0.0, 0.0, -1.0]).expand(16, 16, 3))
 
 
 def test_nothing_in_view(tmp_path: Path) -> None:
@@ -131,12 +159,13 @@ def test_nothing_in_view(tmp_path: Path) -> None:
     surfels = nw.Surfels.from_activated(
         *(scene[k][:0] for k in ("means", "quats", "scales", "opacities", "gammas", "sh"))
     )
-    buffers = render_buffers(surfels, make_texture(), make_camera(scene), 2, BACKGROUND)
+    options = nw.RenderOptions(background=BACKGROUND)
+    buffers = render_buffers(nw.Model(surfels, make_texture(), options=options), make_camera(scene))
     save_buffers(tmp_path / "a.exr", buffers)
     after = load_buffers(tmp_path / "a.exr")
     assert torch.allclose(after.image, torch.tensor(BACKGROUND).expand_as(after.image))
-    for name in ("plain", "textured", "colors", "alpha", "weights", "expected_depth", "top_depth", "normal"):
-        assert (getattr(after, name) == 0).all(), name
+    for name in PASSES:
+        assert name in ("image", "ids") or (getattr(after, name) == 0).all(), name
     assert (after.ids == -1).all()
 
 
@@ -153,7 +182,7 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"cut\.exr: expected a whole OpenEXR file"):
             load_exr(tmp_path / "cut.exr")
     save_exr(tmp_path / "other.exr", {"image": torch.zeros(3, 4, 3)})
-    with pytest.raises(ValueError, match=r"other\.exr: expected the passes of a nexwarp rendering"):
+    with pytest.raises(ValueError, match=r"other\.exr: expected the buffers of a nexwarp rendering"):
         load_buffers(tmp_path / "other.exr")
 
 

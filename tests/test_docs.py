@@ -1,17 +1,22 @@
-"""The documents against the code: options.md is made from it, format.md tells what a run holds, commands can be typed.
+"""The documents against the code: options.md and cli.md are made from it, format.md says what a run holds.
 
-python -m tests.test_docs --write      # writes docs/options.md
+python -m tests.test_docs --write      # writes docs/options.md and docs/cli.md
 """
 
 import ast
+import contextlib
 import dataclasses
+import importlib.util
 import inspect
+import io
 import itertools
 import json
+import os
 import re
 import shlex
 import shutil
 import struct
+import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -27,7 +32,7 @@ from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
-from nexwarp.model.model_file import save_model
+from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
@@ -35,14 +40,15 @@ from nexwarp.train.settings import setting, with_settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 
-# The publication's symbol of a setting, and the section that gives its value; "code": only the authors' code does.
+# The publication's symbol of a setting, and the section that gives its value (docs/paper.md has their titles);
+# "code": only the authors' code gives it.
 SYMBOLS: dict[str, tuple[str, str]] = {
     "preset": ("", ""),
-    "iterations": ("", "Optimization"),
-    "max_surfels": ("P", "Adaptive Density Control"),
-    "max_hits": ("K", "Rendering"),
+    "iterations": ("", "4.3"),
+    "max_surfels": ("P", "4.3"),
+    "max_hits": ("K", "5"),
     "more_hits_from": ("", ""),
-    "sh_degree": ("S = (d + 1)^2", "Results"),
+    "sh_degree": ("S = (d + 1)^2", "5"),
     "sh_every": ("", "code"),
     "coarse": ("", ""),
     "background": ("", "code"),
@@ -63,12 +69,12 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "seed": ("", "code"),
     "deterministic": ("", ""),
     "cuda_graphs": ("", ""),
-    "losses.dssim": ("λ_D-SSIM", "Losses"),
-    "losses.alpha": ("λ_alpha", "Losses"),
+    "losses.dssim": ("λ_D-SSIM", "4.3"),
+    "losses.alpha": ("λ_alpha", "4.3"),
     "losses.alpha_hits": ("", ""),
-    "losses.texture": ("λ_texture", "Losses"),
-    "losses.opacity": ("λ_opacity", "Losses"),
-    "losses.grid": ("λ_grid", "Losses"),
+    "losses.texture": ("λ_texture", "4.3"),
+    "losses.opacity": ("λ_opacity", "4.3"),
+    "losses.grid": ("λ_grid", "4.3"),
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
     "losses.border": ("", ""),
@@ -81,35 +87,37 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.shN": ("", "code"),
     "rates.grid": ("", "code"),
     "rates.mlp": ("", "code"),
-    "texture.levels": ("L", "Results"),
-    "texture.table_size": ("T", "Results"),
-    "texture.features": ("F", "Results"),
+    "texture.levels": ("L", "5"),
+    "texture.table_size": ("T", "5"),
+    "texture.features": ("F", "5"),
     "texture.min_resolution": ("s_0", "code"),
     "texture.max_resolution": ("s_(L-1)", "code"),
-    "texture.width": ("", "Results"),
-    "texture.hidden_layers": ("", "Results"),
-    "texture.sh_degree": ("S = (d + 1)^2", "Results"),
+    "texture.width": ("", "5"),
+    "texture.hidden_layers": ("", "5"),
+    "texture.sh_degree": ("S = (d + 1)^2", "5"),
     "texture.residual": ("", ""),
-    "texture.down_weighting": ("Δ", "Representation"),
-    "densify.start": ("", "Adaptive Density Control"),
-    "densify.stop": ("", "Adaptive Density Control"),
-    "densify.every": ("", "Adaptive Density Control"),
-    "densify.fraction": ("", "Adaptive Density Control"),
-    "densify.prune_opacity": ("", "Adaptive Density Control"),
+    "texture.down_weighting": ("Δ", "4.1"),
+    "densify.start": ("", "4.3"),
+    "densify.stop": ("", "4.3"),
+    "densify.every": ("", "4.3"),
+    "densify.fraction": ("", "4.3"),
+    "densify.prune_opacity": ("", "4.3"),
     "densify.prune_at_cap": ("", "code"),
     "densify.floaters": ("", ""),
 }
 
 INTRODUCTION = """\
-# Options
+# Settings
 
-Made from the code by `python -m tests.test_docs --write`; a test fails when the two disagree.
+Options of each command, and all settings of a training ([below](#all-settings)). The page is made from the code by
+`python -m tests.test_docs --write`; a test fails if the two disagree.
 
-Every command has `--help`. Bad input gives one line on stderr and exit code 2; Ctrl-C exits with 130.
+Every command has `--help` ([Commands](cli.md)). Bad input gives one line on stderr and exit code 2. Ctrl-C exits
+with 130.
 """
 
 SETTINGS = """\
-## Settings
+## All settings
 
 What a training depends on beside its scene: `nexwarp.Config`. `--preset` picks the values to start from, the
 flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
@@ -117,14 +125,15 @@ flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
     nexwarp train SCENE --preset paper --set texture.max_resolution=1024
     nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
 
-VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY, a value of another type or
-out of range is refused before anything is written. The settings of a run are in its `config.json`; with `--resume`
-they come from there, and what is given must agree.
+VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY and a value of another type or
+out of range are refused before anything is written. The settings of a run are in its `config.json`. With `--resume`
+they come from there, and options that are given must agree with them.
 
 `demo` has settings of its own, for a short training on a CPU, with either preset: DEMO.
 
-Symbol and section are the publication's; "code" is what only the authors' code has. Where there is neither, the
-publication has no such thing, and `paper` turns it off or it is of no effect there. Values that differ are bold.
+Symbol and section are the publication's; "code" means that only the authors' code has the setting. A setting without
+either is not in the publication; `paper` turns it off, or it has no effect there. Values that differ are bold.
+[Presets and paper](paper.md) says why they differ.
 """
 
 
@@ -134,10 +143,12 @@ publication has no such thing, and `paper` turns it off or it is of no effect th
 def field_docs(owner: type) -> dict[str, str]:
     """Docstrings of a dataclass's fields, on one line each."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
+    assert isinstance(definition, ast.ClassDef)
     docs = {}
     for line, following in itertools.pairwise(definition.body):
         if isinstance(line, ast.AnnAssign) and isinstance(following, ast.Expr):
-            docs[line.target.id] = " ".join(following.value.value.split())
+            assert isinstance(line.target, ast.Name) and isinstance(following.value, ast.Constant)
+            docs[line.target.id] = " ".join(str(following.value.value).split())
     return docs
 
 
@@ -148,6 +159,7 @@ def options(command: type) -> Iterator[tuple[str, str, str]]:
         extras = getattr(hints[f.name], "__metadata__", ())
         parts = [p for p in (f.type, getattr(hints[f.name], "__origin__", None)) if dataclasses.is_dataclass(p)]
         if parts:
+            assert isinstance(parts[0], type)
             yield from options(parts[0])
             continue
         (shown,) = [e for e in extras if hasattr(e, "metavar")] or [None]
@@ -197,8 +209,49 @@ def options_page() -> str:
         default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
         symbol, section = SYMBOLS[name]
         theirs = theirs if theirs == default else f"**{theirs}**"
+        section = f"paper Sec. {section}" if section[:1].isdigit() else section
         page.append(f"| `{name}` | {default} | {theirs} | {cell(text)} | {symbol} | {section} |")
     return "\n".join(page) + "\n"
+
+
+# docs/cli.md
+
+COMMANDS_PAGE = """\
+# Commands
+
+What `nexwarp COMMAND --help` prints. The page is made from the code by `python -m tests.test_docs --write`; a test
+fails if the two disagree. [Settings](options.md) has the same options as tables, and the keys of `--set`.
+"""
+ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def help_text(*command: str) -> str:
+    """What --help of a command prints, 100 columns wide."""
+    out, columns = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            cli.main([*command, "--help"])
+    finally:
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+    lines = [line.rstrip() for line in ANSI.sub("", out.getvalue()).splitlines()]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).strip()
+
+
+def commands_page() -> str:
+    """The text of docs/cli.md."""
+    page = [COMMANDS_PAGE]
+    for command in ([], *([name] for name in cli.COMMANDS)):
+        page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
+    return "\n".join(page)
+
+
+def test_the_commands_page_is_that_of_the_code():
+    page = (DOCS / "cli.md").read_text(encoding="utf-8")
+    assert page == commands_page(), "docs/cli.md is out of date: python -m tests.test_docs --write"
 
 
 def test_the_options_page_is_that_of_the_code():
@@ -321,40 +374,46 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
+    texture = model.texture
+    assert texture is not None
     others = list(load_cameras(run / "cameras.json")["train"].values())[:3]
     with torch.no_grad():  # more to be seen than after so few steps
-        model.texture.grid.normal_(0, 2)
-        model.surfels.log_scales += 0.7
-        model.surfels.footprints = torch.rand(len(model.surfels)) * 0.2  # some beyond what the camera has, some not
-        model.surfels.far_footprints = torch.rand(len(model.surfels)) * 0.4
-        model.surfels.exposures = Exposures.of(
-            torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]]), others, (-0.3, -0.4, 0.15)
-        )
+        texture.grid.normal_(0, 2)
+        model.surfels.log_scales.add_(0.7)
         model.surfels.raw_gammas.uniform_(-3, 1)
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)
+    count = len(model.surfels)
+    model.detail_limits = DetailLimits(torch.rand(count) * 0.2, torch.rand(count) * 0.4)  # within, and beyond
+    gains = torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]])
+    model.exposures = Exposures.of(gains, others, (-0.3, -0.4, 0.15))
     pixels = [(3, 5), (24, 18), (40, 30), (47, 0), (11, 27), (30, 9)]
-    # As trained; with the texture in place of the plain colours; with a K of 1; and where the texture is not used.
-    for changes in (
-        {},
-        {"residual": False},
-        {"residual": False, "clamp_texture": True},
-        {"max_hits": 1},
-        {"max_hits": 0},
+    # As trained; with the texture in place of the plain colours; and with each option that a file may hold.
+    for residual, changes in (
+        (True, {}),
+        (False, {}),
+        (False, {"clamp_texture": True}),
+        (True, {"max_hits": 1}),
+        (True, {"max_hits": 0}),
+        (True, {"exposure": "mean"}),
+        (True, {"detail_limits": False}),
+        (None, {}),  # without a texture
     ):
-        changes = {"residual": True, "clamp_texture": False, "max_hits": 2} | changes
-        model.texture.residual = model.texture.config["residual"] = changes.pop("residual")
-        model.meta |= changes
-        file = save_model(tmp_path, model)
+        if residual is None:
+            model.texture = None
+        else:
+            texture.residual = texture.config["residual"] = residual
+        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7)).changed(**changes)
+        file = model.save(tmp_path)
         stored = nw.load(file)
         tensors, meta = reader["read"](file)
         drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        plain = nw.Model(stored.surfels, None, stored.exposures, stored.detail_limits, stored.options)
         with torch.no_grad():
-            image = nw.render(stored.surfels, stored.texture, camera, **stored.render_options).image
-            plain = nw.render(stored.surfels, None, camera, **stored.render_options).image
-        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in (image, plain))
+            images = [x.render(camera).image for x in (stored, plain)]
+        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in images)
         np.testing.assert_allclose(drawn, expected, atol=2e-4)
-        assert (abs(expected - untextured).max() > 0.05) == (changes["max_hits"] > 0)
+        assert (abs(expected - untextured).max() > 0.01) == (stored.options.max_hits > 0 and residual is not None)
 
 
 def test_json_files(run):
@@ -378,9 +437,10 @@ def test_checkpoint(run):
     assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
 
 
-# docs/paper.md, docs/migrating.md, and what is said to be typed anywhere
+# docs/paper.md, docs/migrating.md, the README, and commands on any page
 
-PAGES = [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"]
+ROOT = DOCS.parent
+PAGES = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -435,19 +495,69 @@ def test_examples(run, tmp_path, monkeypatch, capsys):
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
 
 
+def test_the_readme_s_python_runs(run, tmp_path, monkeypatch, capsys):
+    """As it stands, where a run of the demo is."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    assert len([line for line in example.splitlines() if line]) <= 12
+    names: dict[str, Any] = {}
+    exec(example, names)
+    shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
+    assert capsys.readouterr().out.splitlines()[0] == shapes
+    assert names["model"].surfels.means.grad.norm() > 0
+
+
+def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
+    """It reads what its command writes."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
+    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
+    exec(example, {})
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1000
+
+
+def test_pages_are_in_the_site_s_navigation():
+    """Each page of docs/ is there, and each is reached from the first page."""
+    listed = set(re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M))
+    pages = {page.name for page in DOCS.glob("*.md")}
+    assert pages <= listed
+    first = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert pages - {"index.md"} <= set(re.findall(r"\]\(([a-z_]+\.md)", first))
+
+
+def test_the_api_page_has_every_public_name():
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
+def test_the_site_builds(tmp_path):
+    """All links and anchors between pages lead somewhere, and all names of the API are found."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "paper Eq. 6" in (tmp_path / "site" / "method" / "index.html").read_text(encoding="utf-8")
+
+
 def test_links():
     """Every link from one document to another leads somewhere."""
-    for page in [*PAGES, DOCS.parent / "CONTRIBUTING.md"]:
+    for page in PAGES:
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def main(arguments: list[str]) -> int:
-    """Write docs/options.md."""
+    """Write docs/options.md and docs/cli.md."""
     if arguments != ["--write"]:
         print("usage: python -m tests.test_docs --write", file=sys.stderr)
         return 2
     (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
+    (DOCS / "cli.md").write_text(commands_page(), encoding="utf-8")
     return 0
 
 

@@ -108,13 +108,13 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
         (
             torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more"),
             2,
-            "nexwarp: error: out of memory: it needed 2.00 GiB; ask for less at a time, such as a smaller size",
+            "nexwarp: error: out of memory: needed 2.00 GiB; try a smaller image size",
         ),
-        (KeyError("means"), 3, "nexwarp: internal error: KeyError: 'means'; --debug shows where"),
+        (KeyError("means"), 3, "nexwarp: internal error: KeyError: 'means'; --debug shows the traceback"),
         (
             RuntimeError("[bold]x[/bold]"),
             3,
-            "nexwarp: internal error: RuntimeError: [bold]x[/bold]; --debug shows where",
+            "nexwarp: internal error: RuntimeError: [bold]x[/bold]; --debug shows the traceback",
         ),
         (KeyboardInterrupt(), 130, "nexwarp: interrupted"),
     ],

@@ -263,8 +263,8 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
     save_splats_ply(tmp_path / "splats.ply", surfels)
     nan = good.index(b"end_header\n") + len(b"end_header\n")
     bad = {
-        "empty": (b"", "expected a PLY file as nexwarp writes it"),
-        "text": (b"ply\nbut then something else", "expected a PLY file as nexwarp writes it"),
+        "empty": (b"", "expected a PLY file written by nexwarp"),
+        "text": (b"ply\nbut then something else", "expected a PLY file written by nexwarp"),
         "short": (good[:-1], f"expected {len(good)} bytes, got {len(good) - 1}"),
         "long": (good + b"x", "expected"),
         "ascii": (good.replace(b"binary_little_endian", b"ascii"), r"expected binary_little_endian 1\.0, got ascii"),
@@ -272,7 +272,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
         "count": (good.replace(b"vertex 4", b"vertex -4"), "expected a number of vertices, got -4"),
         "many": (good.replace(b"vertex 4", b"vertex 999999999999"), "expected a number of vertices"),
         "mixed": (good.replace(b"float x", b"uchar x"), "expected properties of one floating type, got float, uchar"),
-        "list": (good.replace(b"float x", b"list uchar int x"), "expected one value a property"),
+        "list": (good.replace(b"float x", b"list uchar int x"), "expected vertices only, with one value per property"),
         "twice": (good.replace(b"float y", b"float x"), "expected the header of nexwarp surfels"),
         "other": (
             (tmp_path / "splats.ply").read_bytes(),

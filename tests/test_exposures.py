@@ -212,20 +212,20 @@ def test_gains_follow_a_scene_that_is_moved_and_scaled():
 def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff):
     scene = random_scene(40, device=device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
-    options = {"max_hits": 2, "background": (0.2, 0.5, 0.9)}
-    plain = nw.render(surfels, texture, camera, **options)
+    options = nw.RenderOptions(background=(0.2, 0.5, 0.9))
+    plain = nw.render(surfels, texture, camera, background=options.background)
     cameras = [camera, Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
-    surfels.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
-    gains = surfels.exposures.gains(camera)
+    photos = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
+    gains = photos.gains(camera)
     if falloff is not None:
-        gains = gains * surfels.exposures.falloff_of(camera)
+        gains = gains * photos.falloff_of(camera)
         assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
-    out = nw.render(surfels, texture, camera, **options)
+    out = nw.render(surfels, texture, camera, background=options.background, exposures=photos)
     for name in ("image", "plain", "textured"):
         assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
     for name in ("alpha", "weights", "depths"):
         assert torch.equal(getattr(out, name), getattr(plain, name))
-    save_buffers(tmp_path / "a.exr", render_buffers(surfels, texture, camera, **options))
+    save_buffers(tmp_path / "a.exr", render_buffers(nw.Model(surfels, texture, photos, options=options), camera))
     buffers = load_buffers(tmp_path / "a.exr")
     assert_close(buffers.image, out.image, kind="value", name="image of the buffers")
     total = buffers.plain + buffers.textured + (1 - buffers.alpha)[..., None] * buffers.background
@@ -256,7 +256,7 @@ def trained(scene: Scene, **changes: bool) -> tuple[Model, float]:
     trainer = Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
     trainer.run()
     model = trainer.finish()
-    return model, evaluate(model.surfels, model.texture, scene.test, options=model.render_options)["psnr"]
+    return model, evaluate(model, scene.test)["psnr"]
 
 
 def test_training_takes_exposures_out(tmp_path):
@@ -274,7 +274,7 @@ def test_training_takes_exposures_out(tmp_path):
     expected -= expected.mean()
     _, without = trained(scene, exposures=False)
     model, figure = trained(scene, exposures=True)
-    assert (model.surfels.exposures.log_gains - expected[:, None]).abs().max() < 0.03
+    assert (model.exposures.log_gains - expected[:, None]).abs().max() < 0.03
     assert figure > without + 0.5
 
 
@@ -291,9 +291,9 @@ def test_training_takes_vignetting_out(tmp_path):
     scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
     camera = scene.test[0].camera
     even, without = trained(scene, vignetting=False)
-    assert even.surfels.exposures.falloff_of(camera) is None
+    assert even.exposures.falloff_of(camera) is None
     model, figure = trained(scene, vignetting=True)
-    assert (model.surfels.exposures.falloff_of(camera) - lens.falloff_of(camera)).abs().max() < 0.08
+    assert (model.exposures.falloff_of(camera) - lens.falloff_of(camera)).abs().max() < 0.08
     assert figure > without + 0.2
 
 
@@ -315,12 +315,12 @@ def test_no_exposures_where_none_are_wanted(tmp_path, change):
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=2, max_surfels=40, texture=texture, **change)
-    assert Trainer(scene, config, "cpu").finish().surfels.exposures is None
+    assert Trainer(scene, config, "cpu").finish().exposures is None
     # A background that is known is no photo's business.
     known = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
     plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
-    assert Trainer(known, plain, "cpu").finish().surfels.exposures is None
-    assert Trainer(scene, plain, "cpu").finish().surfels.exposures is not None
+    assert Trainer(known, plain, "cpu").finish().exposures is None
+    assert Trainer(scene, plain, "cpu").finish().exposures is not None
 
 
 def test_the_benchmark_tells_spread_and_errors():

@@ -129,7 +129,7 @@ def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_p
     capsys.readouterr()
     with failing(Disk(run, second, FULL)):
         assert cli.main(command) == 2
-    one_line(capsys, "No space left", "training stops at iteration 2", "the model as it is now is saved", "--resume")
+    one_line(capsys, "No space left", "training stops at iteration 2", "the current model is saved", "--resume")
     assert nw.load(run).meta["iteration"] == 2
     assert whole_checkpoints(run) == [1]
 
@@ -139,9 +139,9 @@ def test_a_disk_without_room_is_refused_before_training(trained, scene, tmp_path
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2**20))
     command = ["train", str(scene), "--run", str(tmp_path / "new" / "run"), *FLAGS]
     assert cli.main(command) == 2
-    one_line(capsys, str(tmp_path / "new" / "run"), "expected room", "the disk has 1 MiB left", "--max-surfels")
+    one_line(capsys, str(tmp_path / "new" / "run"), "of free disk space", "got 1 MiB", "--max-surfels")
     assert not (tmp_path / "new").exists()
-    with pytest.raises(StorageError, match="expected room"):
+    with pytest.raises(StorageError, match="of free disk space"):
         check_room(tmp_path, 2**20 + 1)
     check_room(tmp_path, 2**20)
 

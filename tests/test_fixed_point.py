@@ -1,8 +1,7 @@
 """Sums in fixed point: the same values as sums of floats, and the same bits in whatever order."""
 
 import importlib
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.kernels import launch
-from nexwarp.kernels.native.fixed_point import LARGEST, fixed_add
+from nexwarp.kernels.native.fixed_point import LARGEST, fixed_point_add
 from nexwarp.ops._interop import from_fixed_point
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.test_threads import Passes, errors_of
@@ -25,7 +24,7 @@ def add_in_order(
     sums: wp.array2d(dtype=wp.int64),
     bad: wp.array(dtype=wp.int32),
 ):
-    put = wp.static(fixed_add(wp.float32))
+    put = wp.static(fixed_point_add(wp.float32))
     put(sums, 0, terms[order[wp.tid()]], bad)
 
 
@@ -56,39 +55,39 @@ def test_what_does_not_fit_is_not_a_number(term: float) -> None:
 
 
 @pytest.fixture
-def switched(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def switched(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bool], None]]:
     """Switch a CPU to the kernels of CUDA, one thread a pixel, with or without fixed point."""
-    threads = launch.get_num_threads()
 
-    def switch(fixed: bool) -> None:
-        launch.set_num_threads(1)
+    def switch(fixed_point: bool) -> None:
         for name in ("collect", "texture"):
+            # By its full name: the package's attribute is the function of the same name.
             module = importlib.import_module(f"nexwarp.ops.{name}")
-            monkeypatch.setattr(module, "_rows_a_thread", lambda like: False)
-            monkeypatch.setattr(module, "sums_in_fixed_point", lambda like: fixed)
+            monkeypatch.setattr(module, "sums_in_fixed_point", lambda like: fixed_point)
 
-    yield switch
-    launch.set_num_threads(threads)
+    with launch.cpu_form("scalar"):
+        yield switch
 
 
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("max_hits", [0, 2])
-def test_collection_in_fixed_point(low_pass: bool, max_hits: int, switched: Any) -> None:
+def test_collection_in_fixed_point(low_pass: bool, max_hits: int, switched: Callable[[bool], None]) -> None:
     scene = random_scene(150, seed=3, width=61, height=45)
     results = []
-    for fixed in (False, True):
-        switched(fixed)
+    for fixed_point in (False, True):
+        switched(fixed_point)
         passes = Passes(scene, low_pass=low_pass, max_hits=max_hits)
-        passes.hits.watch.errors = errors_of(scene)
+        request = passes.hits.error_request
+        request.errors = errors_of(scene)
         gradients, alone = passes.gradients(), passes.blended(errors_of(scene))
-        results.append(gradients | {"watched": passes.hits.watch.sums, "alone": alone})
+        assert request.sums_after_backward is not None
+        results.append(gradients | {"requested": request.sums_after_backward, "alone": alone})
     for name, plain in results[0].items():
         assert plain.abs().max() > 0, name
         assert_close(results[1][name], plain, kind="gradient", name=name)
 
 
 @pytest.mark.parametrize("features", [1, 2, 4])
-def test_lookup_in_fixed_point(features: int, switched: Any) -> None:
+def test_lookup_in_fixed_point(features: int, switched: Callable[[bool], None]) -> None:
     torch.manual_seed(0)
     texture = nw.NeuralTexture(4, 2**8, features, 1.0, 6.0, width=16)
     torch.nn.init.normal_(texture.grid)
@@ -96,8 +95,8 @@ def test_lookup_in_fixed_point(features: int, switched: Any) -> None:
     depths = 1 + torch.rand(300)
     depths[::7] = 0.0
     results = []
-    for fixed in (False, True):
-        switched(fixed)
+    for fixed_point in (False, True):
+        switched(fixed_point)
         leaf = positions.clone().requires_grad_()
         out = texture(leaf, depths, 24.0)
         factors = torch.randn(out.shape, generator=torch.Generator().manual_seed(1))
@@ -117,10 +116,10 @@ def test_gradients_repeat_bit_for_bit() -> None:
     try:
         for _ in range(5):
             out = nw.render(surfels, texture, camera)
-            watch = out.request_splat_error(out.alpha.detach())
+            request = out.request_splat_error(out.alpha.detach())
             parameters = [*surfels.parameters(), *texture.parameters()]
             grads = torch.autograd.grad(out.image.square().sum() + out.weights.square().sum(), parameters)
-            found.append([*grads, watch.sums, out.splat_error(out.alpha.detach())])
+            found.append([*grads, request.sums_after_backward, out.splat_error(out.alpha.detach())])
     finally:
         torch.use_deterministic_algorithms(False)
     for other in found[1:]:

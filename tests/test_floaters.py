@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras import paths
+from nexwarp.cameras import between as ways
 from nexwarp.data import View
 from nexwarp.train import floaters as module
 from nexwarp.train.floaters import floaters, nearest_depth
@@ -26,7 +26,9 @@ SMALL = (0.3, 0.15, -0.1), 0.002
 BEHIND = (0.0, 0.0, 0.5), 1.0
 
 
-def facing(squares: list[tuple[tuple[float, float, float], float]], device: torch.device) -> nw.Surfels:
+def facing(
+    squares: list[tuple[tuple[float, float, float], float]], device: torch.device, max_hits: int = 2
+) -> nw.Model:
     count = len(squares)
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4)
     means = torch.tensor([place for place, _ in squares])
@@ -34,7 +36,7 @@ def facing(squares: list[tuple[tuple[float, float, float], float]], device: torc
     surfels = nw.Surfels.from_activated(
         means, quats, scales, torch.full((count,), 0.95), torch.full((count, 2), 1.5), torch.zeros(count, 1, 3)
     )
-    return surfels.to(device)
+    return nw.Model(surfels.to(device), None, options=nw.RenderOptions(max_hits=max_hits))
 
 
 @pytest.fixture(autouse=True)
@@ -45,46 +47,46 @@ def between(monkeypatch: pytest.MonkeyPatch) -> list[nw.Camera]:
     return cameras
 
 
-def found(surfels: nw.Surfels, cameras: list[nw.Camera], nearest: list[float], max_hits: int = 2) -> list[bool]:
-    return floaters(surfels, cameras, nearest, torch.Generator(), options={"max_hits": max_hits}).tolist()
+def found(model: nw.Model, cameras: list[nw.Camera], nearest: list[float]) -> list[bool]:
+    return floaters(model, cameras, nearest, torch.Generator()).tolist()
 
 
 @pytest.mark.parametrize("max_hits", [0, 1, 2])
 def test_floaters_are_large_and_much_nearer_than_the_nearest_points(max_hits: int, device: torch.device) -> None:
     """From z = -1, at depths of 1, 0.9 and 1.5, which are 0.6 of 1.67, 1.5 and 2.5."""
-    surfels = facing([NEAR, SMALL, BEHIND], device)
+    model = facing([NEAR, SMALL, BEHIND], device, max_hits)
     ahead = [looking_ahead(-1.0)]
-    assert found(surfels, ahead, [1.68], max_hits) == [True, False, False]
-    assert found(surfels, ahead, [1.65], max_hits) == [False, False, False]
-    assert found(surfels, ahead, [2.55], max_hits) == [True, False, True]
-    assert found(surfels, ahead, [0.0], max_hits) == [False, False, False]
+    assert found(model, ahead, [1.68]) == [True, False, False]
+    assert found(model, ahead, [1.65]) == [False, False, False]
+    assert found(model, ahead, [2.55]) == [True, False, True]
+    assert found(model, ahead, [0.0]) == [False, False, False]
 
 
 def test_the_last_ones_cover_three_thousandths_of_a_picture(device: torch.device) -> None:
     """Two, four and far more, of 3,072 pixels at 80 a unit."""
     two, four = (((0.2 * side, 0.1, -0.01), size) for side, size in ((-1, 0.014), (1, 0.02)))
-    surfels, ahead, options = facing([two, four, NEAR], device), [looking_ahead(-1.0)], {"max_hits": 2}
-    shares = module._shares(surfels, ahead[0], 2.0, options).tolist()
+    model, ahead = facing([two, four, NEAR], device), [looking_ahead(-1.0)]
+    shares = module._shares(model.bare(), ahead[0], 2.0).tolist()
     assert 1e-3 < shares[0] < 2.5e-3 and 3.5e-3 < shares[1] < 6e-3 and shares[2] > 0.2
     for last, expected in ((False, [True, True, True]), (True, [False, True, True])):
-        assert floaters(surfels, ahead, [2.0], torch.Generator(), options=options, last=last).tolist() == expected
+        assert floaters(model, ahead, [2.0], torch.Generator(), last=last).tolist() == expected
 
 
 def test_a_view_between_may_be_nearer_by_the_way_to_it(device: torch.device, between: list[nw.Camera]) -> None:
     """From z = -1, 2 ahead of the training camera: depths of 1 and 1.5 are 0.6 of 3.67 and 4.5, less those 2."""
-    surfels = facing([NEAR, BEHIND], device)
+    model = facing([NEAR, BEHIND], device)
     between.append(looking_ahead(-1.0))
     for nearest, expected in ((3.6, [False, False]), (3.7, [True, False]), (4.6, [True, True])):
-        assert found(surfels, [looking_ahead(-3.0)], [nearest]) == expected
+        assert found(model, [looking_ahead(-3.0)], [nearest]) == expected
 
 
 def test_any_view_tells_by_its_own_points(device: torch.device) -> None:
     """From z = -3, -1 and -3.5: the nearer square is at 3, 1 and 3.5."""
-    surfels = facing([NEAR, BEHIND], device)
+    model = facing([NEAR, BEHIND], device)
     cameras = [looking_ahead(-3.0), looking_ahead(-1.0), looking_ahead(-3.5)]
-    assert found(surfels, cameras, [0.5, 1.7, 0.5]) == [True, False]
-    assert found(surfels, cameras, [1.7, 0.5, 1.7]) == [False, False]
-    assert found(surfels, cameras, [0.5, 0.5, 7.0]) == [True, True]
+    assert found(model, cameras, [0.5, 1.7, 0.5]) == [True, False]
+    assert found(model, cameras, [1.7, 0.5, 1.7]) == [False, False]
+    assert found(model, cameras, [0.5, 0.5, 7.0]) == [True, True]
 
 
 @pytest.mark.parametrize("height", [12, 48, 240])
@@ -104,16 +106,14 @@ def test_sixty_views_between_are_looked_at_or_one_for_each_camera(monkeypatch: p
         found(facing([NEAR], torch.device("cpu")), [looking_ahead(-9.0)] * count, [1.0] * count)
         assert looks == [count] * {1: 60, 40: 2, 130: 1}[count]
         looks.clear()
-        cameras, options = [looking_ahead(-9.0)] * count, {"max_hits": 2}
-        floaters(
-            facing([NEAR], torch.device("cpu")), cameras, [1.0] * count, torch.Generator(), options=options, last=True
-        )
+        cameras = [looking_ahead(-9.0)] * count
+        floaters(facing([NEAR], torch.device("cpu")), cameras, [1.0] * count, torch.Generator(), last=True)
         assert looks == [count] * {1: 240, 40: 6, 130: 2}[count]
 
 
 def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the way between cameras, which look along z from z = -0.3 to 0.3; the wall is at z = 2.4."""
-    monkeypatch.setattr(module, "between", paths.between)
+    monkeypatch.setattr(module, "between", ways.between)
     monkeypatch.setattr(module, "NEARER", 0.999)
     ring = []
     for i in range(8):
@@ -122,12 +122,12 @@ def test_a_wall_as_far_as_the_nearest_points_is_none(device: torch.device, monke
         viewmat[:3, 3] = torch.tensor([math.cos(angle), math.sin(angle), 0.3 * math.sin(3 * angle)])
         ring.append(nw.Camera(viewmat, looking_ahead(0.0).K, 64, 48, 0.01))
     wall = [((x / 2, y / 2, 2.4), 0.4) for x in range(-6, 7) for y in range(-6, 7)]
-    surfels = facing(wall, device)
+    model = facing(wall, device)
     for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
         nearest = [2.4 - camera.position[2].item() for camera in ring]
-        assert not floaters(surfels, ring, nearest, generator, options={"max_hits": 2}).any()
-        assert floaters(surfels, ring, [1.1 * x for x in nearest], generator, options={"max_hits": 2}).any()
+        assert not floaters(model, ring, nearest, generator).any()
+        assert floaters(model, ring, [1.1 * x for x in nearest], generator).any()
 
 
 def test_nearest_depth_by_hand() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.fuzz import Failure, fuzz
 from benchmarks.fuzz_inputs import Files
-from benchmarks.fuzz_targets import TARGETS, Target
+from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
 DRAWN = ("nerfstudio", "config", "colmap_binary")
 DRIVERS = {"mutate": (100, tuple(TARGETS)), "hypothesis": (40, DRAWN)}
@@ -107,7 +107,9 @@ def _one(folder: Path) -> list[Files]:
 def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, kind: str) -> None:
     if kind == "hang":
         monkeypatch.setattr("benchmarks.fuzz.HANG", 1.0)
-    result = fuzz(Target("one", _one, read, ("a",)), seconds=60.0, inputs=1, seed=3, driver="mutate", failed=tmp_path)
+    result = fuzz(
+        FuzzTarget("one", _one, read, ("a",)), seconds=60.0, inputs=1, seed=3, driver="mutate", failed=tmp_path
+    )
     (failure,) = result.failures
     assert isinstance(failure, Failure) and failure.kind == kind and (failure.target, failure.index) == ("one", 0)
     assert failure.folder is not None and (failure.folder / "failure.txt").is_file()

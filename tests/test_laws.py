@@ -21,6 +21,9 @@ from tests.scenes import (
 )
 from tests.tolerances import FLIPS, assert_close, assert_finite, assert_same_ids
 
+# On a CPU both forms of the kernels: see `conftest.form`.
+pytestmark = pytest.mark.usefixtures("form")
+
 BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
 BACKGROUND = (0.1, 0.4, 0.7)
 MAX_HITS = 8

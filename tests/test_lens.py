@@ -57,7 +57,7 @@ def fisheye(x, y, k1, k2, k3, k4):
 
 @pytest.mark.parametrize(("model", "closed"), [("OPENCV", opencv), ("OPENCV_FISHEYE", fisheye)])
 def test_maps_are_opencvs_formulas(model, closed):
-    target = lens(model).pinhole()
+    target = lens(model).undistorted()
     x, y, _ = rays_of(target).T
     x, y = closed(x, y, *LENSES[model][4:])
     expected = np.stack([F[0] * x + F[2], F[1] * y + F[3]], axis=1)
@@ -68,7 +68,7 @@ def test_maps_are_opencvs_formulas(model, closed):
 @pytest.mark.parametrize("model", LENSES)
 def test_pixels_come_from_where_the_lens_put_them(model):
     """A photo whose colours are its own coordinates: what is undistorted tells where each pixel came from."""
-    target = lens(model).pinhole()
+    target = lens(model).undistorted()
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     photo = torch.from_numpy(np.stack([2 * x, 2 * y, 0 * x + 7], axis=-1).astype(np.uint8))
     way = Maps().get(lens(model), target, None)
@@ -85,7 +85,7 @@ def test_pixels_come_from_where_the_lens_put_them(model):
 @pytest.mark.parametrize("model", LENSES)
 def test_an_undistorted_image_is_no_larger_than_it_must(model):
     """It keeps the focal length; some of its edge lies within a pixel or two of the photo's edge."""
-    target = lens(model).pinhole()
+    target = lens(model).undistorted()
     assert target.K[0, 0] == LENSES[model][0] and target.width <= 2 * WIDTH and target.height <= 2 * HEIGHT
     pixels = lens(model).project(rays_of(target))
     gap = np.minimum(pixels, [WIDTH, HEIGHT] - pixels).min(axis=1)
@@ -94,7 +94,7 @@ def test_an_undistorted_image_is_no_larger_than_it_must(model):
 
 def test_masks_take_the_nearest_pixel_and_end_with_the_photo():
     here = lens("OPENCV")
-    target = here.pinhole()
+    target = here.undistorted()
     wide = target.resized(target.width, target.height)
     wide.K[:2, :2] *= 0.5  # twice the field of view: three quarters lie outside the photo
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
@@ -119,7 +119,7 @@ def test_the_faces_of_a_panorama_show_their_directions():
     y = np.sin(latitude)[:, None] + 0 * longitude
     photo = torch.from_numpy(np.round(127.5 + 127.5 * np.stack([x, y, z], axis=-1)).astype(np.uint8))
     sphere = Lens("EQUIRECTANGULAR", tuple(map(float, size)), *size)
-    target = sphere.pinhole()
+    target = sphere.undistorted()
     assert target.width == target.height == round(size[0] / np.pi)
     maps, covered = Maps(), np.zeros(3)
     for face, rotation in FACES.items():
@@ -173,7 +173,7 @@ def test_absurd_lenses_give_finite_maps_of_bounded_size():
             assert "focal lengths" in str(error)
             refused += 1
             continue
-        target = here.pinhole()
+        target = here.undistorted()
         assert 1 <= target.width <= 80 and 1 <= target.height <= 60 and np.isfinite(target.K).all()
         way = Maps().get(here, target, None)
         assert way.grid.isfinite().all() and way.grid.abs().max() <= 2

@@ -24,7 +24,7 @@ from nexwarp.io.json_files import parse_json
 from nexwarp.model.model_file import load, save_model
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
-from tests.test_checkpoint import make_model, rewrite
+from tests.model_file_support import make_model, rewrite
 from tests.test_scene import HEIGHT, WIDTH, make_scene, pose
 
 CAMERA_SIZE = 8 + 8  # where width and height lie in cameras.bin, after the count, id and model
@@ -253,7 +253,7 @@ def test_too_many_points(tmp_path, monkeypatch):
 def test_a_models_tables_are_checked_before_they_are_allocated(tmp_path, changes):
     file = save_model(tmp_path, make_model())
     rewrite(file, lambda tensors, meta: meta["texture"].update(changes))
-    with pytest.raises(ValueError, match=r"the tensors do not make a model \(.*expected"):
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(.*expected"):
         load(file)
 
 

@@ -182,7 +182,7 @@ def test_masks_that_do_not_fit_are_refused(metric: Callable[..., float]) -> None
     image, target = images()
     with pytest.raises(ValueError, match=r"^mask: expected bool of shape \(48, 61\), got torch.uint8 of shape"):
         metric(image, target, torch.ones(48, 61, dtype=torch.uint8))
-    with pytest.raises(ValueError, match=r"^mask: expected pixels that count, got none$"):
+    with pytest.raises(ValueError, match=r"^mask: expected at least one included pixel, got none$"):
         metric(image, target, torch.zeros(48, 61, dtype=torch.bool))
 
 

@@ -20,6 +20,7 @@ from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
+from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels_ply import load_surfels_ply
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.folder import SceneSource, create_run
@@ -29,14 +30,7 @@ from tests.scenes import make_surfels, make_texture, random_scene
 from tests.test_paths import ring, row
 
 TRAIN, TEST = ["b.png", "c.jpg", "d.png", "e.png"], ["a.png", "sub/f.png"]
-META = {
-    "max_hits": 2,
-    "background": [0.1, 0.2, 0.3],
-    "sh_degree": 3,
-    "low_pass": False,
-    "clamp_texture": False,
-    "format_version": 1,
-}
+OPTIONS = RenderOptions(background=(0.1, 0.2, 0.3))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = random_scene(40)
     scene["means"] = scene["means"] - scene["means"].mean(0) + torch.tensor([1.0, -2.0, 0.3])
     create_run(run, SceneSource(str(run.parent / "scene"), "images_2"), Config(), "cpu")
-    save_model(run, Model(make_surfels(scene), make_texture(), dict(META)))
+    save_model(run, Model(make_surfels(scene), make_texture(), options=OPTIONS))
     cameras = [each.to(torch.float32) for each in ring(6)]
     sets = {"train": dict(zip(TRAIN, cameras[1:5], strict=True)), "test": dict(zip(TEST, cameras[::5], strict=True))}
     save_cameras(run / "cameras.json", sets)
@@ -76,7 +70,7 @@ def picture(file: Path) -> torch.Tensor:
 def rendered(run: Path, camera: nw.Camera) -> torch.Tensor:
     model = nw.load(run)
     with torch.no_grad():
-        return to_uint8(nw.render(model.surfels, model.texture, camera, **model.render_options).image)
+        return to_uint8(model.render(camera).image)
 
 
 # Still views
@@ -104,7 +98,7 @@ def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.Ca
     cameras = load_cameras(run / "cameras.json")
     model = nw.load(run)
     log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
-    model.surfels.exposures = Exposures.of(log_gains, list(cameras["train"].values()))
+    model.exposures = Exposures.of(log_gains, list(cameras["train"].values()))
     save_model(run, model)
     assert command("info", run) == 0
     assert "0.67 to 1.35 times the photos' mean" in capsys.readouterr().out
@@ -112,14 +106,14 @@ def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.Ca
     assert torch.equal(picture(run / "renders/test/a.png"), rendered(run, cameras["test"]["a.png"]))
     exposed = load_buffers(run / "renders/test/a.exr")
     assert command("render", run, "--set", "test", "--buffers", "--exposure", "mean") == 0
-    mean, gains = load_buffers(run / "renders/test/a.exr"), model.surfels.exposures.gains(cameras["test"]["a.png"])
+    mean, gains = load_buffers(run / "renders/test/a.exr"), model.exposures.gains(cameras["test"]["a.png"])
     assert (gains - 1).abs().max() > 0.05
     for name in ("image", "plain", "textured", "colors", "background"):
         torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
     # The model of the caller is as it was.
     order = RenderOrder(path=None, views="test", exposure="mean")
     order.prepare(run).render(model)
-    assert model.surfels.exposures is not None
+    assert model.exposures is not None
     assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))
 
 
@@ -211,7 +205,7 @@ def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
     total = buffers.plain + (buffers.weights[..., None] * buffers.colors).sum(2)
     total = total + (1 - buffers.alpha)[..., None] * buffers.background
     assert (total - buffers.image).abs().max() <= 1e-5
-    assert buffers.background.tolist() == torch.tensor(META["background"]).tolist()
+    assert buffers.background.tolist() == torch.tensor(OPTIONS.background).tolist()
     assert to_uint8(buffers.image).equal(picture(run / "renders" / "test" / "sub" / "f.png"))
     shutil.rmtree(run / "renders")
     assert command("render", run, "--path", "ellipse", "--frames", "2", "--buffers") == 0
@@ -297,8 +291,8 @@ def refuses(run: Path, capsys: pytest.CaptureFixture) -> Callable[..., None]:
         (["--path", "ellipse", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
         (["--video", "a.mp4", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
         (["--frames", "-1"], ["--frames: expected at least 0, got -1"]),
-        (["--set", "test", "--frames", "5"], ["--frames: expected with --path or --video"]),
-        (["--fps", "30"], ["--fps: expected with --video"]),
+        (["--set", "test", "--frames", "5"], ["--frames: expected together with --path or --video"]),
+        (["--fps", "30"], ["--fps: expected together with --video"]),
         (["--video", "a.mp4", "--fps", "0"], ["--fps: expected more than 0"]),
         (["--video", "a.avi"], ["--video: a.avi: expected a video ending in .mp4"]),
         (["--size", "100"], ["--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100'"]),
@@ -320,7 +314,7 @@ def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
     path.write_text("{")
     refuses(["render", "--path", path], str(path), "expected JSON")
     save_camera_path(path, ring(2))
-    refuses(["render", "--path", path, "--frames", "3"], "--frames: expected none with", "got 3")
+    refuses(["render", "--path", path, "--frames", "3"], "--frames: expected no value with", "got 3")
     data = json.loads(path.read_text())
     data["camera_path"][1]["camera_to_world"] = [0.0] * 15 + [1.0]
     path.write_text(json.dumps(data))

@@ -135,11 +135,11 @@ def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
 def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
     photos = torch.stack([view.image for view in scene.train]).double() / 255
     assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
-    assert make_trainer(scene).render_options()["background"] == mean_color(scene.train)
+    assert make_trainer(scene).render_options().background == mean_color(scene.train)
     black = make_trainer(scene, background=(0.0, 0.0, 0.0))
-    assert black.render_options()["background"] == (0.0, 0.0, 0.0)
+    assert black.render_options().background == (0.0, 0.0, 0.0)
     white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
-    assert make_trainer(white).render_options()["background"] == (1.0, 1.0, 1.0)
+    assert make_trainer(white).render_options().background == (1.0, 1.0, 1.0)
 
 
 def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
@@ -155,7 +155,7 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
         expected = photo[:10] + 0.8 * (view.background - 1.0)
         assert_close(view.photo[:10], expected, kind="value", name="transparent")
         assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
-    assert trainer.render_options()["background"] == (1.0, 1.0, 1.0)
+    assert trainer.render_options().background == (1.0, 1.0, 1.0)
 
 
 # Masks
@@ -180,9 +180,7 @@ def redness(trainer: Trainer) -> float:
     """How much redder than their photos the test views are, in the middle, 0 to 1."""
     views = trainer.scene.test
     with torch.no_grad():
-        images = [
-            nw.render(trainer.surfels, trainer.texture, v.camera, **trainer.render_options()).image for v in views
-        ]
+        images = [out.image for out in trainer.model().render([view.camera for view in views])]
     pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
     return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
 
@@ -212,8 +210,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
         trainer.run()
         with torch.no_grad():
             view = trainer.targets.from_view(0, 1)
-            options = trainer.render_options()
-            outs = [nw.render(trainer.surfels, trainer.texture, v.camera, **options) for v in scene.train]
+            outs = trainer.model().render([v.camera for v in scene.train])
         alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
         if mode == "background":
             assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
@@ -227,14 +224,14 @@ def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
     mask[:, :24] = True
     view = dataclasses.replace(scene.test[0], mask=mask)
     spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
-    options = trainer.render_options()
+    model = trainer.model()
 
     def judge(*views: View, mode: str = "ignore") -> dict:
         metrics = ("psnr", "ssim", "flip")
-        return evaluate(trainer.surfels, trainer.texture, views, options=options, mask_mode=mode, metrics=metrics)
+        return evaluate(model, views, mask_mode=mode, metrics=metrics)
 
     one, other = judge(view), judge(spoilt)
     assert one["psnr"] == other["psnr"]
     assert judge(view, mode="background")["psnr"] == judge(spoilt, mode="background")["psnr"] != one["psnr"]
     with pytest.raises(ValueError, match=r"^metrics: expected some of psnr, ssim, flip, lpips, got 'mse'$"):
-        evaluate(trainer.surfels, trainer.texture, [view], options=options, metrics=("mse",))
+        evaluate(model, [view], metrics=("mse",))

@@ -24,7 +24,7 @@ from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.sfm.pairs import components, exhaustive_pairs, sequential_pairs
 from nexwarp.sfm.photos import list_photos
 from nexwarp.sfm.report import Overlaps, advise, left_out
-from tests.test_cli import refused, snapshot
+from tests.cli.support import refused, snapshot
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
 DISTANCE = 3.15  # of the cameras from what they look at
@@ -173,7 +173,7 @@ def test_distortion_is_found_and_taken_out(arc, tmp_path):
     folder = write_photos(tmp_path / "bent", bent)
     report = reconstruct(folder, tmp_path / "scene", SfmOptions(camera_model="simple_radial"))
     assert len(report.registered) == VIEWS
-    assert report.cameras[0]["params"][3] == pytest.approx(K1, abs=0.03)
+    assert report.cameras[0].params[3] == pytest.approx(K1, abs=0.03)
     assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
     scene = load_scene(tmp_path / "scene")
     shape = scene.train[0].image.shape

@@ -19,7 +19,6 @@ from tests.reference.sh import basis as sh_basis
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 
-OPTIONS = {"max_hits": 2}
 SIDE = 24
 CONSTANT = 0.28209479177387814  # the harmonic of degree 0
 ROUGHNESS = torch.tensor([(degree * (degree + 1) / 12) ** 2 for degree in range(4) for _ in range(2 * degree + 1)])
@@ -66,7 +65,7 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
     mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     mask[:, : SIDE // 2] = True
     views = [*around([0.0, 0.7]), view([0.5, -0.5, -4.0], mask)]
-    found, total = (x.float() for x in seen_directions(surfels, views, options=OPTIONS))
+    found, total = (x.float() for x in seen_directions(nw.Model(surfels, None), views))
     row, column = torch.triu_indices(16, 16)
     expected, expected_total = torch.zeros_like(found), torch.zeros_like(total)
     for v in views:
@@ -97,14 +96,14 @@ def test_coefficients_are_those_of_ridge_regression(device: torch.device, streng
     """A minimum of what the module's docstring says, by least squares over its terms, not by their normal equations."""
     surfels, views = blob(device), around([-0.6, -0.2, 0.1, 0.5])
     before = surfels.sh.detach().clone()
-    weights = torch.stack([seen_directions(surfels, [v], options=OPTIONS)[1][0] for v in views]).cpu()
+    weights = torch.stack([seen_directions(nw.Model(surfels, None), [v])[1][0] for v in views]).cpu()
     directions = torch.stack([-v.camera.position for v in views]).double()
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=1), 3)  # the surfel is in the world's middle
     seen = (weights / weights.sum()).sqrt()[:, None] * basis
     terms = torch.cat([seen, strength**0.5 * torch.diag(ROUGHNESS.double().sqrt())])
     targets = torch.cat([seen @ before[0].double().cpu(), torch.zeros(16, 3, dtype=torch.float64)])
     expected = torch.linalg.lstsq(terms, targets, driver="gelsd").solution
-    found = torch.cat(smooth_sh(surfels, views, strength, options=OPTIONS), dim=1)[0].double().cpu()
+    found = torch.cat(smooth_sh(nw.Model(surfels, None), views, strength), dim=1)[0].double().cpu()
     assert torch.equal(surfels.sh, before)
     # Harmonics of float32: what their last bits tell of unseen directions grows as strength falls.
     assert (found - expected).abs().max() < 1e-4 < (found - before[0].double().cpu()).abs().max()
@@ -114,7 +113,7 @@ def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch
     """Coefficients of which views tell nothing go: what is left is the same whatever these were."""
     surfels, views = blob(device), around([-0.5, 0.0, 0.5])
     learnt = (surfels.sh0.detach().clone(), surfels.shN.detach().clone())
-    smooth = smooth_sh(surfels, views, 0.01, options=OPTIONS)
+    smooth = smooth_sh(nw.Model(surfels, None), views, 0.01)
     assert (colors(surfels, views, smooth) - colors(surfels, views, learnt))[:, 0].abs().max() < 0.02
     far = around([math.pi])
     assert (colors(surfels, far, smooth) - colors(surfels, far, learnt))[:, 0].abs().max() > 0.05
@@ -124,14 +123,14 @@ def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch
     with torch.no_grad():
         surfels.sh0 += hidden[None, :1, None]
         surfels.shN += hidden[None, 1:, None]
-    again = smooth_sh(surfels, views, 0.01, options=OPTIONS)
+    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
     for a, b in zip(smooth, again, strict=True):
         assert (a - b)[0].abs().max() < 1e-3 < hidden.abs().max()
 
 
 def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device: torch.device) -> None:
     surfels, views = blob(device), around([-0.5, 0.0, 0.5])
-    sh0, shN = smooth_sh(surfels, views, MAX_STRENGTH, options=OPTIONS)
+    sh0, shN = smooth_sh(nw.Model(surfels, None), views, MAX_STRENGTH)
     assert shN.abs().max() < 1e-5
     learnt = colors(surfels, views, (surfels.sh0, surfels.shN))[:, 0]
     flat = colors(surfels, views, (sh0, shN))[0, 0]
@@ -139,19 +138,19 @@ def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device
     with torch.no_grad():
         surfels.sh0.copy_(sh0)
         surfels.shN.zero_()
-    again = smooth_sh(surfels, views, 0.01, options=OPTIONS)
+    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
     assert_close(again[0], sh0, kind="value", name="sh0")
     assert again[1].abs().max() < 1e-6
 
 
 def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.device) -> None:
     surfels, views = blob(device), around([-0.5, 0.5])  # one view alone is told by one colour
-    sh0, shN = smooth_sh(surfels, views, 0.01, options=OPTIONS)
+    sh0, shN = smooth_sh(nw.Model(surfels, None), views, 0.01)
     assert torch.equal(sh0[1], surfels.sh0[1]) and not shN[1].any() and shN[0].abs().max() > 1e-3
     empty = Surfels({name: x[:0] for name, x in surfels.state_dict().items()})
-    assert [x.shape for x in smooth_sh(empty, views, 0.01, options=OPTIONS)] == [(0, 1, 3), (0, 15, 3)]
+    assert [x.shape for x in smooth_sh(nw.Model(empty, None), views, 0.01)] == [(0, 1, 3), (0, 15, 3)]
     flat = Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
-    for a, b in zip(smooth_sh(flat, views, 0.01, options=OPTIONS), (flat.sh0, flat.shN), strict=True):
+    for a, b in zip(smooth_sh(nw.Model(flat, None), views, 0.01), (flat.sh0, flat.shN), strict=True):
         assert torch.equal(a, b)
 
 
@@ -161,17 +160,17 @@ def test_degrees_that_are_not_rendered_take_no_part(device: torch.device, degree
     surfels, views = blob(device), around([-0.5, 0.0, 0.5])
     count = (degree + 1) ** 2
     less = Surfels({name: x[:, : count - 1] if name == "shN" else x for name, x in surfels.state_dict().items()})
-    sh0, shN = smooth_sh(surfels, views, 0.01, options=OPTIONS | {"sh_degree": degree})
-    for a, b in zip((sh0, shN[:, : count - 1]), smooth_sh(less, views, 0.01, options=OPTIONS), strict=True):
+    sh0, shN = smooth_sh(nw.Model(surfels, None, options=nw.RenderOptions(sh_degree=degree)), views, 0.01)
+    for a, b in zip((sh0, shN[:, : count - 1]), smooth_sh(nw.Model(less, None), views, 0.01), strict=True):
         assert_close(a, b, kind="value", name="degrees")
     assert torch.equal(shN[:, count - 1 :], surfels.shN[:, count - 1 :])
 
 
 def test_many_surfels_are_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     surfels, views = make_surfels(random_scene(50, device=device)), around([0.0, 0.4])
-    whole = smooth_sh(surfels, views, 0.01, options=OPTIONS)
+    whole = smooth_sh(nw.Model(surfels, None), views, 0.01)
     monkeypatch.setattr("nexwarp.finish.sh_smoothing.SURFELS", 7)
-    for a, b in zip(smooth_sh(surfels, views, 0.01, options=OPTIONS), whole, strict=True):
+    for a, b in zip(smooth_sh(nw.Model(surfels, None), views, 0.01), whole, strict=True):
         assert_close(a, b, kind="value", name="parts")
 
 
@@ -192,7 +191,7 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
         assert any(stage.graph is not None for stage in asked.graphs.stages.values())
     model = asked.finish()
     assert model.meta["smooth_sh"] == 0.01 and model.surfels is not asked.surfels
-    assert model.surfels.footprints is not None and asked.surfels.footprints is None
+    assert model.detail_limits is not None
     assert not torch.equal(model.surfels.shN, asked.surfels.shN)
     kept = {name: x.clone() for name, x in model.surfels.state_dict().items()}
     asked.run()

@@ -47,13 +47,13 @@ def test_growth_is_told_from_ups_and_downs(values, flat):
 
 
 def test_verdicts_tell_figures_by_kind():
-    looks = [(i, {"host": 100 * MIB, "GPU used": (100 + (i > 900)) * 10 * MIB}) for i in range(10, 1010, 10)]
-    host, gpu = judge(looks, 1000)
+    samples = [(i, {"host": 100 * MIB, "GPU used": (100 + (i > 900)) * 10 * MIB}) for i in range(10, 1010, 10)]
+    host, gpu = judge(samples, 1000)
     assert (host.name, host.flat, host.change) == ("host", True, 0.0)
     assert gpu.name == "GPU used" and gpu.first == 1000 * MIB and gpu.last > gpu.first
     assert gpu.change == pytest.approx((gpu.last - gpu.first) / gpu.first)
-    with pytest.raises(ValueError, match="looks: expected some in"):
-        judge(looks[:40], 1000)
+    with pytest.raises(ValueError, match="samples: expected some in"):
+        judge(samples[:40], 1000)
 
 
 def test_a_leak_fails_the_command(monkeypatch, capsys):
@@ -61,7 +61,7 @@ def test_a_leak_fails_the_command(monkeypatch, capsys):
     grown = iter(range(10**6))
     monkeypatch.setattr(soak, "memory", lambda _: {"host": 100 * MIB + 2**16 * next(grown)})
     monkeypatch.setattr(
-        soak, "render_frames", lambda trainer, cameras, count, look: [look(i + 1) for i in range(count)]
+        soak, "render_frames", lambda trainer, cameras, count, sample: [sample(i + 1) for i in range(count)]
     )
     assert Soak(device="cpu", frames=100, steps=0, max_surfels=50, width=24)() == 1
     out = capsys.readouterr().out

@@ -5,7 +5,7 @@ import torch
 from torch.autograd import gradcheck
 
 from nexwarp.kernels import launch
-from nexwarp.kernels.ssim import LANES, PAD, WINDOW_SIZE
+from nexwarp.kernels.ssim import PAD, SIMD_WIDTH, WINDOW_SIZE
 from nexwarp.ops import ssim
 from nexwarp.ops.ssim import weighted_dssim
 from nexwarp.train.losses import LossWeights, training_losses
@@ -15,14 +15,14 @@ from tests.tolerances import assert_close
 pytestmark = pytest.mark.usefixtures("restore_launch_threads")
 
 DTYPES = [torch.float32, torch.float64]
-# Smaller than the window, than a block of LANES values, and not a whole number of blocks or of 4 rows.
+# Smaller than the window, than a block of SIMD_WIDTH values, and not a whole number of blocks or of 4 rows.
 SIZES = [(1, 1), (1, 40), (40, 1), (3, 5), (4, 6), (12, 16), (13, 17), (30, 43)]
 
 
-@pytest.fixture(params=[LANES, 1], ids=["blocks", "single values"])
+@pytest.fixture(params=[SIMD_WIDTH, 1], ids=["blocks", "single values"])
 def lanes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """Values a thread on a CPU; with 1 the CPU runs what CUDA runs."""
-    monkeypatch.setattr(ssim, "LANES", request.param)
+    monkeypatch.setattr(ssim, "SIMD_WIDTH", request.param)
     return request.param
 
 
@@ -67,7 +67,7 @@ def test_inputs_need_not_be_contiguous(device: torch.device, lanes: int) -> None
 
 
 def test_pads_are_as_wide_as_the_window_reaches() -> None:
-    assert PAD % LANES == 0 and PAD >= 3 * (WINDOW_SIZE // 2)
+    assert PAD % SIMD_WIDTH == 0 and PAD >= 3 * (WINDOW_SIZE // 2)
 
 
 def test_result_does_not_depend_on_threads(lanes: int) -> None:

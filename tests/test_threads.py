@@ -18,6 +18,9 @@ from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("restore_launch_threads")
 
+# On a CPU both forms of the kernels: see `conftest.form`.
+BOTH_FORMS = pytest.mark.usefixtures("form")
+
 BUFFERS = ("plain", "base", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
@@ -77,6 +80,7 @@ def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
 # Threads
 
 
+@BOTH_FORMS
 @pytest.mark.parametrize(("low_pass", "size"), [(False, BIG), (True, BIG), (False, WIDE)])
 def test_collect_does_not_depend_on_threads(low_pass, size):
     scene = random_scene(600, **size)
@@ -85,15 +89,16 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
     for count in (1, 2, 3):
         launch.set_num_threads(count)
         passes = Passes(scene, low_pass=low_pass)
-        watch = passes.hits.watch
-        watch.errors = errors
+        request = passes.hits.error_request
+        request.errors = errors
         results.append(passes.buffers() | {"blended": passes.blended(errors)})
         results[-1] |= {f"grad_{name}": grad for name, grad in passes.gradients().items()}
-        results[-1]["watched"] = watch.sums
+        results[-1]["requested"] = request.sums_after_backward
     assert len(launch.chunks(4 * 3 * 16**2)) > 3  # there was something to share out
     assert_identical(results)
 
 
+@BOTH_FORMS
 @pytest.mark.parametrize("with_colors", [False, True], ids=["coefficients", "colors"])
 def test_texture_does_not_depend_on_threads(with_colors):
     texture = make_texture()
@@ -146,6 +151,7 @@ def test_chunks_cover_the_range_once_whatever_the_threads(dim, align):
 # Tiles
 
 
+@BOTH_FORMS
 @pytest.mark.parametrize("make", [random_scene, layered_scene])
 def test_hits_do_not_depend_on_the_size_of_tiles(make):
     """Values to the last bit; gradients to rounding, as the sums over tiles change their order."""
@@ -179,6 +185,7 @@ def summed(passes: Passes, errors: torch.Tensor, count: int) -> torch.Tensor:
     return torch.zeros(count, dtype=torch.float64).index_add(0, ids.clamp_min(0).flatten(), shares.flatten())
 
 
+@BOTH_FORMS
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
@@ -189,6 +196,7 @@ def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
     assert_close(passes.blended(errors), summed(passes, errors, 8), kind="value", name="blended")
 
 
+@BOTH_FORMS
 @pytest.mark.parametrize("make", [random_scene, layered_scene])
 def test_blended_error_is_the_gradient_to_the_colours(make):
     """With K = 0 the image is sum w c, so d(sum error * image) / dc = sum w error, for any number of hits."""
@@ -200,15 +208,18 @@ def test_blended_error_is_the_gradient_to_the_colours(make):
         assert_close(passes.blended(errors), gradient[:, channel], kind="value", name="blended")
 
 
-def test_watching_the_backward_pass_gives_the_blended_error():
+@BOTH_FORMS
+def test_the_backward_pass_gives_the_blended_error_on_request():
     scene = random_scene(40, seed=5)
     errors = errors_of(scene)
     passes = Passes(scene)
-    passes.hits.watch.errors = errors
-    watched = passes.gradients()
-    assert_close(passes.hits.watch.sums, passes.blended(errors), kind="value", name="sums")
+    request = passes.hits.error_request
+    request.errors = errors
+    requested = passes.gradients()
+    assert request.sums_after_backward is not None
+    assert_close(request.sums_after_backward, passes.blended(errors), kind="value", name="sums")
     plain = Passes(scene).gradients()
-    assert all(torch.equal(watched[name], plain[name]) for name in plain)
+    assert all(torch.equal(requested[name], plain[name]) for name in plain)
 
 
 def test_errors_must_have_the_size_of_the_image():

@@ -67,8 +67,7 @@ def trained(scene: Scene, config: Config) -> Trainer:
 
 
 def mean_psnr(trainer: Trainer, views: list[View]) -> float:
-    options = trainer.render_options()
-    return evaluate(trainer.surfels, trainer.texture, views, options=options)["psnr"]
+    return evaluate(trainer.model(), views)["psnr"]
 
 
 # Repeatability
@@ -125,12 +124,12 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
     assert not torch.are_deterministic_algorithms_enabled()
     for other in runs[1:]:
         assert_same_state(other, runs[0])
-    first, *others = (trainer.finish().surfels for trainer in runs)
+    first, *others = (trainer.finish() for trainer in runs)
+    assert first.exposures is not None and first.detail_limits is not None
     for other in others:
-        for name in ("sh0", "shN", "footprints", "far_footprints"):
-            assert torch.equal(getattr(other, name), getattr(first, name)), name
-        for name, value in first.exposures.tensors().items():
-            assert torch.equal(other.exposures.tensors()[name], value), name
+        assert other.state_dict().keys() == first.state_dict().keys()
+        for name, value in first.state_dict().items():
+            assert torch.equal(other.state_dict()[name], value), name
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
@@ -241,11 +240,11 @@ def test_one_degree_is_unlocked_every_thousand_iterations_of_thirty(scene, itera
     degrees = {}
     for iteration in (1, every - 1, every, 2 * every - 1, 2 * every, 3 * every - 1, 3 * every, iterations):
         trainer.iteration = iteration
-        degrees[iteration] = trainer.render_options()["sh_degree"]
+        degrees[iteration] = trainer.render_options().sh_degree
     assert degrees == {i: min(3, i // every) for i in degrees} and degrees[iterations] == 3
     lower = Trainer(scene, small(iterations=iterations, sh_degree=1), "cpu")
     lower.iteration = iterations
-    assert lower.render_options()["sh_degree"] == 1 and lower.surfels.sh.shape[1] == 4
+    assert lower.render_options().sh_degree == 1 and lower.surfels.sh.shape[1] == 4
 
 
 @pytest.mark.parametrize(
@@ -415,7 +414,7 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor, look,
         assert_close(other, one, kind="gradient", name=f"losses of step {step}")
         counts.append(len(runs[0].surfels))
     assert len(runs[1].surfels) == counts[-1] and (counts[-1] < max(counts)) == look
-    images = [nw.render(t.surfels, t.texture, t.views.cameras[0], **t.render_options()).image for t in runs]
+    images = [t.model().render(t.views.cameras[0]).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
 
 
@@ -425,19 +424,19 @@ def test_surfels_settle_with_two_hits(scene):
         Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
         for hits, start in ((2, 25_000), (4, 25_000), (4, 0))
     )
-    assert [t.render_options()["max_hits"] for t in (two, four, early)] == [2, 2, 4]
+    assert [t.render_options().max_hits for t in (two, four, early)] == [2, 2, 4]
     for iteration in range(1, 13):
         for trainer in (two, four, early):
             trainer.step()
         if iteration < 10:
             assert_same_state(four, two)
-        hits = [t.render_options()["max_hits"] for t in (two, four, early)]
+        hits = [t.render_options().max_hits for t in (two, four, early)]
         assert hits == [2, 2 if iteration < 10 else 4, 4]
     assert not torch.equal(four.texture.grid, two.texture.grid)
-    assert four.finish().meta["max_hits"] == 4
+    assert four.finish().options.max_hits == 4
     for hits in (0, 1):
         few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
-        assert few.render_options()["max_hits"] == hits
+        assert few.render_options().max_hits == hits
 
 
 def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(scene, monkeypatch):
@@ -445,10 +444,10 @@ def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(sc
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
-    def first(surfels, cameras, nearest, generator, *, options, last):
-        looks.append((trainer.iteration, len(surfels), generator.initial_seed()))
+    def first(model, cameras, nearest, generator, *, last):
+        looks.append((trainer.iteration, len(model.surfels), generator.initial_seed()))
         assert last == (trainer.iteration == 60)
-        return torch.arange(len(surfels)) == 0
+        return torch.arange(len(model.surfels)) == 0
 
     monkeypatch.setattr(trainer_module, "floaters", first)
     trainer = Trainer(scene, small(iterations=60, densify=dataclasses.replace(OFTEN, floaters=True)), "cpu")

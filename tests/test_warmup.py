@@ -152,7 +152,7 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
     def noted(self: Trainer) -> Any:
         progress = step(self)
         watching = self.densifier.active(self.iteration)
-        steps.append((self.render_options()["sh_degree"], progress.image.shape[0], watching))
+        steps.append((self.render_options().sh_degree, progress.image.shape[0], watching))
         return progress
 
     def counted(self: Densifier, *args: Any) -> Any:

@@ -1,34 +1,40 @@
-"""Random cameras between given ones."""
+"""Random cameras between the cameras of a scene."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.cameras.paths import (
-    ALIKE,
-    BEYOND,
-    NEIGHBORS,
-    _placed,
-    _poses,
-)
+from nexwarp.cameras.paths import camera_poses, with_pose
+
+NEIGHBORS = 4  # nearest cameras of a similar direction, from which the neighbour is drawn
+ALIKE = math.cos(math.radians(60.0))
+BEYOND = 0.5  # how far beyond either camera a new one may lie, as a share of their distance
 
 
 def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torch.Generator) -> list[Camera]:
-    """Return for each camera one on the way from it to a neighbour, or at most half as far beyond either end.
+    """Draw for each camera a new one on the line through it and a neighbour.
 
-    The neighbour is drawn from the 4 nearest whose optical axes are within 60 degrees of the camera's; without any,
-    the camera stays where it is. Position and rotation go along evenly; all else is the camera's. A rigid motion and
-    scaling of all cameras does the same to the result.
+    The new camera lies between the two or beyond either by at most half their distance. The neighbour is drawn from the
+    4 nearest cameras whose optical axes are within 60 degrees of the camera's; without any, the pose stays. Position
+    and rotation are interpolated linearly; intrinsics, size, near, dtype and device are the camera's. The result is
+    equivariant under rigid motions and scaling of all cameras.
 
     Args:
         cameras: at least one.
-        reaches: for each, how far from it the new one may be, world units, >= 0.
-        generator: for neighbours and places, on the CPU.
+        reaches: for each camera, the largest distance to its new one, world units, >= 0.
+        generator: CPU generator of all random numbers.
+
+    Returns:
+        One camera for each given one, in their order.
+
+    Raises:
+        ValueError: no cameras.
     """
     from scipy.spatial.transform import Rotation
 
-    viewmats, centres = _poses(cameras)
+    viewmats, centres = camera_poses(cameras)
     drawn, places = torch.rand(2, len(cameras), generator=generator, dtype=torch.float64)
     distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
     axes = viewmats[:, 2, :3]
@@ -43,4 +49,4 @@ def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torc
     turns = (turned[others.numpy()] * turned.inv()).as_rotvec() * places[:, None].numpy()
     rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned).as_matrix())
     positions = torch.lerp(centres, centres[others], places[:, None])
-    return [_placed(*each) for each in zip(cameras, rotations, positions, strict=True)]
+    return [with_pose(*each) for each in zip(cameras, rotations, positions, strict=True)]

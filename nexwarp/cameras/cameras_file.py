@@ -1,4 +1,4 @@
-"""Named cameras as JSON, so that a run renders without its photos."""
+"""The cameras of a run as JSON, so that it can be rendered without its photos."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,11 @@ from nexwarp.io.json_files import READ_ERRORS, read_json, write_json
 
 
 def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> None:
-    """Write named cameras by set ("train", "test") as JSON, so that a run renders without its photos."""
+    """Write cameras as JSON: set ("train", "test") -> name -> camera.
+
+    Raises:
+        OSError: `path` cannot be written.
+    """
     data = {
         group: {
             name: {
@@ -30,7 +34,11 @@ def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> Non
 
 
 def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
-    """Read what `save_cameras` wrote, float32 on the CPU."""
+    """Read a file of `save_cameras`: set -> name -> camera, float32 on the CPU.
+
+    Raises:
+        MissingError: no such file. FormatError: the file is damaged or holds something else.
+    """
     try:
         data = read_json(path)
         return {

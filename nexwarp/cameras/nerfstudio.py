@@ -1,8 +1,8 @@
-"""Cameras as nerfstudio's JSON: a scene's `transforms.json` and the viewer's camera paths, in and out.
+"""Read and write cameras as nerfstudio's JSON: `transforms.json` of a scene, and camera paths of its viewer.
 
 Their matrices are camera to world with x right, y up, z backward (OpenGL); nexwarp's are world to camera with x right,
-y down, z forward. World frames are the same, but for the `applied_transform` and `applied_scale` of a transforms.json,
-which are taken back.
+y down, z forward. The world frame is that of the file; the `applied_transform` and `applied_scale` of a transforms.json
+are inverted.
 """
 
 import json
@@ -11,27 +11,24 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from nexwarp.camera import Camera
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line, written_aside
-from nexwarp.io.json_files import read_json
+from nexwarp.io.json_files import Json, JsonObject, read_object
 
-# OpenGL camera axes in those of OpenCV, and back.
+# From OpenGL's camera axes to OpenCV's; its own inverse.
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
-SINGULAR = 1e-9
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
-
-EXACT = 1e-9
-LAST_ROW = 1e-6
+SINGULAR = 1e-9  # determinants up to this count as zero
+EXACT = 1e-9  # relative difference up to which intrinsics count as centred and square
+LAST_ROW = 1e-6  # tolerance of a pose's last row
 MAX_SIDE = 2**16  # pixels
-LARGEST = 1e15  # of a number: squares stay finite in single precision
+LARGEST = 1e15  # limit of numbers: their squares stay finite in single precision
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class CameraPath:
 
     Attributes:
         cameras: float32 on the CPU, in order.
-        fps: frames a second that the file asks for; None where it does not say.
+        fps: frames a second; None where the file gives none.
     """
 
     cameras: list[Camera]
@@ -54,13 +51,13 @@ def save_transforms(
     train: Sequence[str] | None = None,
     test: Sequence[str] | None = None,
 ) -> None:
-    """Write cameras as a `transforms.json`: a pinhole a frame, so that sizes and principal points may differ.
+    """Write cameras as a `transforms.json`; each frame has its own intrinsics, so that sizes may differ.
 
     Args:
-        path: where to; written aside, then renamed.
+        path: the file, written atomically.
         cameras: name of the image file -> camera.
-        train: names to list as `train_filenames`.
-        test: names to list as `val_filenames` and `test_filenames`. Without both, no split is written.
+        train: names for `train_filenames`.
+        test: names for `val_filenames` and `test_filenames`. If `train` and `test` are None, no split is written.
 
     Raises:
         ValueError: no cameras; OSError: `path` cannot be written.
@@ -77,7 +74,7 @@ def save_transforms(
         }
         for name, camera in cameras.items()
     ]
-    data: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames}
+    data: dict[str, object] = {"camera_model": "PINHOLE", "frames": frames}
     if train is not None or test is not None:
         held_out = list(test or [])
         data |= {"train_filenames": list(train or []), "val_filenames": held_out, "test_filenames": held_out}
@@ -85,10 +82,10 @@ def save_transforms(
 
 
 def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[str, Camera]:
-    """Read the cameras of a `transforms.json`; its images need not be there. Distortion is left out: they are pinholes.
+    """Read the cameras of a `transforms.json` as pinhole cameras; distortion coefficients are ignored.
 
-    Intrinsics stand in the frame, else in the file: `fl_x`, `fl_y` or else `camera_angle_x`, `camera_angle_y`; `cx`,
-    `cy` (default: the middle); `w`, `h`.
+    The images need not exist. Intrinsics are those of the frame, else those of the file: `fl_x`, `fl_y` or
+    `camera_angle_x`, `camera_angle_y`; `cx`, `cy` (default: the image centre); `w`, `h`.
 
     Args:
         path: the file.
@@ -98,22 +95,23 @@ def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[st
         Name of the image file -> camera, float32 on the CPU, in the order of the file.
 
     Raises:
-        FileNotFoundError: no such file; ValueError: naming the frame and key where the file is not as expected.
+        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
+            frame and key.
     """
     path = Path(path)
     return _frames(path, _read(path), near)
 
 
 def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fps: float = 30.0) -> None:
-    """Write a camera path as nerfstudio's viewer does, for `ns-render camera-path` and `nexwarp render --path`.
+    """Write a camera path in nerfstudio's format, for `ns-render camera-path` and `nexwarp render --path`.
 
-    nerfstudio's entries know one vertical field of view and a centred principal point. Of cameras that are not so, the
-    focal lengths and principal point are written too (`fl_x`, `fl_y`, `cx`, `cy`), which nexwarp reads and nerfstudio
-    ignores.
+    nerfstudio's entries hold a vertical field of view only; they imply square pixels and a centred principal point. For
+    other cameras the focal lengths and principal point are added as `fl_x`, `fl_y`, `cx`, `cy`, which nexwarp reads and
+    nerfstudio ignores.
 
     Args:
-        path: where to; written aside, then renamed.
-        cameras: of one size.
+        path: the file, written atomically.
+        cameras: cameras of one size.
         fps: frames a second.
 
     Raises:
@@ -159,7 +157,8 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
         near: near depth of the cameras, world units.
 
     Raises:
-        FileNotFoundError: no such file; ValueError: naming the entry and key where the file is not as expected.
+        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
+            entry and key.
     """
     path = Path(path)
     data = _read(path)
@@ -187,7 +186,7 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
     return CameraPath(cameras, fps)
 
 
-def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
+def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
     model = data.get("camera_model", "PINHOLE")
     if model not in PINHOLES:
         raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
@@ -203,7 +202,7 @@ def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
         values = {**data, **frame}
         width, height = (_size(where, values, key) for key in ("w", "h"))
         if "fl_x" in values or "fl_y" in values:
-            # One of them stands for both.
+            # A single focal length holds for both axes.
             fx, fy = (
                 _number(where, values, key if key in values else other)
                 for key, other in (("fl_x", "fl_y"), ("fl_y", "fl_x"))
@@ -221,7 +220,7 @@ def _frames(path: Path, data: dict[str, Any], near: float) -> dict[str, Camera]:
 
 
 def _camera_to_world(camera: Camera) -> torch.Tensor:
-    """(4, 4) float64 on the CPU. An inverse, not a transpose: a float32 rotation is orthonormal to 1e-7 only."""
+    """(4, 4) float64 on the CPU; inverted, not transposed, as a float32 rotation is orthonormal to 1e-7 only."""
     return torch.linalg.inv(camera.viewmat.detach().double().cpu()) @ FLIP
 
 
@@ -240,49 +239,48 @@ def _camera(
         raise ValueError(f"{where}: {error}") from None
 
 
-def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
+def _focal(where: str, values: Mapping[str, Json], key: str, size: int) -> float:
     return size / (2 * math.tan(_number(where, values, key, above=0.0, below=math.pi) / 2))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> JsonObject:
     if not path.is_file():
         raise MissingError(f"{path}: no such file, expected cameras as JSON")
-    data = read_json(path)
-    if not isinstance(data, dict):
-        raise FormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
-    return data
+    return read_object(path)
 
 
-def _write(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
+def _write(path: str | os.PathLike[str], data: Mapping[str, object]) -> None:
     with written_aside(path) as temporary:
         temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
-def _list(path: Path, data: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
     entries = data[key]
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
+    objects = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
-    return entries
+        objects.append(entry)
+    return objects
 
 
 def _number(
-    where: str | Path, values: Mapping[str, Any], key: str, above: float = -math.inf, below: float = math.inf
+    where: str | Path, values: Mapping[str, Json], key: str, above: float = -math.inf, below: float = math.inf
 ) -> float:
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     value = values[key]
-    fits = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (fits and above < value < below and abs(value) <= LARGEST):
-        least = f" above {above:g}" if above > -math.inf else ""
-        most = f" below {below:g}" if below < math.inf else ""
-        raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r:.60}")
-    return float(value)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if above < value < below and abs(value) <= LARGEST:
+            return float(value)
+    least = f" above {above:g}" if above > -math.inf else ""
+    most = f" below {below:g}" if below < math.inf else ""
+    raise ValueError(f"{where}: {key}: expected a number{least}{most}, got {value!r:.60}")
 
 
-def _size(where: str | Path, values: Mapping[str, Any], key: str) -> int:
+def _size(where: str | Path, values: Mapping[str, Json], key: str) -> int:
     size = _number(where, values, key, above=0.0)
     if size > MAX_SIDE:
         raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
@@ -291,8 +289,8 @@ def _size(where: str | Path, values: Mapping[str, Any], key: str) -> int:
     return int(size)
 
 
-def _pose(where: str, values: Mapping[str, Any], key: str) -> torch.Tensor:
-    """(4, 4) float64 of three or four rows of four, nested or in one list."""
+def _pose(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
+    """(4, 4) float64 from three or four rows of four numbers, nested or flat."""
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     try:

@@ -1,4 +1,4 @@
-"""Camera paths for videos, an ellipse, a spiral or a flight from view to view; and cameras between the views."""
+"""Camera paths for videos: an ellipse, a spiral, or an interpolation from view to view."""
 
 import math
 from collections.abc import Sequence
@@ -11,30 +11,26 @@ from nexwarp.camera import Camera
 from nexwarp.checks import check_range
 
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
-ONE_WAY = 0.5  # least length of the mean viewing direction for a spiral
-SPREAD = 0.9  # share of the cameras, along each axis, that a spiral spans
+ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral
+SPREAD = 0.9  # share of the cameras that a spiral spans along each axis
 FRAMES_PER_KEY = 10
-NEIGHBORS = 4  # cameras, the nearest that look alike, towards one of which `between` goes
-ALIKE = math.cos(math.radians(60.0))
-
-BEYOND = 0.5  # share of the way that `between` goes at most beyond either end
 
 
 def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     """Return `count` cameras on a closed ellipse through the region of the given ones.
 
-    The ellipse lies in the plane of the camera centres (through their mean, along their two main axes).
-    Along each axis it spans 90 % of them, from the 5th to the 95th percentile; it starts beside the first
-    camera. All its cameras look at `focus(cameras)`, with the mean up direction, and have intrinsics, size,
-    near, dtype and device of the first one. Centres on one line give a path to and fro along it. A rigid
-    motion and scaling of all cameras does the same to the path.
+    The ellipse lies in the plane of the two principal axes of the camera centres. Along each axis it spans the 5th to
+    the 95th percentile of the centres. It starts at the angle of the first camera. All its cameras look at
+    `focus(cameras)` with the mean up direction; intrinsics, size, near, dtype and device are those of the first camera.
+    If the centres lie on a line, the path runs back and forth along it. The path is equivariant under rigid motions and
+    scaling of all cameras.
 
     Raises:
-        ValueError: fewer than two distinct centres, parallel optical axes, no common up direction, or a path
-            that meets the focus or passes straight above or below it; `count` < 1.
+        ValueError: fewer than two distinct centres, parallel optical axes, no common up direction, a path that meets
+            the focus or passes vertically above or below it, or `count` < 1.
     """
     check_range("count", count, 1)
-    viewmats, centres = _poses(cameras)
+    viewmats, centres = camera_poses(cameras)
     target, up = focus(cameras), -viewmats[:, 1, :3].mean(0)
     if (centres - centres.mean(0)).norm(dim=1).max() <= DEGENERATE * (centres - target).norm(dim=1).max():
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
@@ -43,25 +39,24 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     angles = math.atan2(y, x) + torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     offsets = torch.stack([torch.cos(angles), torch.sin(angles)], dim=1) * semi @ axes
     first = cameras[0]
-    viewmats = [look_at(centre + offset, target, up).to(first.viewmat) for offset in offsets]
-    return [replace(first, viewmat=viewmat) for viewmat in viewmats]
+    return [replace(first, viewmat=look_at(centre + offset, target, up).to(first.viewmat)) for offset in offsets]
 
 
 def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[Camera]:
-    """Return `count` cameras on a closed spiral amid cameras that face one way.
+    """Return `count` cameras on a closed spiral among cameras that face one way.
 
-    Seen from the mean camera it winds `turns` times about the centre, once forward and back meanwhile; along each of
-    that camera's axes it reaches the distance within which 90 % of the cameras lie. Its cameras look at
-    `focus(cameras)` or, where the optical axes do not meet in front of all of them, along the mean direction; up is the
-    mean up direction. Intrinsics, size, near, dtype and device are those of the first camera. A rigid motion and
-    scaling of all cameras does the same to the path.
+    In the frame of the mean camera, the path winds `turns` times around the mean centre and moves forward and back
+    once. Its radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
+    `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras; up is the mean up
+    direction. Intrinsics, size, near, dtype and device are those of the first camera. The path is equivariant under
+    rigid motions and scaling of all cameras.
 
     Raises:
-        ValueError: cameras that do not face one way, or all at one place; `count` or `turns` < 1.
+        ValueError: cameras that do not face one way or share one centre; `count` or `turns` < 1.
     """
     check_range("count", count, 1)
     check_range("turns", turns, 1)
-    viewmats, centres = _poses(cameras)
+    viewmats, centres = camera_poses(cameras)
     forward, down = viewmats[:, 2, :3].mean(0), viewmats[:, 1, :3].mean(0)
     if forward.norm() < ONE_WAY:
         raise ValueError(
@@ -76,7 +71,8 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     target = _common_target(cameras)
     angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
-    first, path = cameras[0], []
+    first = cameras[0]
+    path: list[Camera] = []
     for position in centre + rounds * radii @ axes:
         viewmat = look_at(position, position + forward if target is None else target, -down)
         path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
@@ -84,20 +80,21 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
 
 
 def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
-    """Return `count` cameras on a smooth flight from the first of the given ones to the last.
+    """Return `count` cameras on a smooth path from the first to the last of the given ones.
 
-    The flight passes through key cameras: through all, or, where there are more than `keys`, through that many, evenly
-    spaced in the list, the first and last among them. Between two, it takes time in proportion to the way and the turn.
-    Centres follow a cubic spline, rotations one of continuous angular acceleration. Intrinsics, size, near, dtype and
-    device are those of the first camera. A rigid motion and scaling of all cameras does the same to the path.
+    The path passes through key cameras: all of them, or, if there are more than `keys`, that many at even spacing in
+    the list, the first and last included. The time between two keys is proportional to their distance and rotation.
+    Centres follow a cubic spline; rotations follow a spline of continuous angular acceleration. Intrinsics, size, near,
+    dtype and device are those of the first camera. The path is equivariant under rigid motions and scaling of all
+    cameras.
 
     Args:
-        cameras: in the order to fly by.
-        count: cameras to return; the first is at the first key, the last at the last.
-        keys: at most so many keys, at least 2; by default one for every 10 of `count`.
+        cameras: cameras in the order of the path.
+        count: number of cameras to return; the first is at the first key, the last at the last key.
+        keys: largest number of keys, at least 2; None is one key for every 10 of `count`.
 
     Raises:
-        ValueError: fewer than two distinct cameras; `count` < 1, `keys` < 2.
+        ValueError: fewer than two distinct cameras, `count` < 1 or `keys` < 2.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -105,14 +102,14 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
     check_range("count", count, 1)
     keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
     check_range("keys", keys, 2)
-    viewmats, centres = _poses(cameras)
+    viewmats, centres = camera_poses(cameras)
     if len(cameras) > keys:
         chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()
         viewmats, centres = viewmats[chosen], centres[chosen]
     turned = Rotation.from_matrix(viewmats[:, :3, :3].mT.numpy())
     ways = (centres[1:] - centres[:-1]).norm(dim=1).numpy()
     turns = (turned[:-1].inv() * turned[1:]).magnitude() if len(ways) else ways
-    # Two views at one place, turned alike, are one key: they would be a halt.
+    # Equal poses in sequence become one key; otherwise the path would stop there.
     spans = sum(x / x.mean() if x.sum() > 0.0 else 0.0 * x for x in (ways, turns)) if len(ways) else ways
     distinct = np.concatenate([[True], spans > DEGENERATE])
     if distinct.sum() < 2:
@@ -122,18 +119,18 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
     positions = CubicSpline(times, centres.numpy()[distinct], bc_type="natural")(at)
     rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
     placed = zip(torch.from_numpy(rotations), torch.from_numpy(positions), strict=True)
-    return [_placed(cameras[0], rotation, position) for rotation, position in placed]
+    return [with_pose(cameras[0], rotation, position) for rotation, position in placed]
 
 
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:
     """(3,) float64, the world point with the least sum of squared distances to the optical axes.
 
     Raises:
-        ValueError: the axes are parallel, as a single camera's are.
+        ValueError: no cameras, a single one, or parallel optical axes.
     """
-    viewmats, centres = _poses(cameras)
+    viewmats, centres = camera_poses(cameras)
     axes = viewmats[:, 2, :3]
-    # Each matrix takes off the part of a vector that is along its axis.
+    # Each matrix projects a vector onto the plane orthogonal to its axis.
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
     if torch.linalg.eigvalsh(across.mean(0))[0] < DEGENERATE**2:
         raise ValueError(f"cameras: expected two or more with axes that are not parallel, got {len(cameras)}")
@@ -141,10 +138,10 @@ def focus(cameras: Sequence[Camera]) -> torch.Tensor:
 
 
 def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
-    """(4, 4) world-to-camera matrix at `position` looking at `target`, `up` being up in the image; (3,) each.
+    """(4, 4) world-to-camera matrix at `position` looking at `target`, with `up` upwards in the image; (3,) each.
 
     Raises:
-        ValueError: `target` is at `position`, or `up` is zero or along the line between them.
+        ValueError: `target` equals `position`, or `up` is zero or parallel to the line between them.
     """
     forward = target - position
     right = torch.linalg.cross(forward, up)
@@ -157,15 +154,19 @@ def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> t
     return viewmat
 
 
-def _placed(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) -> Camera:
-    """The camera with another world-to-camera rotation (3, 3) and centre (3,), float64."""
+def with_pose(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) -> Camera:
+    """Return `camera` with another world-to-camera rotation (3, 3) and centre (3,), both float64 on the CPU."""
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     return replace(camera, viewmat=viewmat.to(camera.viewmat))
 
 
-def _poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-    """World-to-camera matrices (n, 4, 4) and centres (n, 3), float64 on the CPU."""
+def camera_poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
+    """World-to-camera matrices (n, 4, 4) and centres (n, 3), float64 on the CPU.
+
+    Raises:
+        ValueError: no cameras.
+    """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
     viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
@@ -176,8 +177,8 @@ def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.T
     """Centre (3,), unit axes (2, 3) and semi-axes (2,) of the ellipse, counter-clockwise from above."""
     mean = centres.mean(0)
     axes = torch.linalg.svd(centres - mean)[2][:2]
-    # The axes come with arbitrary signs. The cameras' down or, in an upright plane, forward direction settles
-    # the sense of rotation; the start at the first camera makes the rest irrelevant.
+    # The signs of the axes are arbitrary. The cameras' mean down direction, or forward direction for a vertical plane,
+    # decides the sense of rotation. The signs have no other effect, as the path starts at the first camera.
     normal = torch.linalg.cross(axes[0], axes[1])
     if max((viewmats[:, 1:3, :3].mean(0) @ normal).tolist(), key=abs) > 0.0:
         axes = axes * axes.new_tensor([[1.0], [-1.0]])
@@ -186,10 +187,10 @@ def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.T
 
 
 def _common_target(cameras: Sequence[Camera]) -> torch.Tensor | None:
-    """`focus(cameras)`, where it lies in front of all; None where it does not, or the axes are parallel."""
+    """`focus(cameras)` if it lies in front of all cameras; None if not, or if the optical axes are parallel."""
     try:
         target = focus(cameras)
     except ValueError:
         return None
-    viewmats, _ = _poses(cameras)
+    viewmats, _ = camera_poses(cameras)
     return target if bool(((viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0).all()) else None

@@ -29,39 +29,40 @@ from nexwarp.train.presets import preset
 
 @dataclass
 class Render:
-    """Render a run, without its photos, into its renders/: still views, a camera path, a video of it, all passes.
+    """Render a run to RUN/renders: still views, a camera path, a video of the path, and buffers. Needs no photos.
 
-    Without options: the test views and an ellipse of 120 frames. With --path or --video: that path alone. With --set:
-    those views alone. Together: both. docs/outputs.md describes paths and files.
+    Without options, it renders the test views and an ellipse of 120 frames. With --path or --video, it renders the path
+    only; with --set, the still views only; with both, both. docs/outputs.md describes paths and files.
     """
 
     run: Run_
     """Run folder."""
     path: Annotated[str | None, option("{ellipse,spiral,interpolate,FILE.json}", "ellipse")] = None
-    """Camera path; FILE.json is nerfstudio's camera path or a transforms.json."""
+    """Camera path; FILE.json is a nerfstudio camera path or a transforms.json."""
     video: Annotated[Path | None, option("FILE", "none")] = None
-    """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9); needs the extra `video`."""
-    frames: Annotated[int | None, option("N", "120, or what FILE.json says")] = None
-    """Frames of the path; 0 for no path."""
-    fps: Annotated[float | None, option("N", "30, or what FILE.json says")] = None
-    """Frames a second of the video."""
-    set: Annotated[str | None, option("{test,train,all}", "test where no path is asked for")] = None
+    """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9). Needs the extra `video`."""
+    frames: Annotated[int | None, option("N", "120, or that of FILE.json")] = None
+    """Number of frames of the path; 0 renders no path."""
+    fps: Annotated[float | None, option("N", "30, or that of FILE.json")] = None
+    """Frames per second of the video."""
+    set: Annotated[str | None, option("{test,train,all}", "test without --path and --video, else none")] = None
     """Still views to render."""
     buffers: bool = False
-    """Also write all passes of each still view, or where there is none of each frame, as one OpenEXR file."""
+    """Also write an OpenEXR file of all buffers (depths, normals, weights and more) for each still view; without still
+    views, for each frame of the path."""
     size: Annotated[str | None, option("WIDTHxHEIGHT", "that of the photos")] = None
-    """Pixels, such as 1920x1080; what is seen from top to bottom stays."""
+    """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
-    """Factor on the size, instead of --size."""
+    """Factor on the size of the photos, instead of --size."""
     exposure: Annotated[str, option("{photos,mean}")] = "photos"
-    """Brightness and white balance: those of the photos around each camera, which change along a path; or their mean,
-    one for all pictures."""
+    """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
+    `mean` takes the mean of all photos for every image."""
     device: Device_ = None
-    """Where to compute."""
+    """Device to render on."""
 
     def __call__(self, console: Console) -> None:
         """Render."""
-        # The default, both, is for someone who wants to see what there is.
+        # Without any selection, show everything that the run can show.
         both = self.set is None and self.path is None and self.video is None
         order = RenderOrder(
             path=(self.path or "ellipse") if both or self.path or self.video else None,
@@ -86,23 +87,24 @@ class Render:
 
 @dataclass
 class Export:
-    """Export a run for other programs. docs/outputs.md describes the files.
+    """Export a run to the formats of other programs. docs/outputs.md describes the files.
 
-    ply: surfels.ply, the surfels with all their properties, and splats.ply, their plain appearance (without texture) as
-    Gaussians, which the viewers of 3D Gaussian splatting open.
+    --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
+    splatting open: the surfels as Gaussians, without the texture.
 
-    cameras: transforms.json, all cameras as nerfstudio takes them, and camera_path.json, the same as a path by name.
+    --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
+    names, camera_path.json.
     """
 
     run: Run_
     """Run folder."""
     format: Annotated[str, option("{ply,cameras}")] = "ply"
-    """What to write."""
+    """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
-    """Folder to write to."""
+    """Output folder."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """Surfels larger than this share of their distance from the nearest camera become several Gaussians in
-    splats.ply; inf splits none."""
+    """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
+    Gaussians; inf splits none."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
@@ -112,13 +114,13 @@ class Export:
 
 @dataclass
 class Info:
-    """Tell what a run holds."""
+    """Print a summary of a run."""
 
     run: Run_
     """Run folder."""
 
     def __call__(self, console: Console) -> None:
-        """Print a table."""
+        """Print the summary."""
         source, config, _ = read_run(self.run)
         rows = {"scene": source.path, "preset": config.preset, "iterations": f"{config.iterations:,}"}
         if (self.run / MODEL_FILE).is_file():
@@ -143,14 +145,14 @@ class Info:
 
 @dataclass
 class Warmup:
-    """Compile ahead of time what train, eval and render need, into Warp's kernel cache."""
+    """Compile the kernels of train, eval and render ahead of time, into Warp's kernel cache."""
 
     preset: Preset_ = "default"
-    """As will be given to train."""
+    """The --preset of the training to come."""
     max_hits: Annotated[int | None, option("K", "2")] = None
-    """As will be given to train."""
+    """The --max-hits of the training to come."""
     device: Device_ = None
-    """Where to compute."""
+    """Device to compile for."""
 
     def __call__(self, console: Console) -> None:
         """Compile."""
@@ -179,15 +181,15 @@ class Warmup:
 
 @dataclass
 class Sfm:
-    """Find the cameras of bare photos, and write a scene to train on: undistorted photos and a COLMAP model."""
+    """Estimate the cameras of photos by structure from motion, and write a scene: undistorted photos, COLMAP model."""
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of the photos (JPEG, PNG, TIFF, BMP); subfolders count."""
+    """Folder of the photos (JPEG, PNG, TIFF, BMP), searched with its subfolders."""
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Folder to write: images/, sparse/0/ and sfm.json, the report."""
+    """Output folder: images/, sparse/0/ and the report sfm.json."""
     settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
     overwrite: bool = False
-    """Replace SCENE if nexwarp sfm made it."""
+    """Replace SCENE if nexwarp sfm created it."""
 
     def __call__(self, console: Console) -> None:
         """Reconstruct."""

@@ -1,4 +1,4 @@
-"""The device that a command runs on."""
+"""Choice and set-up of the device that a command runs on."""
 
 import ctypes
 import sys
@@ -7,25 +7,26 @@ import torch
 
 from nexwarp.errors import SettingError
 
-# Of glibc's mallopt.
+# Parameters of glibc's mallopt.
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 
 
 def pick_device(name: str | None) -> torch.device:
-    """Return the device asked for, or CUDA where there is one, else the CPU."""
+    """Return the device of this name; None selects CUDA if available, else the CPU. SettingError if there is none."""
     if name is None:
         return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
     if name not in ("cuda", "cpu"):
         raise SettingError(f"--device: expected cuda or cpu, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise SettingError("--device: cuda was asked for, but torch finds no CUDA device; use --device cpu")
+        raise SettingError("--device: expected a CUDA device, but torch finds no CUDA device; use --device cpu")
     return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep what a CPU training frees: each step takes the same blocks again, page by page from the system.
+    """Let glibc keep freed memory for reuse, for training on a CPU.
 
-    A tenth of a step's time. Does nothing where the C library is another one.
+    Each step allocates the same blocks again. Getting them from the system anew, page by page, would take a tenth of
+    the step's time. No effect with other C libraries.
     """
     if not sys.platform.startswith("linux"):
         return

@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: a live line in a terminal, a line now and then in a log."""
+"""Display of progress and results: live lines in a terminal, occasional lines in a log file."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -26,17 +26,17 @@ LOG_LINES = 20
 
 
 def describe_exposures(model: Model) -> str:
-    """How far the photos that a model was learned from differ."""
+    """Summarise the exposures of a model's training photos."""
     exposures = model.exposures
     if exposures is None:
         return "one for all photos"
     gains, edge = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
-    told = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean"
-    return f"{told}; light at the edge: {edge:.0%}"
+    text = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean"
+    return f"{text}; light at the edge: {edge:.0%}"
 
 
 def device_name(device: torch.device) -> str:
-    """Name of the GPU, or "the CPU"."""
+    """Return the name of the GPU, or "the CPU"."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
 
 
@@ -46,10 +46,17 @@ def warn(console: Console, text: str) -> None:
 
 
 class TrainingDisplay:
-    """Iteration, it/s, time left, loss, training PSNR, surfels and memory of a run."""
+    """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
 
     def __init__(self, console: Console, total: int, done: int, device: torch.device) -> None:
-        """Show a run of `total` iterations of which `done` are done."""
+        """Prepare the display.
+
+        Args:
+            console: where to print.
+            total: iterations of the run.
+            done: iterations done before.
+            device: device of the training, whose memory is shown.
+        """
         self.console, self.total, self.done, self.device = console, total, done, device
         self.start = self.shown = time.perf_counter()
         self.progress = Progress(
@@ -72,7 +79,7 @@ class TrainingDisplay:
         self.progress.stop()
 
     def __call__(self, step: StepReport) -> None:
-        """Observe a step; the numbers are fetched only when they are shown."""
+        """Show a step; its numbers are fetched from the device only when they are shown."""
         now = time.perf_counter()
         if self.console.is_terminal:
             due = now - self.shown >= REFRESH_SECONDS
@@ -86,21 +93,21 @@ class TrainingDisplay:
         text += f"  {memory(self.device)}"
         self.progress.update(self.task, completed=step.iteration, text=text)
         if not self.console.is_terminal:
-            left = (self.total - step.iteration) / max(rate, 1e-9)
+            seconds_left = (self.total - step.iteration) / max(rate, 1e-9)
             self.console.print(
-                f"iteration {step.iteration:,}/{self.total:,}  {text}  {left:.0f} s left", soft_wrap=True
+                f"iteration {step.iteration:,}/{self.total:,}  {text}  {seconds_left:.0f} s left", soft_wrap=True
             )
 
 
 def memory(device: torch.device) -> str:
-    """Peak memory so far: of the GPU in use, else of this process."""
+    """Return the peak memory so far as text, see `peak_memory`; "" if it is unknown."""
     used = peak_memory(device)
     return "" if used is None else f"{used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
 
 
 @contextmanager
 def counting(console: Console, title: str, total: int) -> Iterator[Callable[..., None]]:
-    """Yield a function to call once an item is done."""
+    """Show a progress bar; yield a function to call after each item."""
     columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(title, total=total)
@@ -109,7 +116,11 @@ def counting(console: Console, title: str, total: int) -> Iterator[Callable[...,
 
 @contextmanager
 def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function to call with a stage's name, what is done and of how many; in a log, a line a stage."""
+    """Show a progress bar for each stage, or one line per stage in a log file.
+
+    Yields:
+        A function to call with a stage's name, the number of items done and their total.
+    """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tasks: dict[str, TaskID] = {}
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -126,7 +137,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function to call with the number of photos read and their total."""
+    """Show a progress bar; yield a function to call with the number of photos read and their total."""
     columns = (TextColumn("reading photos"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task("reading photos", total=None)
@@ -134,7 +145,7 @@ def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 
 def results_table(rows: dict[str, str], title: str) -> Table:
-    """Make a two-column table."""
+    """Return a table of two columns: names and values."""
     table = Table(title=title, show_header=False)
     for name, value in rows.items():
         table.add_row(name, value)

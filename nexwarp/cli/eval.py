@@ -30,12 +30,12 @@ class Eval:
 
     run: Run_
     """Run folder."""
-    scene: Annotated[str | None, option("SCENE", "where it was trained from")] = None
-    """Folder of the scene, if it moved."""
+    scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
+    """Folder of the scene, if it has moved."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
-    """Figures to give; flip and lpips need the extras `flip` and `lpips`."""
+    """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
     device: Device_ = None
-    """Where to compute."""
+    """Device to render on."""
 
     def __call__(self, console: Console) -> None:
         """Evaluate."""
@@ -52,7 +52,7 @@ class Eval:
 
 
 def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
-    """Rows of a table: the metrics of the test views."""
+    """Return test metrics as rows of a table."""
     rows = {}
     for name in metrics:
         value = results[name]
@@ -74,16 +74,16 @@ def evaluate_run(
     """Evaluate a model on its test views and write metrics.json.
 
     Args:
-        model: on the device to render on.
-        scene: its photos.
+        model: the model, on the device to render on.
+        scene: the scene with the test views.
         run: run folder.
         console: where to show the progress.
-        mask_mode: as `evaluate` takes it.
-        metrics: as `evaluate` takes them.
-        facts: what the file says beside the metrics; None keeps what an older file says.
+        mask_mode: see `evaluate`.
+        metrics: see `evaluate`.
+        facts: the file's entries beside the metrics; None keeps those of an existing file.
 
     Returns:
-        What the file holds.
+        The entries of metrics.json.
     """
     if not scene.test:
         raise SceneError(f"{scene.path}: expected test views, found none")
@@ -91,7 +91,7 @@ def evaluate_run(
         results = evaluate(
             model, scene.test, renders=run / "renders", mask_mode=mask_mode, metrics=metrics, progress=done
         )
-    whole: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
-    whole |= cast(dict[str, Json], results)
-    write_json(run / METRICS_FILE, whole)
-    return whole
+    entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
+    entries |= cast(dict[str, Json], results)
+    write_json(run / METRICS_FILE, entries)
+    return entries

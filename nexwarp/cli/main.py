@@ -5,8 +5,8 @@ import re
 import signal
 import sys
 import traceback
+from collections.abc import Callable
 from contextlib import redirect_stderr
-from typing import Any
 
 import tyro
 from rich.console import Console
@@ -15,46 +15,46 @@ from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
-from nexwarp.cli.view import View
+from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError
 from nexwarp.train.health import needed_memory
 
-COMMANDS: dict[str, Any] = {
+COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
     "eval": Eval,
     "render": Render,
     "export": Export,
-    "view": View,
+    "view": ViewCommand,
     "info": Info,
     "sfm": Sfm,
     "warmup": Warmup,
 }
 
 
-def _parse(arguments: list[str]) -> Any:
-    """The command that the arguments ask for; exits with 2 where they are none, after one line on stderr."""
-    boxed = io.StringIO()
+def _parse(arguments: list[str]) -> Callable[[Console], None]:
+    """Return the command of the arguments; invalid ones print one line on stderr and exit with 2."""
+    message = io.StringIO()
     try:
-        with redirect_stderr(boxed):
+        with redirect_stderr(message):
             return tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="nexwarp",
-                description="Nexels: neurally-textured surfels. Each command has a --help of its own; with --debug, "
-                "each shows the full trace of an error.",
+                description="Nexels: neurally textured surfels. Each command has its own --help. "
+                "--debug shows the full traceback of an error.",
                 args=arguments,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as stop:
         if stop.code:
             help_of = f"nexwarp {arguments[0]}" if arguments and arguments[0] in COMMANDS else "nexwarp"
-            _complain(f"error: {_unboxed(boxed.getvalue())}; see {help_of} --help", None)
+            _complain(f"error: {_unboxed(message.getvalue())}; see {help_of} --help", None)
         raise
 
 
 def _unboxed(text: str) -> str:
-    """What tyro says in a box of several paragraphs, in one sentence."""
+    """Reduce an error message of tyro, a box of several paragraphs, to one sentence."""
     lines = [line.strip("│╭╮╰╯|+ ") for line in text.splitlines()]
-    # After the title; terminals without such characters get lines of "-".
+    # The first line is the title. Terminals without box characters get lines of "-".
     parts = [part for part in re.split(r"\n[─-]*\n", "\n".join(["", *lines[1:]])) if part]
     fault = " ".join(parts[0].split()).removesuffix(".")
     value = re.fullmatch(
@@ -73,12 +73,15 @@ def _unboxed(text: str) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
-    0: done. 2: bad input, a full disk, a training that diverged: one line on stderr. 3: an error of nexwarp itself,
-    likewise. 128 and the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
+    0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error. 128 plus the signal's
+    number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129). Every failure prints one line on stderr.
+
+    Args:
+        arguments: command line without the program's name; None takes that of the process.
     """
     import warp as wp
 
-    # Warp's notes on a missing CUDA driver or on kernels it compiles are no news to a person at a terminal.
+    # Hide Warp's messages about a missing CUDA driver and about the kernels that it compiles.
     wp.config.log_level = wp.LOG_ERROR
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
@@ -95,21 +98,19 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         trace = error if debug else None
         if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
-            _complain(
-                f"error: out of memory: it needed {needed}; ask for less at a time, such as a smaller size", trace
-            )
+            _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
             return 2
         if isinstance(error, (NexwarpError, ValueError, OSError)):
             _complain(f"error: {error}", trace)
             return 2
-        hint = "" if debug else "; --debug shows where"
+        hint = "" if debug else "; --debug shows the traceback"
         _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
         return 3
     return 0
 
 
 def _complain(text: str, trace: Exception | None) -> None:
-    """One line on stderr, and the trace of an error above it if there is one to show."""
+    """Print one line on stderr, below the traceback of an error if one is given."""
     if trace is not None:
         traceback.print_exception(trace)
     line = " ".join(f"nexwarp: {text}".split())

@@ -1,17 +1,17 @@
-"""Signals that ask a program to end, in an orderly way: Ctrl-C, SIGTERM, SIGHUP."""
+"""Orderly ends on signals: Ctrl-C (SIGINT), SIGTERM and SIGHUP."""
 
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that ends the program.
+    """A signal ends the program.
 
     Attributes:
-        number: the signal's.
+        number: number of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -21,13 +21,13 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Raise `Stopped` where SIGTERM or SIGHUP interrupts the block; Ctrl-C raises KeyboardInterrupt as ever.
+    """Raise `Stopped` in the block on SIGTERM or SIGHUP; Ctrl-C raises KeyboardInterrupt as usual.
 
-    After `nohup`, which has SIGHUP ignored, a closed terminal is no reason to. In a thread, which gets no signals, the
-    block just runs.
+    An ignored SIGHUP, as after `nohup`, stays ignored. Other threads than the main one get no signals: there the block
+    runs without handlers.
     """
 
-    def handle(number: int, _frame: Any) -> None:
+    def handle(number: int, _frame: FrameType | None) -> None:
         raise Stopped(number)
 
     with _handled(handle, *_endings()):
@@ -36,30 +36,30 @@ def stopped_by_signals() -> Iterator[None]:
 
 @contextmanager
 def deferred_stop() -> Iterator[Callable[[], int | None]]:
-    """Let a first Ctrl-C, or a request to end, wait until it is asked for, between steps: no half step is saved.
+    """Record the first signal instead of raising, so that a training can stop between two steps.
 
     Yields:
-        A function that tells the signal's number, or None. A second signal does not wait: it raises `Stopped`.
+        A function that returns the number of the recorded signal, or None. A second signal raises `Stopped` at once.
     """
-    asked: list[int] = []
+    received: list[int] = []
 
-    def handle(number: int, _frame: Any) -> None:
-        asked.append(number)
-        if len(asked) > 1:
+    def handle(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1:
             raise Stopped(number)
 
     with _handled(handle, signal.SIGINT, *_endings()):
-        yield lambda: asked[0] if asked else None
+        yield lambda: received[0] if received else None
 
 
 def _endings() -> list[int]:
-    """SIGTERM and SIGHUP, as far as the system knows them and they are not ignored."""
+    """Return SIGTERM and SIGHUP, without those that the system does not have or that are ignored."""
     known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [number for number in known if signal.getsignal(number) != signal.SIG_IGN]
 
 
 @contextmanager
-def _handled(handle: Callable[[int, Any], None], *numbers: int) -> Iterator[None]:
+def _handled(handle: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return

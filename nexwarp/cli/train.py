@@ -39,36 +39,36 @@ if TYPE_CHECKING:
 
 @dataclass
 class Train:
-    """Train a scene, evaluate it on its test views, and keep everything in a run folder."""
+    """Train a scene, evaluate it on its test views, and write everything to a run folder."""
 
     scene: Scene_
     """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
     run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
-    """Folder to write to."""
+    """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
-    """Budget of surfels, never exceeded."""
+    """Largest number of surfels."""
     iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
-    """Training steps, one photo each; schedules stretch with them."""
+    """Training steps, each of one photo; schedules scale with it."""
     downscale: Annotated[int, option("N")] = 1
-    """Reduce photos by this factor, by area."""
+    """Factor by which photos are downscaled, with an area filter."""
     images: Annotated[str, option("FOLDER")] = "images"
-    """Folder of the photos below SCENE, such as images_4."""
+    """Folder of the photos, relative to SCENE, such as images_4."""
     masks: Annotated[str, option("{FOLDER,alpha,none}")] = "masks"
-    """Folder of the masks below SCENE, if it is there; `alpha` takes the photos' own transparency."""
+    """Folder of the masks, relative to SCENE, used if it exists; `alpha` takes the photos' alpha channel as masks."""
     mask_mode: Annotated[str | None, option("{ignore,background}", "ignore")] = None
-    """What masks leave out: learn nothing there, or learn that nothing is there."""
+    """Treatment of masked-out pixels: `ignore` excludes them from training, `background` trains them to be empty."""
     background: Annotated[
-        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else photos count as opaque")
+        str | None, option("{white,black,R,G,B,random}", "white for Blender scenes, else alpha is ignored")
     ] = None
-    """Colour behind transparent photos, and behind renderings; R,G,B go up to 1, `random` is another each step."""
+    """Colour behind transparent photos and behind renderings; R,G,B are in [0, 1], `random` changes in each step."""
     points: Annotated[str | None, option("FILE.ply", "the scene's own points")] = None
-    """Points to start from."""
-    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "the one that is there")] = None
-    """Kind of the scene, for a folder that holds more than one."""
+    """PLY file of the initial points."""
+    format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "detected")] = None
+    """Format of the scene, for a folder that holds several."""
     max_hits: Annotated[int | None, option("K", "2")] = None
-    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
+    """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
-    """Settings to start from: nexwarp's own, or those of the publication (docs/paper.md)."""
+    """Settings to start from: nexwarp's defaults, or those of the paper (docs/paper.md)."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
@@ -77,23 +77,23 @@ class Train:
     seed: Annotated[int | None, option("N", "0")] = None
     """Random seed."""
     deterministic: bool = False
-    """Give the same bits in every run also on CUDA; slower. A CPU always does."""
+    """Make CUDA runs bitwise reproducible, which is slower; CPU runs always are."""
     device: Device_ = None
-    """Where to train."""
+    """Device to train on."""
     resume: bool = False
-    """Continue the run in --run, however it ended: with its settings, whatever else is given must agree with them."""
+    """Continue the run in --run with its settings; other options must agree with them."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
-    """Iterations between checkpoints, of which the last two are kept."""
+    """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
     """Replace the run in --run."""
     view: bool = False
-    """Show the training in the browser (extra `viewer`); afterwards the result, until Ctrl-C."""
+    """Show the training in the browser, then the result until Ctrl-C (extra `viewer`)."""
     host: Host_ = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look."""
+    """Address that --view listens on; 0.0.0.0 allows other machines."""
     port: Port_ = 8080
-    """Port for --view; 0 takes any free one."""
+    """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
-    """Also log into RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
+    """Also log to RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -123,7 +123,7 @@ class Train:
         else:
             session.check_room()
             if self.resume:
-                console.print(f"{run}: no checkpoint yet, so training starts anew", soft_wrap=True)
+                console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
         with self._viewer(trainer, run, source.name, console) as viewer:
             if not resume:
                 create_run(run, source, config, device.type)
@@ -134,7 +134,7 @@ class Train:
                 show_until_interrupted(viewer, console)
 
     def _check(self) -> None:
-        """Raise SettingError for flags that do not make sense, before the photos are read."""
+        """Raise SettingError for invalid options, before the photos are read."""
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.downscale < 1:
@@ -147,17 +147,17 @@ class Train:
             check_server(self.host, self.port)
 
     def _with_background(self, config: Config, scene: Scene, resume: bool) -> Config:
-        """Take the background that the scene's photos are put on, unless the run has one already."""
+        """Return a config with the background of the scene's photos; a resumed run keeps its own."""
         if scene.background is None or resume:
             return config
         if "background" in parse_settings(self.settings):
-            raise SettingError("--set: background: expected --background instead: the photos are put on it, too")
+            raise SettingError("--set: background: expected --background instead, which also applies to the photos")
         return dataclasses.replace(config, background=scene.background)
 
     def _viewer(
         self, trainer: Trainer, run: Path, title: str, console: Console
     ) -> AbstractContextManager["Viewer | None"]:
-        """A context with the viewer of a training, or with None."""
+        """Return a context with the viewer of the training; with None, without --view."""
         if not self.view:
             return nullcontext()
         from nexwarp.viewer import Viewer
@@ -178,13 +178,13 @@ class Train:
         return viewer
 
     def _source(self) -> SceneSource:
-        """The scene that the flags ask for."""
+        """Return the scene of the options."""
         return SceneSource(
             self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
         )
 
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
-        """Photos as in the run to resume; the scene's folder may have moved, other flags must agree."""
+        """Return the scene of the run to resume; its folder may have moved, other options must agree."""
         old, config, _ = read_run(run)
         for flag, default, given, expected in (
             ("--downscale", 1, self.downscale, old.downscale),
@@ -200,7 +200,7 @@ class Train:
         return dataclasses.replace(old, path=source.path)
 
     def _config(self, run: Path, resume: bool = False) -> Config:
-        """Settings from preset and flags, or, when resuming, from the run, which given flags must agree with."""
+        """Return the settings of preset and options, or those of the run to resume, which options must agree with."""
         flags: dict[str, Json] = {
             "iterations": self.iterations,
             "max_surfels": self.max_surfels,
@@ -220,7 +220,7 @@ class Train:
         return with_flag_settings(with_settings(base, given), settings)
 
     def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
-        """Settings of the run to resume; SettingError names a given one that differs."""
+        """Return the settings of the run to resume; a SettingError names an option that differs."""
         config = read_run(run)[1]
         for name, value in given.items():
             if getattr(config, name) != value:
@@ -229,14 +229,14 @@ class Train:
         changed = with_flag_settings(config, settings)
         for name in settings:
             old, new = setting(config, name), setting(changed, name)
-            if name == "cuda_graphs":  # the one setting that does not change a run's results
+            if name == "cuda_graphs":  # does not change the results
                 config = dataclasses.replace(config, cuda_graphs=changed.cuda_graphs)
             elif old != new:
                 raise SettingError(f"--set: {name}: expected {old} as in the run to resume, got {new}")
         return config
 
     def _settings(self, given: dict[str, Json]) -> dict[str, Json]:
-        """What --set asks for; a setting that has a flag of its own must not be there."""
+        """Return the settings of --set; those that are also given as an option of their own are refused."""
         try:
             settings = parse_settings(self.settings)
         except ValueError as error:
@@ -244,5 +244,5 @@ class Train:
         for name in settings:
             if name == "preset" or name in given:
                 flag = f"--{name.replace('_', '-')}"
-                raise SettingError(f"--set: {name}: expected {flag} alone, got {name} with --set")
+                raise SettingError(f"--set: {name}: expected {flag} instead of --set")
         return settings

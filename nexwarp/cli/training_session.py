@@ -1,4 +1,4 @@
-"""One training with its display, log and checkpoints, and what is left behind when it ends."""
+"""A training session: the training loop with display, log and checkpoints, and the files of a finished run."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,24 +28,24 @@ if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 CHECKPOINTS_A_RUN = 10
-# While a checkpoint is written, the last two are there, and the model needs room too.
+# Large files on the disk at once: two checkpoints, a third while it is written, and the model.
 FILES_AT_A_TIME = 4
 DIVERGED_FILE = "diverged.json"
 
 
 class TrainingSession:
-    """A training in a run folder, from its first or resumed iteration to the evaluated model."""
+    """One training in a run folder, from its first or resumed iteration to the evaluated model."""
 
     def __init__(
         self, trainer: Trainer, run: Path, console: Console, *, tensorboard: bool = False, every: int | None = None
     ) -> None:
-        """Take a trainer.
+        """Prepare the session; nothing runs yet.
 
         Args:
-            trainer: at the run's beginning.
+            trainer: the trainer, before its first iteration.
             run: run folder.
             console: where to print.
-            tensorboard: also log for TensorBoard.
+            tensorboard: whether to log for TensorBoard, too.
             every: iterations between checkpoints; None is a tenth of the run.
         """
         self.trainer, self.run, self.console, self.tensorboard = trainer, run, console, tensorboard
@@ -53,42 +53,49 @@ class TrainingSession:
         self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
 
     def check_room(self, kept: int = 0) -> None:
-        """Raise StorageError unless the disk has room for the files of a run that has `kept` checkpoints already."""
+        """Raise StorageError unless the disk has room for the run's files.
+
+        Args:
+            kept: number of checkpoints that the run has already.
+        """
         check_room(self.run, max(FILES_AT_A_TIME - kept, 1) * self.trainer.checkpoint_size())
 
     def resume(self) -> None:
-        """Continue from the run's newest whole checkpoint, where it has one."""
+        """Restore the run's newest complete checkpoint, if it has one."""
         self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
         tidy_run(self.run)
         if has_checkpoint(self.run):
             self.trainer.restore(self.run, partial(display.warn, self.console))
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
         else:
-            self.console.print(f"{self.run}: no checkpoint yet, so training starts anew", soft_wrap=True)
+            self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
 
     def train(self, viewer: "Viewer | None" = None) -> None:
-        """Run the loop; write checkpoints on the way and when a signal asks to stop.
+        """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
+
+        Args:
+            viewer: shows the training between steps; None shows nothing.
 
         Raises:
             DivergedError: the training diverged twice; the last good model and a report are in the run.
-            StorageError: the disk is full; the model as it is now is in the run where there was room.
-            Stopped: a signal ended the training after a checkpoint.
+            StorageError: the disk is full; the current model is in the run if there was room for it.
+            Stopped: a signal ended the training; a checkpoint of its last step is in the run.
         """
         trainer = self.trainer
-        shown = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
+        progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
         log = TrainingLog(self.run, trainer, tensorboard=self.tensorboard)
-        with shown, log, deferred_stop() as asked:
+        with progress_display, log, deferred_stop() as stop_signal:
 
             def observe(step: StepReport) -> None:
-                shown(step)
+                progress_display(step)
                 with self._model_kept():
                     log(step)
                 if viewer is not None:
-                    viewer.between_steps(step.iteration, partial(_describe, step), lambda: asked() is not None)
-                if step.iteration % self.every == 0 or step.iteration == self.total or asked() is not None:
+                    viewer.between_steps(step.iteration, partial(_describe, step), lambda: stop_signal() is not None)
+                if step.iteration % self.every == 0 or step.iteration == self.total or stop_signal() is not None:
                     with self._model_kept():
                         trainer.save(self.run)
-                if (number := asked()) is not None:
+                if (number := stop_signal()) is not None:
                     raise Stopped(number)
 
             def warn(text: str) -> None:
@@ -101,49 +108,49 @@ class TrainingSession:
                 raise self._diverged(error) from None
 
     def _diverged(self, error: DivergedError) -> DivergedError:
-        """Write the last good model, which the trainer has gone back to, and a report; return the error to raise."""
+        """Write a report and the last good model, which the trainer has restored; return the error to raise."""
         trainer, run = self.trainer, self.run
         report = {"message": str(error), **error.report}
-        kept = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
+        outcome = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
         try:
             write_json(run / DIVERGED_FILE, report)
             save_model(run, trainer.model())
         except OSError as problem:
-            kept = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
-        return DivergedError(f"{error}; {kept}", report)
+            outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
+        return DivergedError(f"{error}; {outcome}", report)
 
     @contextmanager
     def _model_kept(self) -> Iterator[None]:
-        """Where the disk is full, save at least the model, which is smaller than a checkpoint."""
+        """If the block fails on a full disk, save the model at least, which is smaller than a checkpoint."""
         try:
             yield
         except OSError as error:
             try:
                 save_model(self.run, self.trainer.model())
-                model = "the model as it is now is saved"
+                model = "the current model is saved"
             except OSError:
                 model = "the model cannot be saved either"
-            rest = "no checkpoint yet"
+            checkpoint = "there is no checkpoint"
             if has_checkpoint(self.run):
-                rest = "the last checkpoint is kept, --resume continues from it"
+                checkpoint = "--resume continues from the last checkpoint"
             iteration = self.trainer.iteration
-            raise StorageError(f"{error}; training stops at iteration {iteration:,}: {model}, {rest}") from error
+            raise StorageError(f"{error}; training stops at iteration {iteration:,}: {model}, {checkpoint}") from error
 
     def finish(self) -> Model:
-        """Finish and write the model, evaluate what was written, and return it.
+        """Finish, write, evaluate and return the model.
 
         Raises:
-            StorageError, OutOfMemoryError: the training is kept, and --resume finishes the run.
+            StorageError, OutOfMemoryError: the last checkpoint holds the trained state; --resume finishes the run.
         """
         try:
             return self._finish()
         except OSError as error:
-            raise StorageError(f"{error}; the training is done and kept: --resume finishes the run") from error
+            raise StorageError(f"{error}; training is complete and saved: --resume finishes the run") from error
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
                 raise
             raise OutOfMemoryError(
-                f"out of memory: it needed {needed}; the training is done and kept: --resume finishes the run"
+                f"out of memory: needed {needed}; training is complete and saved: --resume finishes the run"
             ) from error
 
     def _finish(self) -> Model:

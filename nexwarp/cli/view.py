@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class View:
-    """Show a run in the browser: every pass, from anywhere, and camera paths for render (extra `viewer`)."""
+class ViewCommand:
+    """Show a run in the browser, with all buffers and an editor of camera paths for render (extra `viewer`)."""
 
     run: Run_
     """Run folder."""
     host: Host_ = "127.0.0.1"
-    """Where to listen; 0.0.0.0 lets other machines look."""
+    """Address to listen on; 0.0.0.0 allows other machines."""
     port: Port_ = 8080
-    """Port to listen on; 0 takes any free one."""
+    """Port to listen on; 0 picks a free one."""
     device: Device_ = None
-    """Where to compute."""
+    """Device to render on."""
 
     def __call__(self, console: Console) -> None:
-        """Listen until Ctrl-C."""
+        """Serve the viewer until Ctrl-C."""
         from nexwarp.viewer import Viewer
 
         source, _, _ = read_run(self.run)
@@ -49,7 +49,7 @@ class View:
 
 
 def show_until_interrupted(viewer: "Viewer", console: Console) -> None:
-    """Show a model that no longer changes."""
+    """Serve the viewer of a finished model until Ctrl-C."""
     console.print(f"viewer: {viewer.url} (Ctrl-C ends it)")
     with suppress(KeyboardInterrupt):
         viewer.show()

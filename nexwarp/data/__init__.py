@@ -1,4 +1,4 @@
-"""Where scenes come from: COLMAP, nerfstudio, Blender, the built-in demo; and the points that training starts from."""
+"""Scenes from COLMAP, nerfstudio, Blender and the built-in demo; the initial points of a training."""
 
 from nexwarp.data.demo import demo_folder, write_demo
 from nexwarp.data.points import InitialPoints, initial_points

@@ -1,4 +1,4 @@
-"""A cache of the user's: the demo scene, and photos that were undistorted."""
+"""The user's cache folder, which holds the demo scene and undistorted photos."""
 
 import hashlib
 import os
@@ -10,30 +10,30 @@ from pathlib import Path
 import numpy as np
 import torch
 
-VERSION = b"1"  # of what a cached photo holds: raise it when the same photo and lens would give other pixels
+VERSION = b"1"  # of cached photos; raise it when the same photo and lens give other pixels
 
 
 def cache_folder() -> Path:
-    """Folder of the cache: $NEXWARP_CACHE, else $XDG_CACHE_HOME/nexwarp, else ~/.cache/nexwarp."""
+    """The cache folder: $NEXWARP_CACHE, else $XDG_CACHE_HOME/nexwarp, else ~/.cache/nexwarp."""
     cache = os.environ.get("NEXWARP_CACHE")
     return Path(cache) if cache else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nexwarp"
 
 
 class PhotoCache:
-    """Undistorted photos as PNG files, found by a digest of everything that their pixels depend on.
+    """Undistorted photos as PNG files, named by a digest of all inputs of the undistortion.
 
-    A folder that cannot be written to is no error: one warning, and the photos are undistorted anew each time.
+    If the folder cannot be written to, a warning is issued once and the photos are undistorted at each load.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Cache below a folder, which need not exist."""
+        """Use a folder, which is created when the first photo is saved."""
         self.folder = folder
         self._lock = threading.Lock()
         self._writable = True
 
     @staticmethod
     def key(*parts: bytes) -> str:
-        """Digest of byte strings, each with its length."""
+        """Hexadecimal digest of byte strings and their lengths."""
         digest = hashlib.blake2b(VERSION, digest_size=20)
         for part in parts:
             digest.update(len(part).to_bytes(8, "little"))
@@ -41,7 +41,7 @@ class PhotoCache:
         return digest.hexdigest()
 
     def load(self, key: str, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor | None] | None:
-        """Photo (H, W, 3 or 4) uint8 and mask (H, W) bool or None; None when it is not there or is damaged."""
+        """Load a photo (H, W, 3 or 4) uint8 and its mask, (H, W) bool or None; None if it is missing or damaged."""
         file, mask_file = self._files(key)
         photo = _read(file)
         if photo is None or photo.shape[:2] != (height, width) or photo.ndim != 3:
@@ -54,7 +54,7 @@ class PhotoCache:
         return torch.from_numpy(photo), torch.from_numpy(mask > 0)
 
     def save(self, key: str, photo: torch.Tensor, mask: torch.Tensor | None) -> None:
-        """Keep a photo; the mask is written first, so that a photo is never found without it."""
+        """Save a photo and its mask; the mask first, so that no photo exists without its mask."""
         if not self._writable:
             return
         file, mask_file = self._files(key)

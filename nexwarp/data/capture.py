@@ -1,30 +1,29 @@
-"""What a scene's files say before a pixel is read: photos with their cameras, and points."""
+"""The content of a scene's files without pixels: photos with their cameras, and points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
 
 import numpy as np
 
 from nexwarp.data.lens import Lens
 
-MAX_PART, MAX_PATH = 240, 1024  # bytes of a file name
-LARGEST_COORDINATE = 1e15  # squares stay finite in single precision
+MAX_PART, MAX_PATH = 240, 1024  # bytes of a part of a file's path, and of the path
+LARGEST_COORDINATE = 1e15  # its square is finite in single precision
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One posed photo; the pixels are elsewhere.
+    """A posed photo, without its pixels.
 
     Attributes:
-        name: its name below the images folder, "/" between its parts; unique in a scene.
+        name: path below the images folder, with "/" as separator; unique in a scene.
         file: the image file.
         viewmat: (4, 4) float64, world to camera, OpenCV axes.
-        lens: the camera as it took the photo, whose size may differ from the file's by a factor.
-        mask: the mask's file where the scene names it.
-        face: which face of a panorama this is, see `nexwarp.data.lens.FACES`.
-        points: (M, 3) float32 world positions of the points that were triangulated from it; None when unknown.
+        lens: the camera of the photo; the size of the image file may differ from the lens's by a factor.
+        mask: the mask's file; None if the scene names none.
+        face: name of the face of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos.
+        points: (M, 3) float32 world positions of the points that were triangulated from it; None if unknown.
     """
 
     name: str
@@ -38,15 +37,15 @@ class Photo:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points to start from.
+    """The points of a scene.
 
     Attributes:
         positions: (P, 3) float64, world frame.
         colors: (P, 3) uint8 sRGB.
-        track_lengths: (P,) int32, how many photos see a point; 0 when unknown.
-        reprojection_errors: (P,) float32, mean over the track, in pixels of the photos as taken; -1 when unknown.
-        observations: (M, 2) int64 pairs of a photo's number and the index of a point that it sees; ascending, none
-            twice. None when unknown.
+        track_lengths: (P,) int32, number of photos that see a point; 0 if unknown.
+        reprojection_errors: (P,) float32, mean over the track, in pixels of the original photos; -1 if unknown.
+        observations: (M, 2) int64 distinct pairs of a photo's number and the index of a point that it sees, ascending;
+            None if unknown.
     """
 
     positions: np.ndarray
@@ -57,21 +56,21 @@ class Cloud:
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> "Cloud":
-        """Points of which nothing but positions and colours is known."""
+        """Points with positions (P, 3) and colours (P, 3) only."""
         count = len(positions)
         return cls(positions, colors, np.zeros(count, np.int32), np.full(count, -1.0, np.float32))
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene's photos and points.
+    """The photos and points of a scene.
 
     Attributes:
         source: the file or folder that the cameras were read from.
-        photos: sorted by name.
-        cloud: points, None where the scene has none.
-        test: names of the photos to judge by; None for every eighth.
-        background: colour that goes behind transparent photos unless another is asked for; None drops their alpha.
+        photos: the photos, sorted by name.
+        cloud: the points; None if the scene has none.
+        test: names of the test photos; None for every eighth photo.
+        background: default colour behind transparent photos; None drops their alpha.
     """
 
     source: Path
@@ -82,10 +81,15 @@ class Capture:
 
 
 def safe_name(where: str, name: str, folder: str) -> str:
-    """Normalise a file name of a scene: "/" between its parts, none of them ".".
+    """Normalise a relative path of a scene: "/" as separator, without ".".
+
+    Args:
+        where: place of the name, for messages.
+        name: the path.
+        folder: what the path is relative to, for messages.
 
     Raises:
-        ValueError: it is no printable relative path below the scene's folder, on any system, or longer than one has.
+        ValueError: the path is not printable, is absolute or has ".." on any operating system, or is too long.
     """
     if (
         not name
@@ -96,21 +100,26 @@ def safe_name(where: str, name: str, folder: str) -> str:
     path = PurePosixPath(name)
     if not path.parts:
         raise ValueError(f"{where} {short(name)} names no file, expected a relative path below the {folder}")
-    # What a mask or an undistorted photo adds to a name has to fit as well.
+    # The limits leave room for the suffixes of masks and undistorted photos.
     if len(name.encode()) > MAX_PATH or any(len(part.encode()) > MAX_PART for part in path.parts):
         raise ValueError(f"{where} {short(name)}: expected at most {MAX_PART} bytes a part and {MAX_PATH} in all")
     return str(path)
 
 
 def inside_folder(where: str, path: Path, folder: Path) -> Path:
-    """Return a path below a scene's folder unless symbolic links lead it out; the folder itself may be a link.
+    """Return `path` after a check that symbolic links do not lead out of `folder`; `folder` itself may be a link.
+
+    Args:
+        where: place of the path, for messages.
+        path: a path below `folder`.
+        folder: a folder of the scene.
 
     Raises:
-        ValueError: they do.
+        ValueError: a link leads out of the folder.
     """
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # links in a circle
+    except (OSError, RuntimeError):  # circular links
         inside = False
     if not inside:
         raise ValueError(f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it")
@@ -118,7 +127,7 @@ def inside_folder(where: str, path: Path, folder: Path) -> Path:
 
 
 def check_unique(source: Path, photos: list[Photo]) -> None:
-    """Raise ValueError when two photos have one name."""
+    """Raise ValueError if two photos have the same name."""
     seen: set[str] = set()
     for photo in photos:
         if photo.name in seen:
@@ -127,7 +136,7 @@ def check_unique(source: Path, photos: list[Photo]) -> None:
 
 
 def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:
-    """Raise ValueError naming the first of (P, 3) positions that is not finite or is absurdly far."""
+    """Raise ValueError naming the first of (P, 3) positions that is not finite or further than 1e15 from the origin."""
     bad = ~(np.abs(positions) <= LARGEST_COORDINATE).all(axis=1)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
@@ -137,7 +146,7 @@ def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[
         )
 
 
-def short(value: Any) -> str:
-    """What a file holds, for a message of one line."""
+def short(value: object) -> str:
+    """The representation of a value in at most 60 characters, for messages."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""COLMAP models: where they lie, and what their records say about photos and points."""
+"""COLMAP models: search for their files, and conversion of their records to photos and points."""
 
 import dataclasses
 from pathlib import Path
@@ -24,17 +24,17 @@ FOLDERS = ("sparse/0", "sparse", ".")
 
 
 def has_model(path: Path) -> bool:
-    """Whether a COLMAP model, or a part of one, lies where `find_model` looks."""
+    """Whether a file of a COLMAP model exists in a folder that `find_model` searches."""
     return any((path / folder / f"{part}.{end}").is_file() for folder in FOLDERS for part in PARTS for end in FORMATS)
 
 
 def find_model(path: Path) -> tuple[Path, str]:
     """Return the folder of a scene's COLMAP model and its format, "bin" (preferred) or "txt".
 
-    Looks in sparse/0, in sparse and in `path` itself, in this order.
+    The folders sparse/0, sparse and `path` itself are searched in this order.
 
     Raises:
-        FileNotFoundError: there is no complete model; of a partial one, the message says what lacks.
+        FileNotFoundError: there is no complete model; the message names the missing files of a partial one.
     """
     partial = None
     for folder in (path / name for name in FOLDERS):
@@ -52,12 +52,16 @@ def find_model(path: Path) -> tuple[Path, str]:
 
 
 def read_model(path: Path, images: Path) -> Capture:
-    """Read the COLMAP model of the scene at `path`, whose photos lie in `images`.
+    """Read the COLMAP model of a scene.
+
+    Args:
+        path: folder of the scene.
+        images: folder of its photos.
 
     Raises:
         FileNotFoundError: there is no model.
-        ValueError: the model is damaged, has no registered image, a camera or pose that is not usable, an image name
-            that leaves the images folder or comes twice, or points that are not finite.
+        ValueError: the model is damaged, has no registered image, an invalid camera or pose, an image name that leaves
+            the images folder or occurs twice, or points that are not finite.
     """
     folder, suffix = find_model(path)
     records = (read_binary if suffix == "bin" else read_text)(folder)
@@ -93,7 +97,7 @@ def _photo(
 
 
 def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
-    """(4, 4) of a rotation wxyz and a translation."""
+    """(4, 4) float64 matrix of a rotation wxyz and a translation."""
     quat, shift = np.array(pose[:4]), np.array(pose[4:])
     if not (np.abs(pose) <= LARGEST_COORDINATE).all() or not np.abs(quat).max() >= 1 / LARGEST_COORDINATE:
         raise ValueError(f"{where}: expected a finite pose with a rotation, got {pose}")
@@ -110,11 +114,11 @@ def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
 
 
 def _seen(records: Records, folder: Path) -> list[np.ndarray]:
-    """For each image the (M, 3) float32 positions of the points that were triangulated from it, by ascending id."""
+    """For each image, the (M, 3) float32 positions of the points that were triangulated from it, by ascending id."""
     points = records.points
     identities = np.array(list(records.images), np.int64)
     ascending = np.argsort(identities)
-    # Of observations there are many more than of anything else: what is made of them is made in place.
+    # Observations are the largest arrays of a model, so they are processed in place.
     pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
     np.minimum(pairs, len(identities) - 1, out=pairs)
     known = identities[ascending].astype(np.uint32)[pairs] == points.seen_by
@@ -124,7 +128,7 @@ def _seen(records: Records, folder: Path) -> list[np.ndarray]:
             f"{folder}: damaged, point {points.ids[points.points[first]]} is seen by image {points.seen_by[first]}, "
             "which the model does not have"
         )
-    # By image, then by point; a point that an image sees twice counts once.
+    # Sort by image, then by point, and remove duplicates.
     pairs *= len(points.ids)
     pairs += points.points
     pairs.sort()

@@ -1,8 +1,8 @@
-"""COLMAP's model files, binary and text, into plain arrays.
+"""Readers of COLMAP's model files, binary and text, into numpy arrays.
 
-Read here and not through pycolmap: that allocates for counts before it knows that the file holds them, reads on past
-the end of a truncated file, stops the process on some damaged ones, and takes a Python object for each point. Poses
-and points are all that is used; rigs and frames repeat the poses of the images and are only looked at for damage.
+pycolmap is not used: it allocates memory for a count before it checks the file's size, reads past the end of a
+truncated file, aborts the process on some damaged files, and creates a Python object for each point. Only poses and
+points are used; rigs and frames, which repeat the poses of the images, are only checked for damage.
 """
 
 import struct
@@ -10,7 +10,7 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ MAX_CAMERAS = MAX_IMAGES = 100_000
 MAX_POINTS = 10_000_000
 MAX_OBSERVATIONS = 100_000_000
 MAX_NAME = 4096  # bytes
-MAX_LINE = 64 * 2**20  # bytes of a text file's line: a photo with a million keypoints
+MAX_LINE = 64 * 2**20  # bytes of a line of a text file, enough for a million keypoints
 CAMERA, IMAGE, POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), 51
 POINT_RECORD = np.dtype(
     {
@@ -31,10 +31,12 @@ POINT_RECORD = np.dtype(
     }
 )
 
+Record = TypeVar("Record")
+
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """A camera: its model by COLMAP's name, size in pixels, parameters in COLMAP's order."""
+    """A camera: COLMAP's name of its model, size in pixels, parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -47,9 +49,9 @@ class ImageRecord:
     """A registered image.
 
     Attributes:
-        pose: (7,) rotation wxyz, of any length, and translation, world to camera.
+        pose: (7,) rotation wxyz, not normalised, and translation, world to camera.
         camera: id of its camera.
-        name: as the file has it.
+        name: the name in the file.
     """
 
     pose: tuple[float, ...]
@@ -63,12 +65,12 @@ class PointRecords:
 
     Attributes:
         ids: (P,) uint64.
-        positions: (P, 3) float64.
+        positions: (P, 3) float64, world frame.
         colors: (P, 3) uint8.
-        errors: (P,) float64, mean reprojection errors.
-        lengths: (P,) int64, observations of each.
-        seen_by: (E,) uint32, image ids of the observations, point after point in the order of `points`.
-        points: (E,) int32, index of the point of each.
+        errors: (P,) float64, mean reprojection errors in pixels.
+        lengths: (P,) int64, number of observations of each point.
+        seen_by: (E,) uint32, image ids of the observations, in the order of `points`.
+        points: (E,) int32, index of the point of each observation.
     """
 
     ids: np.ndarray
@@ -82,7 +84,7 @@ class PointRecords:
 
 @dataclass(frozen=True)
 class Records:
-    """What the files of a model hold: cameras and images by id, and points."""
+    """The records of a model: cameras and images by id, and points."""
 
     cameras: dict[int, CameraRecord]
     images: dict[int, ImageRecord]
@@ -90,10 +92,10 @@ class Records:
 
 
 def read_binary(folder: Path) -> Records:
-    """Read cameras.bin, images.bin and points3D.bin; what lies in rigs.bin and frames.bin must be whole.
+    """Read cameras.bin, images.bin and points3D.bin; check that rigs.bin and frames.bin are complete if they exist.
 
     Raises:
-        ValueError: naming the file, where it is truncated or damaged, or holds more than nexwarp takes.
+        ValueError: a file is truncated or damaged, or exceeds the limits above; the message names it.
     """
     for name, skip in (("rigs.bin", _skip_rig), ("frames.bin", _skip_frame)):
         if (folder / name).is_file():
@@ -114,7 +116,7 @@ def read_binary(folder: Path) -> Records:
 
 
 def read_text(folder: Path) -> Records:
-    """Read cameras.txt, images.txt and points3D.txt; errors as of `read_binary`, with the line."""
+    """Read cameras.txt, images.txt and points3D.txt; errors are those of `read_binary`, with the line number."""
     lines = _lines(folder / "cameras.txt")
     cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines), MAX_CAMERAS)
     images = _unique(folder / "images.txt", _text_images(folder / "images.txt"), MAX_IMAGES)
@@ -122,7 +124,7 @@ def read_text(folder: Path) -> Records:
 
 
 class _Reader:
-    """A binary file that is never read past its end, nor allocated for beyond its size."""
+    """Reads a binary file with checks against its size: it never reads or allocates beyond it."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.position = path, 0
@@ -151,14 +153,14 @@ class _Reader:
 
     def count(self, limit: int) -> int:
         count = self.number("Q")
-        if count > self.size - self.position:  # a record takes more than a byte
+        if count > self.size - self.position:  # each record has at least one byte
             raise self._short()
         if count > limit:
             raise ValueError(f"{self.path}: expected at most {limit:,} records, got {count:,}")
         return count
 
     def text(self) -> bytes:
-        """Bytes up to a zero."""
+        """Read bytes up to a zero."""
         start = self.position
         data, zero, _ = self._file.read(MAX_NAME + 1).partition(b"\0")
         if not zero and start + MAX_NAME < self.size:
@@ -181,9 +183,9 @@ class _Reader:
         return ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
 
 
-def _unique(path: Path, records: Iterator[tuple[int, object]], limit: int = MAX_CAMERAS) -> dict:
-    """Records by id, each id once."""
-    found = {}
+def _unique(path: Path, records: Iterator[tuple[int, Record]], limit: int = MAX_CAMERAS) -> dict[int, Record]:
+    """Collect records by id; ValueError if an id occurs twice or there are more than `limit`."""
+    found: dict[int, Record] = {}
     for identity, record in records:
         if identity in found:
             raise ValueError(f"{path}: damaged, expected each id once, got {identity} twice")
@@ -223,7 +225,7 @@ def _binary_points(file: _Reader) -> PointRecords:
 
 
 def _skip_rig(file: _Reader) -> None:
-    """Id, sensors: the first of type and id, the others with a pose (7 doubles) or none."""
+    """Skip a rig: its id and sensors, each with type and id; all but the first have an optional pose (7 doubles)."""
     file.skip(4)
     sensors = file.number("I")
     if sensors:
@@ -235,13 +237,13 @@ def _skip_rig(file: _Reader) -> None:
 
 
 def _skip_frame(file: _Reader) -> None:
-    """Id, rig, pose (7 doubles), and 16 bytes a sensor."""
+    """Skip a frame: id, rig, pose (7 doubles), and 16 bytes for each sensor."""
     file.skip(64)
     file.skip(16 * file.number("I"))
 
 
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Where a line is, and the line; comments and empty ones are left out."""
+    """Yield each line with its place for messages; comments and empty lines are skipped."""
     return ((where, line) for where, line in _all_lines(path) if line and not line.startswith(b"#"))
 
 
@@ -325,7 +327,7 @@ def _sorted(
     lengths: np.ndarray,
     seen_by: np.ndarray,
 ) -> PointRecords:
-    """Points by ascending id, so that binary and text models load alike."""
+    """Sort points by ascending id, so that binary and text models give the same result."""
     order = np.argsort(ids, kind="stable")
     ids = ids[order]
     twice = np.flatnonzero(ids[1:] == ids[:-1])

@@ -15,7 +15,7 @@ from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.raytrace import render
 
-VERSION = 1  # of the content: raise it when anything changes in what `write_demo` writes
+VERSION = 1  # of the scene's content; raise it when the output of `write_demo` changes
 WIDTH, HEIGHT, VIEWS, POINTS = 192, 144, 40, 4000
 TARGET = np.array([0.0, 0.0, 0.62])
 RINGS = ((3.15, 14.0), (3.3, 36.0))  # distance from the target in world units, elevation in degrees
@@ -23,21 +23,21 @@ FIELD_OF_VIEW = 56.0  # horizontal, degrees
 
 
 def demo_folder() -> Path:
-    """Return the folder of the built-in scene, after making it when it is not there yet (some seconds).
+    """Return the folder of the built-in scene; the first call writes it, which takes some seconds.
 
-    It lies in a cache of the user: $NEXWARP_CACHE, else $XDG_CACHE_HOME/nexwarp, else ~/.cache/nexwarp.
+    It is in the user's cache: $NEXWARP_CACHE, else $XDG_CACHE_HOME/nexwarp, else ~/.cache/nexwarp.
     """
     folder = cache_folder() / f"demo-v{VERSION}-{WIDTH}x{HEIGHT}-{VIEWS}"
     if not folder.is_dir():
         try:
             write_demo(folder)
-        except FileExistsError:  # another process was quicker, and its folder is as good
+        except FileExistsError:  # another process has written the same scene
             pass
     return folder
 
 
 def write_demo(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     width: int = WIDTH,
     height: int = HEIGHT,
     views: int = VIEWS,
@@ -46,16 +46,16 @@ def write_demo(
 ) -> Path:
     """Write the demo as a COLMAP scene: images/*.png and a binary model in sparse/0.
 
-    The same arguments give the same files. They are written beside `folder` and moved there at the end, so
-    that a crash leaves no half of a scene.
+    The same arguments give the same files. They are written to a temporary folder beside `folder` and moved at the
+    end, so that a crash leaves no incomplete scene.
 
     Args:
-        folder: where to; must not exist, or be empty.
-        width: of the photos, in pixels; the textures get as fine as it takes.
-        height: of the photos, in pixels.
+        folder: folder to write; must be empty or absent.
+        width: width of the photos in pixels; it also sets the resolution of the textures.
+        height: height of the photos in pixels.
         views: number of photos, at least 4.
-        points: number of sparse points wanted.
-        seed: of the points' noise; the photos do not depend on it.
+        points: largest number of sparse points.
+        seed: seed of the points' noise; the photos do not depend on it.
 
     Returns:
         `folder`.
@@ -97,18 +97,18 @@ def _move(scene: Path, folder: Path) -> None:
     """Rename `scene` to `folder`, in one step."""
     _check_free(folder)
     if folder.exists():
-        folder.rmdir()  # Windows renames onto nothing, not even an empty folder
+        folder.rmdir()  # on Windows, rename needs a target that does not exist
     try:
         scene.rename(folder)
     except OSError:
-        _check_free(folder)  # a race is lost: say it in the same words
+        _check_free(folder)  # another process has written the folder meanwhile
         raise
 
 
 def demo_cameras(width: int, height: int, views: int) -> Rig:
-    """Two rings of cameras around the lawn, the upper one turned by half a step.
+    """Two rings of cameras around the lawn; the upper ring is rotated by half a step.
 
-    All share intrinsics with fx != fy and a principal point off the centre.
+    All cameras share intrinsics with fx != fy and a principal point off the centre.
     """
     fx = 0.5 * width / np.tan(np.radians(FIELD_OF_VIEW / 2))
     K = np.array([[fx, 0.0, 0.507 * width], [0.0, 1.03 * fx, 0.489 * height], [0.0, 0.0, 1.0]])

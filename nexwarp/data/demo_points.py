@@ -1,4 +1,4 @@
-"""The demo's sparse points: what structure from motion would have found, noise and blunders included."""
+"""The demo's sparse points: a simulation of structure from motion with noise and outliers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ MIN_VIEWS = 3
 POSITION_NOISE = 0.005  # standard deviation, in units of the cameras' distance from their mean
 COLOR_NOISE = 3.0  # standard deviation, of 255
 DETECTION_NOISE = 0.3  # standard deviation of an observation, in pixels
-DETECTION_RATE = 0.7  # of the views that see a point
+DETECTION_RATE = 0.7  # share of the views that detect a visible point
 OUTLIER_RATE = 0.03
 BORDER = 1.0  # pixels at the image border without observations
 
@@ -24,7 +24,7 @@ class SparsePoint:
         position: (3,) float64 world position, noise included.
         color: (3,) uint8.
         views: (n,) indices of the views that observed it, ascending.
-        pixels: (n, 2) float64 where they did, pixel coordinates.
+        pixels: (n, 2) float64 pixel coordinates of the observations, noise included.
     """
 
     position: np.ndarray
@@ -69,14 +69,14 @@ def sparse_points(
     count: int,
     rng: np.random.Generator,
 ) -> list[SparsePoint]:
-    """Detect, match and triangulate, as it were: surface points that 3 views or more see, and some outliers.
+    """Simulate detection, matching and triangulation: surface points that at least 3 views see, and some outliers.
 
     Args:
         rectangles: the scene.
         rig: the cameras.
-        images: (H, W, 3) uint8 of each view; features are more likely where they have contrast.
-        count: how many points are wanted.
-        rng: source of all randomness.
+        images: (H, W, 3) uint8 image of each view; detection is more likely at high contrast.
+        count: largest number of points.
+        rng: generator of all random numbers.
 
     Returns:
         At most `count` points.
@@ -106,8 +106,10 @@ def sparse_points(
     return points
 
 
-def _candidates(rectangles, rig: Rig, images, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Surface points at high contrast, shuffled: views (N,), positions, colours and normals (N, 3)."""
+def _candidates(
+    rectangles: Sequence[Rectangle], rig: Rig, images: Sequence[np.ndarray], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
+    """Draw surface points at high contrast, in random order: views (N,), positions, colours and normals (N, 3)."""
     share = -(-count // len(images))
     found = []
     for view, (image, centre) in enumerate(zip(images, rig.centres, strict=True)):
@@ -129,11 +131,13 @@ def _candidates(rectangles, rig: Rig, images, count: int, rng: np.random.Generat
     return tuple(np.concatenate(column)[order] for column in zip(*found, strict=True))
 
 
-def _outlier(rig: Rig, view: int, surface: np.ndarray, rng: np.random.Generator):
-    """Triangulate a wrong match: a point elsewhere on the viewing ray, with a short or a badly fitting track.
+def _outlier(
+    rig: Rig, view: int, surface: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Simulate a wrong match: a point elsewhere on the viewing ray, with a short or inaccurate track.
 
     Returns:
-        Position, views and pixels; None when too few views have the wrong point in their image.
+        Position (3,), views (n,) and pixels (n, 2); None if too few views have the point in their image.
     """
     shift = rng.uniform(0.5, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.8)
     position = rig.centres[view] + shift * (surface - rig.centres[view])

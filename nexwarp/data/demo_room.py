@@ -1,7 +1,7 @@
-"""What stands in the demo scene: a courtyard with a raised lawn, boxes with pictures and a cage of thin bars.
+"""Geometry and light of the demo scene: a courtyard with a raised lawn, boxes with pictures and a cage of thin bars.
 
 World frame: z up, floor at z = 0, the middle of the lawn at x = y = 0, units of about a metre. The pictures
-are those that come inside scikit-image's wheel, so nothing is downloaded.
+are part of scikit-image's wheel, so nothing is downloaded.
 """
 
 from collections.abc import Callable
@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nexwarp.data.raytrace import Rectangle, sample_texture, visible
 
@@ -16,24 +17,21 @@ HALF_SIDE, WALL_HEIGHT, LAWN_HEIGHT = 4.2, 3.4, 0.3
 LAMP = np.array([-1.6, -2.2, 3.2])
 LAMP_SIDE, LAMP_STEPS, LAMP_POWER = 1.2, 4, 0.62
 FILL_LIGHTS, FILL_POWER, AMBIENT = 20, 0.55, 0.34
-OBJECT_DETAIL, FLOOR_DETAIL, WALL_DETAIL = (
-    0.75,
-    0.5,
-    0.4,
-)  # texels per world unit and per pixel of image width
+# Texels per world unit and per pixel of image width.
+OBJECT_DETAIL, FLOOR_DETAIL, WALL_DETAIL = 0.75, 0.5, 0.4
 
 Paint = Callable[[float, float], np.ndarray]  # width and height in world units -> (h, w, 3) float32 texture
 
 
 def build_room(width: int) -> list[Rectangle]:
-    """Build the scene, with textures as fine as images of `width` pixels can show and the light baked in."""
+    """Build the scene with baked light; `width`, that of the images in pixels, sets the resolution of the textures."""
     pictures = _pictures()
     rectangles = _courtyard(pictures, width) + _objects(pictures, width) + _cage(width)
     return _bake_light(rectangles)
 
 
 def _pictures() -> dict[str, np.ndarray]:
-    """(h, w, 3) float32 in [0, 1] each."""
+    """Load the pictures by name, (h, w, 3) float32 in [0, 1] each."""
     from skimage import data
 
     names = "page brick grass gravel astronaut coins chelsea coffee rocket immunohistochemistry".split()
@@ -41,14 +39,14 @@ def _pictures() -> dict[str, np.ndarray]:
     for name in names:
         image = getattr(data, name)().astype(np.float32) / 255.0
         pictures[name] = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
-    pictures["brick"] = pictures["brick"].transpose(1, 0, 2)  # courses lie level
+    pictures["brick"] = pictures["brick"].transpose(1, 0, 2)  # brick courses are horizontal
     pictures["title"] = pictures["page"][4:42, 0:288]
     pictures["wood"] = pictures["coffee"][5:165, 500:598]
     return pictures
 
 
 def _picture(image: np.ndarray, detail: float, frame: float = 0.0) -> Paint:
-    """Fit an image to a face, with a white frame of so many world units."""
+    """Fit an image to a face, with a white frame whose width is in world units."""
 
     def paint(width: float, height: float) -> np.ndarray:
         texture = _resize(image, width, height, detail)
@@ -67,7 +65,7 @@ def _picture(image: np.ndarray, detail: float, frame: float = 0.0) -> Paint:
 
 
 def _tiles(image: np.ndarray, detail: float, period: float, tint: tuple[float, float, float]) -> Paint:
-    """Cover a face with an image of `period` world units, mirrored from tile to tile against seams."""
+    """Tile a face with an image of `period` world units; neighbouring tiles are mirrored to avoid seams."""
 
     def paint(width: float, height: float) -> np.ndarray:
         tile = _resize(image, period, period, detail)
@@ -75,7 +73,7 @@ def _tiles(image: np.ndarray, detail: float, period: float, tint: tuple[float, f
         tile = np.concatenate([tile, tile[:, ::-1]], axis=1)
         rows, columns = (max(2, round(size * detail)) for size in (height, width))
         repeats = -(-rows // tile.shape[0]), -(-columns // tile.shape[1]), 1
-        return np.clip(np.tile(tile, repeats)[:rows, :columns] * np.float32(tint), 0.0, 1.0)
+        return np.clip(np.tile(tile, repeats)[:rows, :columns] * np.asarray(tint, np.float32), 0.0, 1.0)
 
     return paint
 
@@ -86,7 +84,7 @@ def _stripes(colors: list[tuple[float, float, float]], detail: float, period: fl
     def paint(width: float, height: float) -> np.ndarray:
         rows, columns = (max(2, round(size * detail)) for size in (height, width))
         position = (np.arange(max(rows, columns)) + 0.5) / detail / period
-        bands = np.float32(colors)[position.astype(int) % len(colors)]
+        bands = np.asarray(colors, np.float32)[position.astype(int) % len(colors)]
         bands = bands[None] if columns >= rows else bands[:, None]
         return np.broadcast_to(bands, (rows, columns, 3)).copy()
 
@@ -100,18 +98,20 @@ def _resize(image: np.ndarray, width: float, height: float, detail: float) -> np
     return np.clip(resize(image, shape, order=1, anti_aliasing=True), 0.0, 1.0).astype(np.float32)
 
 
-def _rectangle(origin, u, v, paint: Paint, gloss: float = 0.0) -> Rectangle:
-    origin, u, v = (np.asarray(vector, dtype=np.float64) for vector in (origin, u, v))
-    # Textures run down their rows: v points down a wall as it does in an image.
+def _rectangle(corner: ArrayLike, along: ArrayLike, down: ArrayLike, paint: Paint, gloss: float = 0.0) -> Rectangle:
+    """A rectangle with a corner (3,) and two edges (3,); `down` is the direction of the texture's rows."""
+    origin, u, v = (np.asarray(vector, dtype=np.float64) for vector in (corner, along, down))
     return Rectangle(origin, u, v, paint(float(np.linalg.norm(u)), float(np.linalg.norm(v))), gloss)
 
 
-def _box(center, size, yaw: float, sides: list[Paint], top: Paint, gloss: float = 0.0) -> list[Rectangle]:
-    """A box on its base: `center` (3,) of the base, `size` (3,), turned by `yaw` degrees about z.
+def _box(
+    base: ArrayLike, size: tuple[float, float, float], yaw: float, sides: list[Paint], top: Paint, gloss: float = 0.0
+) -> list[Rectangle]:
+    """A box with the centre of its base at `base` (3,), rotated by `yaw` degrees about z.
 
-    Sides come in the order -y, +x, +y, -x; the base is left out unless it floats.
+    The sides are in the order -y, +x, +y, -x. The bottom is left out unless the box is above the lawn.
     """
-    center, (length, depth, height) = np.asarray(center, dtype=np.float64), size
+    center, (length, depth, height) = np.asarray(base, dtype=np.float64), size
     cos, sin = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     x, y, z = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0]), np.array([0.0, 0.0, 1.0])
     faces = []
@@ -174,7 +174,7 @@ def _objects(pictures: dict[str, np.ndarray], width: int) -> list[Rectangle]:
 
 
 def _cage(width: int) -> list[Rectangle]:
-    """A cube of twelve thin bars: at 192 pixels of width they are two pixels across."""
+    """A cube of twelve thin bars, two pixels wide in images of 192 pixels width."""
     detail, edge, bar = OBJECT_DETAIL * width, 0.62, 0.032
     stripes = _stripes([(0.86, 0.16, 0.12), (0.95, 0.93, 0.9)], detail, 0.104)
     center, yaw = np.array([0.42, -0.5, LAWN_HEIGHT]), 28.0
@@ -191,11 +191,11 @@ def _cage(width: int) -> list[Rectangle]:
 
 
 def _bake_light(rectangles: list[Rectangle]) -> list[Rectangle]:
-    """Multiply Lambert's law and soft shadows into the textures: matt surfaces look alike from everywhere."""
+    """Multiply diffuse light with soft shadows into the textures."""
     grids = [_light_grid(rectangle) for rectangle in rectangles]
     points = np.concatenate([grid.reshape(-1, 3) for grid in grids])
     normals = np.repeat([rectangle.normal for rectangle in rectangles], [grid[..., 0].size for grid in grids], axis=0)
-    # An empty room is convex: its walls shade nothing in it.
+    # The walls of a convex room cast no shadows inside it.
     blockers = [rectangle for rectangle in rectangles if np.abs(rectangle.origin[:2]).max() < HALF_SIDE - 0.1]
 
     def lit(light: tuple[np.ndarray, float]) -> np.ndarray:
@@ -207,7 +207,7 @@ def _bake_light(rectangles: list[Rectangle]) -> list[Rectangle]:
         return total
 
     with ThreadPoolExecutor() as pool:
-        total = AMBIENT + sum(pool.map(lit, _lights()))
+        total = np.asarray(AMBIENT + sum(pool.map(lit, _lights())))
     baked, start = [], 0
     for rectangle, grid in zip(rectangles, grids, strict=True):
         rows, columns = grid.shape[:2]
@@ -218,17 +218,17 @@ def _bake_light(rectangles: list[Rectangle]) -> list[Rectangle]:
 
 
 def _lights() -> list[tuple[np.ndarray, float]]:
-    """Position and power of the point lights: a square lamp, and a dome of weak ones that soften corners."""
+    """Position (3,) and power of the point lights: a square lamp, and a dome of weak lights that brightens corners."""
     steps = (np.arange(LAMP_STEPS) + 0.5) / LAMP_STEPS - 0.5
     lamp = [LAMP + LAMP_SIDE * np.array([x, y, 0.0]) for x in steps for y in steps]
-    angles = np.arange(FILL_LIGHTS) * np.pi * (3.0 - 5.0**0.5)  # the golden angle spreads them evenly
+    angles = np.arange(FILL_LIGHTS) * np.pi * (3.0 - 5.0**0.5)  # the golden angle gives an even distribution
     radii = 3.8 * np.sqrt((np.arange(FILL_LIGHTS) + 0.5) / FILL_LIGHTS)
     dome = [np.array([r * np.cos(t), r * np.sin(t), 3.3 - 0.1 * r * r]) for r, t in zip(radii, angles, strict=True)]
     return [(p, LAMP_POWER / len(lamp)) for p in lamp] + [(p, FILL_POWER / len(dome)) for p in dome]
 
 
 def _light_grid(rectangle: Rectangle) -> np.ndarray:
-    """(rows, columns, 3) places to measure light: centres of cells of 0.06 units, on large faces 0.12."""
+    """(rows, columns, 3) world positions for baking: centres of cells of 0.06 units, or 0.12 on large faces."""
     area = np.linalg.norm(rectangle.u) * np.linalg.norm(rectangle.v)
     spacing = 0.12 if area > 10.0 else 0.06
     columns, rows = (max(2, round(np.linalg.norm(edge) / spacing)) for edge in (rectangle.u, rectangle.v))
@@ -237,7 +237,7 @@ def _light_grid(rectangle: Rectangle) -> np.ndarray:
 
 
 def _spread(light: np.ndarray, rectangle: Rectangle) -> np.ndarray:
-    """Interpolate `light` (rows, columns, 1) to the texels of the rectangle."""
+    """Interpolate `light` (rows, columns, 1) at the texels of the rectangle, (h, w, 1)."""
     height, width = rectangle.texture.shape[:2]
     a, b = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     return sample_texture(light, a.ravel(), b.ravel()).reshape(height, width, 1)

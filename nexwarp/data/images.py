@@ -1,30 +1,34 @@
-"""Reading photos and masks into uint8 tensors, and shrinking them."""
+"""Read photos and masks into uint8 tensors, and reduce them."""
 
 import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from nexwarp.io.files import one_line
 
-# PIL has more, some of which start other programs.
+if TYPE_CHECKING:
+    import PIL.Image
+
+# PIL supports other formats; some of them start other programs.
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF")
-ROWS = 256  # that are converted at a time
+ROWS = 256  # rows that are converted at a time
 MAX_SUM = 2**32 - 1
-MAX_PIXELS = 178_956_970  # PIL's own limit for an honest image, twice what it warns of
-# No codec packs a photo so well; the pixels of a one-coloured PNG take an eighth of a thousandth of a byte at most.
+MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
+# Larger images are refused above a ratio of pixels to bytes that no photo reaches: (2,000, 16,000 for bilevel images).
 HONEST_PIXELS, HONEST_RATIO = 40_000_000, (2_000, 16_000)
-WHITE = 128  # and above counts in a mask that has such values; in another, such as one of 0 and 1, all but 0
+WHITE = 128  # threshold of a mask; if no value reaches it, as in a mask of 0 and 1, all values above 0 are used
 
 
 @contextmanager
 def quiet_pillow() -> Iterator[None]:
-    """Keep PIL's warning of very large images back; above twice that size they are refused."""
+    """Suppress PIL's warning of very large images; twice that size is an error in any case."""
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -33,9 +37,11 @@ def quiet_pillow() -> Iterator[None]:
 
 
 class _Bounded(io.BufferedReader):
-    """A file of which no more is read than there is."""
+    """A file that limits each read to the file's size.
 
-    # Python allocates what is asked for, and PIL asks for lengths as damaged files give them.
+    PIL reads lengths that damaged files give, and Python allocates the whole length before reading.
+    """
+
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > os.fstat(self.fileno()).st_size:
             size = -1
@@ -43,8 +49,8 @@ class _Bounded(io.BufferedReader):
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator:
-    """A PIL image; whatever goes wrong with it until the end is told in one line."""
+def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
+    """Open an image with PIL; errors in the block, too, become a ValueError of one line."""
     from PIL import Image, UnidentifiedImageError
 
     if not path.is_file():
@@ -52,7 +58,7 @@ def _opened(path: Path) -> Iterator:
     try:
         formats = [name for name in FORMATS if name in _registered()]
         with _Bounded(io.FileIO(path)) as file, Image.open(file, formats=formats) as image:
-            # Also where another library took PIL's guard off.
+            # PIL's own check can be disabled by other libraries.
             pixels = image.width * image.height
             if pixels > MAX_PIXELS:
                 raise Image.DecompressionBombError
@@ -65,11 +71,12 @@ def _opened(path: Path) -> Iterator:
         ) from None
     except UnidentifiedImageError:
         raise ValueError(f"{path}: expected a complete image file, could not decode it: no format is known") from None
-    except Exception as error:  # PIL's decoders raise whatever a damaged file leads them to
+    except Exception as error:  # PIL's decoders raise many types for damaged files
         raise ValueError(f"{path}: expected a complete image file, could not decode it: {one_line(error)}") from error
 
 
-def _registered() -> dict:
+def _registered() -> Container[str]:
+    """Names of the formats that this build of PIL can decode."""
     from PIL import Image
 
     Image.init()
@@ -77,13 +84,13 @@ def _registered() -> dict:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image in pixels, from its header; errors as of `read_image`."""
+    """Width and height of an image in pixels, from its header; errors are those of `read_image`."""
     with quiet_pillow(), _opened(path) as image:
         return image.size
 
 
 def read_image(path: Path) -> torch.Tensor:
-    """Read a photo as COLMAP does: no EXIF orientation is applied; grey is repeated, alpha is dropped.
+    """Read a photo as COLMAP does: EXIF orientation is ignored, grey is repeated, alpha is dropped.
 
     Args:
         path: a JPEG, PNG, WebP, TIFF, BMP, PPM, GIF, TGA, JPEG 2000 or AVIF file, 8 or 16 bits a channel.
@@ -93,7 +100,7 @@ def read_image(path: Path) -> torch.Tensor:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file cannot be decoded, is truncated, or has more pixels than PIL takes for an honest image.
+        ValueError: the file cannot be decoded, is truncated, or has more than 178 megapixels.
     """
     with _opened(path) as image:
         image.load()
@@ -104,26 +111,31 @@ def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Read a photo with its transparency.
 
     Returns:
-        (H, W, 3) uint8 sRGB as of `read_image`, and (H, W) uint8 alpha, None where the file has none.
+        (H, W, 3) uint8 sRGB as of `read_image`, and (H, W) uint8 alpha; None if the file has no transparency.
+
+    Raises:
+        FileNotFoundError, ValueError: as of `read_image`.
     """
     with _opened(path) as image:
         image.load()
-        alpha = None
         if image.has_transparency_data:
             rgba = np.array(image.convert("RGBA"))
             return torch.from_numpy(rgba[:, :, :3].copy()), torch.from_numpy(rgba[:, :, 3].copy())
-        return torch.from_numpy(_to_rgb(image)), alpha
+        return torch.from_numpy(_to_rgb(image)), None
 
 
 def read_mask(path: Path) -> torch.Tensor:
-    """Read a mask: white counts, black does not.
+    """Read a mask, whose white pixels are used.
 
     Returns:
-        (H, W) bool, True for values of 128 and above; where the file has none of them, for all but 0.
+        (H, W) bool, True for values of at least 128; if the file has no such value, True for values above 0.
+
+    Raises:
+        FileNotFoundError, ValueError: as of `read_image`.
     """
     with _opened(path) as image:
         image.load()
-        if image.mode == "P":  # label pictures: the index says more than the palette's colour
+        if image.mode == "P":  # label images: the index is the value, not the palette's colour
             values = np.array(image)
         elif image.mode == "1":
             values = np.array(image).astype(np.uint8)
@@ -133,8 +145,8 @@ def read_mask(path: Path) -> torch.Tensor:
     return torch.from_numpy(white if white.any() else values > 0)
 
 
-def _grey(image):
-    """A mask with an alpha channel is one painted on nothing: its colours say what counts, its alpha where it is."""
+def _grey(image: "PIL.Image.Image") -> "PIL.Image.Image":
+    """Convert a mask to grey; a transparent mask is composited on black, so that transparent pixels are not used."""
     if image.has_transparency_data:
         from PIL import Image
 
@@ -143,21 +155,21 @@ def _grey(image):
     return image.convert("L")
 
 
-def _to_rgb(image) -> np.ndarray:
-    """(H, W, 3) uint8 of a PIL image."""
-    if image.mode.startswith("I"):  # 16-bit greyscale, which PIL's own conversion would clip at 255
+def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
+    """Convert a PIL image to (H, W, 3) uint8."""
+    if image.mode.startswith("I"):  # 16-bit grey, which PIL's conversion would clip at 255
         wide = np.asarray(image)
         grey = np.empty(wide.shape, np.uint8)
         for top in range(0, len(wide), ROWS):
             grey[top : top + ROWS] = np.clip((wide[top : top + ROWS].astype(np.int64) + 128) // 257, 0, 255)
         return np.repeat(grey[:, :, None], 3, axis=2)
-    if image.mode == "P":  # palettes may hold transparency, which PIL can drop only by way of RGBA
+    if image.mode == "P":  # PIL drops the transparency of a palette only through RGBA
         image = image.convert("RGBA")
     return np.array(image.convert("RGB"))
 
 
 def compose(image: torch.Tensor, alpha: torch.Tensor, background: tuple[float, float, float]) -> torch.Tensor:
-    """Put a transparent photo on a colour, in sRGB as 8-bit tools do.
+    """Composite a transparent photo on a colour, in sRGB.
 
     Args:
         image: (H, W, 3) uint8, not premultiplied.
@@ -176,7 +188,7 @@ def compose(image: torch.Tensor, alpha: torch.Tensor, background: tuple[float, f
 
 
 def downscale_mask(mask: torch.Tensor, factor: int) -> torch.Tensor:
-    """Reduce a mask (H, W) bool as `downscale_image` does; a pixel counts where all of its block does."""
+    """Reduce a mask (H, W) bool in blocks as `downscale_image`; a pixel is True if its whole block is."""
     if factor == 1:
         return mask
     height, width = mask.shape[0] // factor, mask.shape[1] // factor
@@ -185,14 +197,14 @@ def downscale_mask(mask: torch.Tensor, factor: int) -> torch.Tensor:
 
 
 def resize_mask(mask: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Take the nearest pixels of a mask (H, W) bool, for an image of another size."""
+    """Resample a mask (H, W) bool to (height, width) by nearest neighbours."""
     rows = ((torch.arange(height) + 0.5) * (mask.shape[0] / height)).long()
     columns = ((torch.arange(width) + 0.5) * (mask.shape[1] / width)).long()
     return mask[rows][:, columns]
 
 
 def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:
-    """Average blocks of `factor` x `factor` pixels; what fills no block at the right and bottom is cropped.
+    """Average blocks of `factor` x `factor` pixels; incomplete blocks at the right and bottom are cropped.
 
     Args:
         image: (H, W, C) uint8.
@@ -205,7 +217,7 @@ def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:
         return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
     pixels = image[: height * factor, : width * factor].numpy()
-    # Adding up slices is far faster than a sum over two strided axes.
+    # Adding slices is much faster than a sum over two strided axes.
     area = factor * factor
     rows = pixels[::factor].astype(np.uint32 if area * 511 < MAX_SUM else np.int64)
     for offset in range(1, factor):

@@ -1,7 +1,6 @@
-"""Lenses: COLMAP's camera models, the pinhole that replaces a distorted one, and the resampling in between.
+"""Lenses: COLMAP's camera models, undistortion to a pinhole image, and the resampling for it.
 
-Pixel centres lie at +0.5 in every image. A photo is resampled once, by bicubic interpolation; masks take the
-nearest pixel.
+Pixel centres are at +0.5. A photo is resampled once by bicubic interpolation, a mask by nearest neighbours.
 """
 
 import math
@@ -9,20 +8,24 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+if TYPE_CHECKING:
+    import pycolmap
+
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 PANORAMA = "EQUIRECTANGULAR"
 MAX_SIDE = 2**16  # pixels, of an undistorted image
-MIN_FOCAL, MAX_PARAMETER = 1e-3, 1e9  # pixels: rays and pixels stay finite in single precision
-ROWS = 128  # of a map that are computed at a time: their rays take double precision
-KEPT_MAPS = 6  # a panorama's faces
-BORDER = 0.5  # pixels outside a photo that still take the colour of its edge
+MIN_FOCAL, MAX_PARAMETER = 1e-3, 1e9  # pixels; rays and pixels stay finite in single precision
+ROWS = 128  # rows of a map that are computed at a time, as their rays are float64
+KEPT_MAPS = 6  # for the faces of a panorama
+BORDER = 0.5  # pixels outside a photo that take the colour of its edge
 
-# World-to-face rotations of a panorama's six views, each of 90 degrees, x right, y down, z forward.
+# Rotations from a panorama's frame to its six faces of 90 degrees, x right, y down, z forward.
 FACES = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
@@ -33,10 +36,10 @@ FACES = {
 }
 
 
-def pycolmap_module() -> Any:
-    """Import pycolmap, late (it costs start-up time) and after numpy and PIL.
+def pycolmap_module() -> ModuleType:
+    """Import pycolmap when it is needed, since it delays the start, and after numpy and PIL.
 
-    Version 4.2.1 corrupts the heap now and then when it is imported before them.
+    If version 4.2.1 is imported before them, it sometimes corrupts the heap.
     """
     import PIL.Image  # noqa: F401
     import pycolmap
@@ -46,7 +49,7 @@ def pycolmap_module() -> Any:
 
 @lru_cache(maxsize=1)
 def camera_models() -> dict[int, tuple[str, int]]:
-    """COLMAP's camera models: id -> name and number of parameters."""
+    """COLMAP's camera models: id -> (name, number of parameters)."""
     pycolmap = pycolmap_module()
     create = pycolmap.Camera.create_from_model_id
     models = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
@@ -54,40 +57,40 @@ def camera_models() -> dict[int, tuple[str, int]]:
 
 
 @dataclass(frozen=True)
-class Pinhole:
-    """An image without distortion.
+class Intrinsics:
+    """Intrinsics and size of an image without distortion.
 
     Attributes:
-        K: (3, 3) float64, intrinsics in pixels, pixel centres at +0.5.
-        width: of the image in pixels.
-        height: of the image in pixels.
+        K: (3, 3) float64, in pixels, pixel centres at +0.5.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
     """
 
     K: np.ndarray
     width: int
     height: int
 
-    def resized(self, width: int, height: int) -> "Pinhole":
-        """Return the same view with other pixels, an axis at a time."""
+    def resized(self, width: int, height: int) -> "Intrinsics":
+        """Return the intrinsics of the same view with another size; each axis is scaled on its own."""
         K = self.K.copy()
         K[0] *= width / self.width
         K[1] *= height / self.height
-        return Pinhole(K, width, height)
+        return Intrinsics(K, width, height)
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as it took the photo: one of COLMAP's models.
+    """The camera of a photo before undistortion: one of COLMAP's camera models.
 
     Attributes:
         model: COLMAP's name, such as OPENCV.
-        params: its parameters in COLMAP's order, in pixels of a width x height image.
-        width: of the photo in pixels.
-        height: of the photo in pixels.
+        params: parameters in COLMAP's order, in pixels of a width x height image.
+        width: width of the photo in pixels.
+        height: height of the photo in pixels.
 
     Raises:
-        ValueError: an unknown model, another number of parameters, parameters that are not finite, a focal length
-            or size that is not positive.
+        ValueError: an unknown model, a wrong number of parameters, a parameter that is not finite, a focal length or
+            size that is not positive.
     """
 
     model: str
@@ -116,57 +119,61 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines may come out bent."""
+        """Whether the model is not a pinhole."""
         return self.model not in PINHOLES
 
-    def pinhole(self) -> Pinhole:
-        """The pinhole image that replaces the photo: itself, or as much of it as leaves no empty corners.
+    def undistorted(self) -> Intrinsics:
+        """Intrinsics of the undistorted image; those of the photo if it is not distorted.
 
-        An undistorted image keeps the focal length; it is at most twice as wide and high as the photo. A panorama's
-        faces have the resolution of its equator.
+        The undistorted image shows the largest part of the photo without empty corners. It has the photo's focal length
+        and is at most twice as wide and high. The faces of a panorama have the resolution of its equator.
+
+        Raises:
+            ValueError: the parameters allow no undistortion.
         """
         if not self.distorted:
-            return Pinhole(np.array(self._camera().calibration_matrix()), self.width, self.height)
+            return Intrinsics(np.array(self._camera().calibration_matrix()), self.width, self.height)
         if self.model == PANORAMA:
             side = max(round(self.width / math.pi), 1)
             K = np.array([[side / 2, 0.0, side / 2], [0.0, side / 2, side / 2], [0.0, 0.0, 1.0]])
-            return Pinhole(K, side, side)
+            return Intrinsics(K, side, side)
         pycolmap = pycolmap_module()
         options = pycolmap.UndistortCameraOptions()
         camera = pycolmap.undistort_camera(options, self._camera())
         K = np.array(camera.calibration_matrix())
         if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE and np.isfinite(K).all()):
             raise ValueError(f"camera model {self.model}: cannot undistort with the parameters {self.params}")
-        return Pinhole(K, int(camera.width), int(camera.height))
+        return Intrinsics(K, int(camera.width), int(camera.height))
 
     def project(self, rays: np.ndarray) -> np.ndarray:
-        """Pixel coordinates (N, 2) float64 of camera-frame directions (N, 3); NaN where the lens sees nothing."""
+        """Pixel coordinates (N, 2) float64 of camera-frame directions (N, 3); NaN outside the lens's field of view."""
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)))
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Camera-frame directions (N, 3) float64 of pixel coordinates (N, 2); NaN where there is none."""
+        """Camera-frame directions (N, 3) float64 of pixel coordinates (N, 2); NaN if a pixel has none."""
         return np.asarray(self._camera().cam_ray_from_img(np.ascontiguousarray(pixels, dtype=np.float64)))
 
-    def _camera(self) -> Any:
-        return pycolmap_module().Camera(
+    def _camera(self) -> "pycolmap.Camera":
+        camera: pycolmap.Camera = pycolmap_module().Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
         )
+        return camera
 
 
 @dataclass(frozen=True)
 class Map:
-    """Where an undistorted image's pixels lie in the photo.
+    """The positions in the photo of the pixels of an undistorted image.
 
     Attributes:
-        grid: (1, h, w, 2) float32, as `torch.nn.functional.grid_sample` takes it.
-        valid: (h, w) bool, True inside the photo; None when all are.
+        grid: (1, h, w, 2) float32, for `torch.nn.functional.grid_sample`.
+        valid: (h, w) bool, True inside the photo; None if all pixels are.
     """
 
     grid: torch.Tensor
     valid: torch.Tensor | None
 
     def colors(self, image: torch.Tensor) -> torch.Tensor:
-        """Resample a photo (H, W, C) uint8 to (h, w, C) uint8, a channel at a time to save memory."""
+        """Resample a photo (H, W, C) uint8 to (h, w, C) uint8; each channel on its own, to save memory."""
         out = torch.empty(*self.grid.shape[1:3], image.shape[2], dtype=torch.uint8)
         for channel in range(image.shape[2]):
             plane = image[None, None, :, :, channel].float()
@@ -177,7 +184,7 @@ class Map:
         return out
 
     def mask(self, mask: torch.Tensor | None) -> torch.Tensor | None:
-        """Resample a mask (H, W) bool to (h, w) bool, False outside the photo; None where all of it counts."""
+        """Resample a mask (H, W) bool to (h, w) bool, False outside the photo; None if all pixels are True."""
         if mask is None:
             return self.valid
         near = torch.nn.functional.grid_sample(
@@ -188,14 +195,14 @@ class Map:
 
 
 class Maps:
-    """The maps of a scene's lenses, computed once for photos that share one; safe to use from several threads."""
+    """A thread-safe cache of the most recent maps, for photos that share a lens."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._maps: OrderedDict[tuple, Map] = OrderedDict()
+        self._maps: OrderedDict[tuple[Lens, int, int, bytes, str | None], Map] = OrderedDict()
 
-    def get(self, lens: Lens, target: Pinhole, face: str | None) -> Map:
-        """The map from a pinhole image to a photo; `face` names a panorama's face."""
+    def get(self, lens: Lens, target: Intrinsics, face: str | None) -> Map:
+        """Return the map from an undistorted image to a photo; `face` is the face of a panorama, a key of `FACES`."""
         key = (lens, target.width, target.height, target.K.tobytes(), face)
         with self._lock:
             if key not in self._maps:
@@ -206,7 +213,7 @@ class Maps:
             return self._maps[key]
 
 
-def _map(lens: Lens, target: Pinhole, face: str | None) -> Map:
+def _map(lens: Lens, target: Intrinsics, face: str | None) -> Map:
     grid = np.empty((target.height, target.width, 2), np.float32)
     valid = np.empty((target.height, target.width), bool)
     x = (np.arange(target.width) + 0.5 - target.K[0, 2]) / target.K[0, 0]

@@ -1,15 +1,15 @@
-"""Whether a scene's photos fit into the host's memory, told before the first of them is decoded."""
+"""Check that the photos of a scene fit into the host's memory, before any of them is decoded."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 GIB = 2**30
-SHARE = 0.9  # of the free memory that photos may take
+SHARE = 0.9  # largest share of the free memory for photos
 MAX_DOWNSCALE = 64
 
 
 def available_memory() -> int:
-    """Bytes that this process can still take: of the machine, or of its control group where that allows less."""
+    """Free memory for this process in bytes: that of the machine or of its control group, whichever is smaller."""
     import psutil
 
     free = int(psutil.virtual_memory().available)
@@ -20,28 +20,28 @@ def available_memory() -> int:
             used = int((group / "memory.current").read_text())
             stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
             free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
-    except (OSError, ValueError):  # no control groups of version 2 here
+    except (OSError, ValueError):  # no control groups of version 2
         pass
     return max(free, 0)
 
 
 def photos_bytes(sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:
-    """Bytes of photos (width, height) that are reduced by a factor."""
+    """Memory in bytes of photos of the given (width, height), reduced by `downscale`."""
     return sum((width // downscale) * (height // downscale) * channels for width, height in sizes)
 
 
 def check_memory(path: Path, images: str, sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:
-    """Return the bytes that stay free; raise when the photos would not fit.
+    """Return the memory in bytes that remains free after the photos are loaded.
 
     Args:
         path: folder of the scene, for the message.
-        images: folder of the photos in use, likewise.
-        sizes: width and height of every photo as it is kept, before `downscale`.
-        downscale: factor that reduces them.
-        channels: bytes a pixel.
+        images: name of the photos' folder, for the message.
+        sizes: width and height of every photo after undistortion, before the reduction.
+        downscale: factor of the reduction.
+        channels: bytes per pixel.
 
     Raises:
-        ValueError: they do not fit; the message says by how much to reduce them, or which folder to use.
+        ValueError: the photos do not fit; the message suggests a downscale or a folder of smaller images.
     """
     free = available_memory()
     limit = int(SHARE * free)

@@ -1,9 +1,10 @@
-"""Points in PLY files: positions and, where there are any, colours, and what is known of the photos they came from."""
+"""Points in PLY files: positions, and optionally colours, track lengths, reprojection errors and observations."""
 
 import io
 import itertools
 import os
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,31 +22,35 @@ MAX_HEADER = 64 * 1024  # bytes
 MAX_PROPERTIES = 1024
 MAX_POINTS = 100_000_000
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats: coefficients of Y_0
+HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # coefficients of the harmonic Y_0 of Gaussian splats
 BAND_0 = 0.28209479177387814
 GREY = 128
 TRACK = "track_length"
-ERRORS = ("reprojection_error", "error")  # the second is COLMAP's name, but elsewhere may mean anything
+ERRORS = ("reprojection_error", "error")  # the second is COLMAP's name; it is used only beside a track length
 OBSERVATION, PAIR = "observation", ("image_id", "vertex_index")
+
+# Name, count, and properties as (name, numpy type); None for an element with lists.
+Element: TypeAlias = tuple[str, int, list[tuple[str, str]] | None]
 
 
 def read_ply(path: Path) -> Cloud:
     """Read the points of a PLY file, ascii or binary.
 
     Args:
-        path: the file; its vertices have x, y and z, and may have red, green and blue (also diffuse_red ... or r, g,
-            b; integers of full range, or floats in [0, 1]) or the f_dc_0 ... of Gaussian splats; `track_length`, the
-            number of photos that see the point, where 0 or less is unknown; and `reprojection_error` (beside a
-            `track_length` also `error`), in pixels, negative when unknown. Integers `image_id` and `vertex_index`
-            of an element `observation` after the vertices say which photo sees which point. Others are ignored.
+        path: the file. Its vertices have x, y and z. Optional properties: colours red, green, blue (or diffuse_red,
+            ..., or r, g, b) as integers of full range or floats in [0, 1], or f_dc_0, ... of Gaussian splats;
+            `track_length`, the number of photos that see the point, unknown if 0 or less; `reprojection_error`, or
+            `error` beside a `track_length`, in pixels, unknown if negative. An optional element `observation` after
+            the vertices has the integers `image_id` and `vertex_index`: which photo sees which point. Other
+            properties and elements are ignored.
 
     Returns:
-        The points, in the file's frame; grey where the file has no colours.
+        The points in the file's frame; grey if the file has no colours.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no PLY file, one that is damaged or truncated, no vertices, positions or errors that are not
-            finite, or observations of points that are not there.
+        ValueError: the file is not PLY, is damaged or truncated, has no vertices, positions or errors that are not
+            finite, or observations of missing points.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected a PLY file of points")
@@ -53,7 +58,7 @@ def read_ply(path: Path) -> Cloud:
     with path.open("rb") as file:
         order, elements = _header(path, file)
         vertices, observations = _elements(path, file, order, elements, size)
-    names = vertices.dtype.names
+    names = _names(vertices)
     lacking = [axis for axis in "xyz" if axis not in names]
     if lacking:
         raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
@@ -63,10 +68,8 @@ def read_ply(path: Path) -> Cloud:
     with np.errstate(invalid="ignore", over="ignore"):
         colors = _colors(vertices)
     error = next((name for name in ERRORS if name in names and (name == ERRORS[0] or TRACK in names)), None)
-    lengths, errors = (
-        np.full(len(vertices), unknown) if name not in names else _known(path, vertices, name, unknown)
-        for name, unknown in ((TRACK, 0.0), (error, -1.0))
-    )
+    lengths = _known(path, vertices, TRACK if TRACK in names else None, 0.0)
+    errors = _known(path, vertices, error, -1.0)
     return Cloud(
         positions,
         colors,
@@ -77,11 +80,11 @@ def read_ply(path: Path) -> Cloud:
 
 
 def write_ply(path: str | os.PathLike[str], cloud: Cloud) -> None:
-    """Write points so that `read_ply` gives them back, and other programs read what they know of it.
+    """Write points for `read_ply`; other programs can read the positions and colours.
 
     Args:
-        path: where to; written aside, then renamed.
-        cloud: (P, 3) positions in the frame that the file is to have, colours, and what else is known.
+        path: the file, written atomically.
+        cloud: the points, in the frame of the file. Unknown track lengths and errors are left out.
 
     Raises:
         OSError: `path` cannot be written.
@@ -108,8 +111,15 @@ def write_ply(path: str | os.PathLike[str], cloud: Cloud) -> None:
         file.writelines(bodies)
 
 
-def _known(path: Path, vertices: np.ndarray, name: str, unknown: float) -> np.ndarray:
-    """(P,) float64 values of a property, of which all below 0 are unknown."""
+def _names(rows: np.ndarray) -> tuple[str, ...]:
+    """Names of the fields of a structured array."""
+    return rows.dtype.names or ()
+
+
+def _known(path: Path, vertices: np.ndarray, name: str | None, unknown: float) -> np.ndarray:
+    """(P,) float64 values of a property; `unknown` where the value is negative or the property does not exist."""
+    if name is None:
+        return np.full(len(vertices), unknown)
     values = vertices[name].astype(np.float64)
     bad = ~(np.abs(values) <= LARGEST_COORDINATE)
     if bad.any():
@@ -119,7 +129,7 @@ def _known(path: Path, vertices: np.ndarray, name: str, unknown: float) -> np.nd
 
 
 def _pairs(path: Path, observations: np.ndarray, count: int) -> np.ndarray:
-    """(M, 2) int64 ascending pairs of photo and point, each once."""
+    """(M, 2) int64 distinct pairs of photo and point, ascending."""
     image, vertex = (observations[name].astype(np.int64) for name in PAIR)
     if len(image) and (min(image.min(), vertex.min()) < 0 or vertex.max() >= count):
         raise ValueError(
@@ -129,12 +139,12 @@ def _pairs(path: Path, observations: np.ndarray, count: int) -> np.ndarray:
     return np.stack(np.divmod(np.unique(image * count + vertex), count), axis=1)
 
 
-def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[tuple[str, int, list[tuple[str, str]] | None]]]:
-    """Format and elements: name, count and properties, which are None for an element with lists."""
+def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:
+    """Read the format and the elements."""
     if file.readline(16).strip() != b"ply":
         raise ValueError(f"{path}: expected a PLY file, but it does not begin with 'ply'")
     form = None
-    elements: list[tuple[str, int, list[tuple[str, str]] | None]] = []
+    elements: list[Element] = []
     while True:
         if file.tell() > MAX_HEADER:
             raise ValueError(f"{path}: expected a PLY header of at most {MAX_HEADER:,} bytes")
@@ -151,8 +161,9 @@ def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[tuple[str, i
         elif words[:2] == ["property", "list"] and len(words) == 5 and elements:
             elements[-1] = (*elements[-1][:2], None)
         elif words[:1] == ["property"] and len(words) == 3 and elements and words[1] in TYPES:
-            if elements[-1][2] is not None:
-                elements[-1][2].append((words[2], TYPES[words[1]]))
+            properties = elements[-1][2]
+            if properties is not None:
+                properties.append((words[2], TYPES[words[1]]))
         elif words and words[0] not in ("comment", "obj_info"):
             raise ValueError(f"{path}: expected a PLY header, got the line {' '.join(words)[:60]!r}")
     if form is None:
@@ -161,9 +172,9 @@ def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[tuple[str, i
 
 
 def _elements(
-    path: Path, file: io.BufferedReader, form: str, elements: list, size: int
+    path: Path, file: io.BufferedReader, form: str, elements: list[Element], size: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Structured arrays of the vertices and, where they follow, of the observations; what lies before is skipped."""
+    """Read structured arrays of the vertices and, if they follow, of the observations; skip earlier elements."""
     names = [name for name, _, properties in elements if name != OBSERVATION or _is_observation(properties)]
     vertices = None
     for name, count, properties in elements:
@@ -177,7 +188,7 @@ def _elements(
         if len({field for field, _ in fields}) < len(fields) or len(fields) > MAX_PROPERTIES:
             raise ValueError(f"{path}: element {one_line(name, 60)}: expected properties of different names")
         dtype = np.dtype(fields)
-        # An ascii value takes a digit and a blank or an end of line.
+        # An ascii value has at least a digit and a separator.
         least = count * (dtype.itemsize if form != "ascii" else max(2 * len(fields), 1)) - (form == "ascii")
         if least > left or count > MAX_POINTS:
             raise ValueError(
@@ -204,31 +215,33 @@ def _is_observation(properties: list[tuple[str, str]] | None) -> bool:
     return all(kinds.get(name, "f4")[0] in "iu" for name in PAIR)
 
 
-def _rows(path: Path, file: io.BufferedReader, form: str, dtype: np.dtype, count: int) -> np.ndarray:
+def _rows(path: Path, file: io.BufferedReader, form: str, dtype: "np.dtype[np.void]", count: int) -> np.ndarray:
     if form == "ascii":
         return _ascii(path, file, dtype, count) if count else np.empty(0, dtype)
     return np.fromfile(file, dtype, count)
 
 
-def _ascii(path: Path, file: io.BufferedReader, dtype: np.dtype, count: int) -> np.ndarray:
+def _ascii(path: Path, file: io.BufferedReader, dtype: "np.dtype[np.void]", count: int) -> np.ndarray:
+    names = dtype.names or ()
     lines = itertools.islice((line for line in file if line.strip()), count)
     try:
         values = np.loadtxt(lines, np.float64, comments=None, max_rows=count, ndmin=2, encoding="ascii")
     except (ValueError, UnicodeDecodeError) as error:
         raise ValueError(
-            f"{path}: expected rows of {len(dtype)} numbers, could not read them: {one_line(error)}"
+            f"{path}: expected rows of {len(names)} numbers, could not read them: {one_line(error)}"
         ) from None
-    if values.shape != (count, len(dtype)):
-        raise ValueError(f"{path}: truncated, expected {count:,} rows of {len(dtype)} numbers, got {values.shape}")
+    if values.shape != (count, len(names)):
+        raise ValueError(f"{path}: truncated, expected {count:,} rows of {len(names)} numbers, got {values.shape}")
     vertices = np.empty(count, dtype)
     with np.errstate(invalid="ignore", over="ignore"):
-        for index, name in enumerate(dtype.names):
+        for index, name in enumerate(names):
             vertices[name] = values[:, index]
     return vertices
 
 
 def _colors(vertices: np.ndarray) -> np.ndarray:
-    names = vertices.dtype.names
+    """(P, 3) uint8 colours; grey without any."""
+    names = _names(vertices)
     for triple in COLORS:
         if set(triple) <= set(names):
             channels = [vertices[name] for name in triple]

@@ -1,4 +1,4 @@
-"""The points that training starts from: sparse points without outliers, spread evenly, with a size each."""
+"""The initial points of a training: sparse points without outliers, in an even distribution, with sizes."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ NORMAL_NEIGHBORS = 12
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Points in the order of farthest point sampling, so that every prefix covers the scene evenly.
+    """Points in the order of farthest point sampling: every prefix covers the scene evenly.
 
     Attributes:
         means: (M, 3) float32, world frame.
         colors: (M, 3) float32, sRGB in [0, 1].
         scales: (M,) float32, world units, > 0.
-        normals: (M, 3) float32, unit, of the plane through each point's 12 nearest points; of either sign.
+        normals: (M, 3) float32 unit normals of the planes fitted to each point's 12 nearest points; of either sign.
     """
 
     means: torch.Tensor
@@ -38,20 +38,20 @@ def initial_points(
     errors: torch.Tensor | None = None,
     filter_outliers: bool = True,
 ) -> InitialPoints:
-    """Choose the points that training starts from.
+    """Choose the initial points of a training.
 
-    A point's scale is half the root mean square distance to its 3 nearest predecessors in the order of the
-    sampling, that is, to what was there when it was added; the first three points, which lack predecessors,
-    take their nearest points of the whole choice. Points at exactly one position count once.
+    The scale of a point is half the root mean square distance to its 3 nearest predecessors in the order of the
+    sampling. The first three points use their nearest points among all chosen ones. Points at the same position count
+    once.
 
     Args:
         points: (P, 3) float, world frame.
         colors: (P, 3) uint8 sRGB, or float in [0, 1].
-        count: how many are wanted; fewer come when fewer are available.
-        track_lengths: (P,) integer, photos that a point was triangulated from; 0 when unknown.
-        errors: (P,) float, mean reprojection errors in pixels; negative when unknown.
+        count: largest number of points.
+        track_lengths: (P,) integer, number of photos that a point was triangulated from; 0 if unknown.
+        errors: (P,) float, mean reprojection errors in pixels; negative if unknown.
         filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust
-            sigmas, as far as `track_lengths` and `errors` are given; never more than half of the points.
+            sigmas, as far as `track_lengths` and `errors` are given; at most half of the points.
 
     Returns:
         min(count, available) points.
@@ -61,8 +61,8 @@ def initial_points(
     """
     _check_arguments(points, colors, count, track_lengths, errors)
     xyz = points.detach().cpu().double().numpy()
-    rgb = colors.detach().cpu()
-    rgb = (rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float().clamp(0.0, 1.0)).numpy()
+    srgb = colors.detach().cpu()
+    rgb = (srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb.float().clamp(0.0, 1.0)).numpy()
     if filter_outliers:
         keep = inliers(
             len(xyz),
@@ -80,7 +80,13 @@ def initial_points(
     )
 
 
-def _check_arguments(points, colors, count, track_lengths, errors) -> None:
+def _check_arguments(
+    points: torch.Tensor,
+    colors: torch.Tensor,
+    count: int,
+    track_lengths: torch.Tensor | None,
+    errors: torch.Tensor | None,
+) -> None:
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 1:
@@ -95,12 +101,12 @@ def _check_arguments(points, colors, count, track_lengths, errors) -> None:
 
 
 def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | None) -> np.ndarray:
-    """Return the indices, ascending, of the points that pass the outlier filter; at least half of them.
+    """Return the ascending indices of the points that pass the outlier filter; at least half of all points.
 
     Args:
         count: number of points P.
-        track_lengths: (P,) integer, 0 when unknown, or None.
-        errors: (P,) float, pixels, negative when unknown, or None.
+        track_lengths: (P,) integer, 0 if unknown; or None.
+        errors: (P,) float, pixels, negative if unknown; or None.
     """
     short = np.zeros(count, dtype=bool)
     if track_lengths is not None:
@@ -113,27 +119,27 @@ def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | N
         bound = median + ROBUST_SIGMAS * SIGMA_FROM_MAD * np.median(np.abs(known - median))
     keep = ~short & (error <= bound)
     half = (count + 1) // 2
-    if keep.sum() < half:  # a sparse capture, two-view points mostly: the better half, long tracks first
+    if keep.sum() < half:  # mostly two-view points: keep the better half, long tracks first
         keep[np.lexsort((error, short))[:half]] = True
     return np.flatnonzero(keep)
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Order points so that each is the farthest from all before it.
+    """Order points so that each is the farthest from all previous ones.
 
     Args:
-        points: (P, 3) float64; where several are at one position, only the first of them is taken.
-        count: how many to take.
+        points: (P, 3) float64; of several points at one position only the first is used.
+        count: largest number of points.
 
     Returns:
-        (min(count, distinct),) int64 indices into `points`. The start is arbitrary but always the same:
-        fpsample's `start_idx` counts in the order of its own tree (1.0.2), so index 0 need not come first.
+        (min(count, distinct),) int64 indices into `points`. The first one is deterministic but not always 0, since
+        fpsample's `start_idx` refers to the order of its own tree (1.0.2).
     """
     from fpsample import bucket_fps_kdline_sampling
 
-    # fpsample works in float32: centred, so that the distance from the origin costs no precision.
+    # fpsample uses float32: centring the points keeps its precision far from the origin.
     centred = (points - points.mean(axis=0)).astype(np.float32)
-    # Once only duplicates are left, fpsample returns one index again and again.
+    # Duplicates are removed: once only duplicates are left, fpsample repeats an index.
     distinct = np.sort(np.unique(centred, axis=0, return_index=True)[1])
     if len(distinct) == 1:
         return distinct
@@ -145,10 +151,12 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def predecessor_scales(means: np.ndarray) -> np.ndarray:
-    """Half the root mean square distance of each point to its 3 nearest predecessors, exactly.
+    """Half the root mean square distance of each point to its 3 nearest predecessors.
+
+    The search is exact. The first three points use their nearest points among all.
 
     Args:
-        means: (M, 3) float64 in order.
+        means: (M, 3) float64, in the order of the sampling.
 
     Returns:
         (M,) float64, at least 1e-6 of the extent of `means`.
@@ -166,7 +174,7 @@ def predecessor_scales(means: np.ndarray) -> np.ndarray:
         distances, indices = tree.query(means[pending], k=neighbors, workers=-1)
         earlier = indices < pending[:, None]
         done = earlier.sum(axis=1) >= NEIGHBORS
-        # The neighbours come nearest first, so the first 3 predecessors among them are the nearest of all.
+        # Neighbours are sorted by distance, so the first 3 predecessors among them are the nearest ones.
         rank = np.cumsum(earlier[done], axis=1)
         chosen = earlier[done] & (rank <= NEIGHBORS)
         squared[pending[done]] = (distances[done] ** 2 * chosen).sum(axis=1) / NEIGHBORS
@@ -179,11 +187,11 @@ def predecessor_scales(means: np.ndarray) -> np.ndarray:
 
 
 def plane_normals(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Unit normals of the planes fitted to the 12 points of a cloud nearest to each of some places.
+    """Unit normals of the planes fitted to the 12 points of a cloud nearest to each query position.
 
     Args:
-        points: (P, 3) float64 cloud.
-        at: (M, 3) float64 places.
+        points: (P, 3) float64, the cloud.
+        at: (M, 3) float64, the query positions.
 
     Returns:
         (M, 3) float64; the sign is arbitrary.
@@ -193,6 +201,6 @@ def plane_normals(points: np.ndarray, at: np.ndarray) -> np.ndarray:
     count = min(NORMAL_NEIGHBORS, len(points))
     _, indices = cKDTree(points).query(at, k=[*range(1, count + 1)], workers=-1)
     offsets = points[indices] - points[indices].mean(axis=1, keepdims=True)
-    # Eigenvalues ascend: the first eigenvector is the direction of least spread.
+    # Eigenvalues are ascending: the first eigenvector is the direction of least variance.
     _, vectors = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets)
     return vectors[:, :, 0]

@@ -1,31 +1,32 @@
-"""Points for a scene that has none: spread over what its cameras look at."""
+"""Random points for a scene without points, in the region that its cameras look at."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from nexwarp.data.capture import Cloud
+from nexwarp.data.views import View
 
 COUNT = 100_000
-ROUNDS = 20
-NEAREST, FARTHEST = 0.3, 3.0  # in units of the distance to what the cameras look at
-UNKNOWN_DEPTHS = (1.0, 30.0)  # in units of the scene's scale, where they look at nothing in common
-MIN_CONVERGENCE = 1e-3
-HULL_VIEWS = 24
+ROUNDS = 20  # largest number of draws
+NEAREST, FARTHEST = 0.3, 3.0  # depths relative to the distance of the cameras' focus
+UNKNOWN_DEPTHS = (1.0, 30.0)  # depths relative to the scene's scale, without a common focus
+MIN_CONVERGENCE = 1e-3  # ratio of eigenvalues below which optical axes count as parallel
+HULL_VIEWS = 24  # largest number of views that check a point
 
 
-def random_points(views: Sequence, scale: float, count: int = COUNT, seed: int = 0) -> Cloud:
-    """Random points in the views' frustums, with the colours of the pixels that they were drawn from.
+def random_points(views: Sequence[View], scale: float, count: int = COUNT, seed: int = 0) -> Cloud:
+    """Draw random points in the views' frustums, with the colours of their pixels.
 
-    Depths are log-uniform around the distance to the place nearest to all optical axes, or, where the axes are
-    parallel, over 1 to 30 times the scene's scale. Points that only one view sees are dropped, and so are points that
-    some photo shows as fully transparent: they lie outside the visual hull.
+    Depths are log-uniform between 0.3 and 3 times the distance to the point nearest to all optical axes or, for
+    parallel axes, between 1 and 30 times the scene's scale. Points that only one view sees are dropped. So are points
+    that a photo shows as fully transparent, as they lie outside the visual hull.
 
     Args:
-        views: training views, with `camera`, `image` and `alpha`.
-        scale: of the scene, in world units.
-        count: points wanted; fewer come where hardly any place passes.
-        seed: of the choice, which is always the same.
+        views: training views.
+        scale: scale of the scene, world units.
+        count: largest number of points.
+        seed: seed of all random numbers.
 
     Returns:
         At least one point, in the world frame.
@@ -36,18 +37,18 @@ def random_points(views: Sequence, scale: float, count: int = COUNT, seed: int =
     depths = _depths(viewmats, centres, scale)
     judges = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, HULL_VIEWS).round().astype(int))]
     kept: list[tuple[np.ndarray, np.ndarray]] = []
-    spare: tuple[np.ndarray, np.ndarray] | None = None
+    first: list[tuple[np.ndarray, np.ndarray]] = []
     found = 0
     for _ in range(ROUNDS):
         points, colors = _draw(views, viewmats, centres, depths, rng, count)
         keep = _plausible(judges, points, 2 if len(views) > 1 else 1)
         kept.append((points[keep], colors[keep]))
-        spare = spare or (points, colors)
+        first = first or [(points, colors)]
         found += int(keep.sum())
         if found >= count:
             break
-    if not found:  # the photos show nothing but transparency, or no two of them the same place
-        kept = [spare]
+    if not found:  # all photos are transparent, or no two views see a common point
+        kept = first
     positions, colors = (np.concatenate(parts)[:count] for parts in zip(*kept, strict=True))
     return Cloud.of(positions, colors)
 
@@ -68,8 +69,14 @@ def _depths(viewmats: np.ndarray, centres: np.ndarray, scale: float) -> np.ndarr
 
 
 def _draw(
-    views: Sequence, viewmats: np.ndarray, centres: np.ndarray, depths: np.ndarray, rng: np.random.Generator, count: int
+    views: Sequence[View],
+    viewmats: np.ndarray,
+    centres: np.ndarray,
+    depths: np.ndarray,
+    rng: np.random.Generator,
+    count: int,
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Draw `count` pixels and depths; return world positions (count, 3) and colours (count, 3) uint8."""
     chosen = np.sort(rng.integers(0, len(views), count))
     depth = np.exp(rng.uniform(np.log(depths[chosen, 0]), np.log(depths[chosen, 1])))
     where = rng.uniform(0.0, 1.0, (count, 2))
@@ -86,8 +93,8 @@ def _draw(
     return points, colors
 
 
-def _plausible(judges: Sequence, points: np.ndarray, least: int) -> np.ndarray:
-    """Whether enough views have a point in their frustum, and none of them shows it as fully transparent."""
+def _plausible(judges: Sequence[View], points: np.ndarray, least: int) -> np.ndarray:
+    """(N,) bool: at least `least` views have the point in their frustum, and none shows it as fully transparent."""
     seen = np.zeros(len(points), int)
     empty = np.zeros(len(points), bool)
     for view in judges:

@@ -2,8 +2,7 @@
 
 Symbols: a rectangle is origin + a u + b v with 0 <= a, b <= 1, a ray is start + t d. With the columns
 M = (u, v, origin - start), M (a, b, 1) = t d, so one solve gives (a, b, 1) / t = M^-1 d, linear in d.
-Rectangles are seen only from the side that their normal v x u points to, where the texture is not mirrored;
-walls of a room and faces of boxes need no other.
+Rectangles are visible only from the side of their normal v x u, where the texture is not mirrored.
 """
 
 from collections.abc import Sequence
@@ -11,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SHADOW_BIAS = 1e-4  # relative to the distance: a surface does not shade itself
+SHADOW_BIAS = 1e-4  # relative to the distance, so that a surface does not shade itself
 HIGHLIGHT_EXPONENT = 40.0
-MIN_DEPTH = 1e-3  # corners nearer to the camera's plane than this, or behind it, leave the window unbounded
+MIN_DEPTH = 1e-3  # a corner with a smaller depth leaves the window unbounded
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Rectangle:
         return self.origin + a[..., None] * self.u + b[..., None] * self.v
 
     def solve(self, start: np.ndarray) -> np.ndarray | None:
-        """(3, 3) matrix that takes a direction from `start` to (a, b, 1) / t; None behind the rectangle."""
+        """(3, 3) matrix that maps directions from `start` to (a, b, 1) / t; None if `start` is behind the rectangle."""
         if (start - self.origin) @ self.normal < 1e-9:
             return None
         return np.linalg.inv(np.stack([self.u, self.v, self.origin - start], axis=1))
@@ -56,10 +55,10 @@ class RayHits:
     """The first rectangle on each ray, with the rays' shape (...).
 
     Attributes:
-        ids: (...) int32 index of the rectangle, -1 when there is none.
+        ids: (...) int32 index of the rectangle, -1 without a hit.
         a: (...) coordinate along u.
         b: (...) coordinate along v.
-        nearness: (...) 1 / t, 0 when there is no hit.
+        nearness: (...) 1 / t, 0 without a hit.
     """
 
     ids: np.ndarray
@@ -74,13 +73,13 @@ def first_hits(
     directions: np.ndarray,
     windows: Sequence[tuple[slice, ...]] | None = None,
 ) -> RayHits:
-    """Find what each ray from `start` meets first.
+    """Find the first rectangle on each ray from `start`.
 
     Args:
         rectangles: the scene.
         start: (3,) world position.
         directions: (..., 3) world directions, of any length.
-        windows: for each rectangle the part of the ray array that can meet it; everything by default.
+        windows: for each rectangle the slices of the ray array that can hit it; None is all rays.
     """
     shape = directions.shape[:-1]
     ids = np.full(shape, -1, dtype=np.int32)
@@ -101,7 +100,7 @@ def first_hits(
 
 
 def visible(rectangles: Sequence[Rectangle], start: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: nothing stands between `start` (3,) and `points` (N, 3), their own surface aside."""
+    """(N,) bool: no rectangle is between `start` (3,) and `points` (N, 3), except the points' own surface."""
     directions = np.ascontiguousarray((points - start).T)
     clear = np.ones(len(points), dtype=bool)
     for rectangle in rectangles:
@@ -113,7 +112,7 @@ def visible(rectangles: Sequence[Rectangle], start: np.ndarray, points: np.ndarr
 
 
 def _inside(a_over_t: np.ndarray, b_over_t: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Whether a hit lies ahead and within its rectangle, without dividing."""
+    """Whether a hit is in front of the start and inside its rectangle, without a division."""
     inside = near > 0.0
     for coordinate in (a_over_t, b_over_t):
         inside &= (coordinate >= 0.0) & (coordinate <= near)
@@ -164,15 +163,15 @@ def render(
     light: np.ndarray,
     samples: int = 4,
 ) -> np.ndarray:
-    """Photograph the rectangles, averaging `samples` x `samples` rays over the area of every pixel.
+    """Render the rectangles with `samples` x `samples` rays per pixel.
 
     Args:
         rectangles: the scene.
         viewmat: (4, 4) float64 world to camera, OpenCV axes.
         K: (3, 3) float64 intrinsics in pixels, pixel centres at +0.5.
         size: width, height in pixels.
-        light: (3,) position of the lamp that makes highlights.
-        samples: rays along each side of a pixel.
+        light: (3,) position of the lamp for highlights.
+        samples: number of rays along each side of a pixel.
 
     Returns:
         (H, W, 3) uint8.
@@ -192,7 +191,7 @@ def render(
 
 
 def _window(rectangle: Rectangle, viewmat: np.ndarray, K: np.ndarray, shape: tuple[int, int]) -> tuple[slice, slice]:
-    """Rows and columns that the projected rectangle can cover: all when it reaches behind the camera."""
+    """Rows and columns that the projected rectangle can cover; all if a corner is behind the camera."""
     edges = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
     corners = rectangle.at(*edges) @ viewmat[:3, :3].T + viewmat[:3, 3]
     if corners[:, 2].max() < MIN_DEPTH:

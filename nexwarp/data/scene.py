@@ -22,7 +22,7 @@ from nexwarp.data.memory import check_memory
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
 from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
-from nexwarp.data.views import Job, View, ViewReader, find_mask
+from nexwarp.data.views import PlannedView, View, ViewReader, find_mask
 
 TEST_EVERY = 8  # the field's split: of the views sorted by name, those with index % 8 == 0 are for testing
 NEAR_FRACTION = 0.01  # near plane, in units of the scene scale
@@ -38,7 +38,7 @@ MAX_READERS = 32
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Progress = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -113,15 +113,15 @@ class Scene:
 
 
 def load_scene(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     images: str = "images",
     downscale: int = 1,
     *,
     masks: str | None = MASKS,
     background: str | Sequence[float] | None = None,
-    points: str | os.PathLike | None = None,
+    points: str | os.PathLike[str] | None = None,
     format: str | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Scene:
     """Read a scene: a COLMAP folder, nerfstudio's transforms.json, or Blender's transforms_train.json.
 
@@ -158,15 +158,9 @@ def load_scene(
             are not usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than
             2 photos, no points in a COLMAP model, points that are not finite, photos too many for the memory.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    for name, value in (("images", images), ("masks", masks)):
-        if not isinstance(value, str) and not (name == "masks" and value is None):
-            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
-    if points is not None and not isinstance(points, (str, os.PathLike)):
-        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
-    path = Path(path)
+    _check_paths(path, images, masks, points)
     _check_downscale(downscale)
+    path = Path(path)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
     if path.is_file():
@@ -176,6 +170,17 @@ def load_scene(
     with quiet_pillow():
         scene = _load(path, images, downscale, masks, color, points, format, progress)
     return dataclasses.replace(scene, random_background=random)
+
+
+def _check_paths(path: object, images: object, masks: object, points: object) -> None:
+    """Raise TypeError unless the paths that `load_scene` takes are paths."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    for name, value in (("images", images), ("masks", masks)):
+        if not isinstance(value, str) and not (name == "masks" and value is None):
+            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
+    if points is not None and not isinstance(points, (str, os.PathLike)):
+        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
 
 
 def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
@@ -231,9 +236,9 @@ def _load(
     downscale: int,
     masks: str | None,
     background: tuple[float, float, float] | None,
-    points: str | os.PathLike | None,
+    points: str | os.PathLike[str] | None,
     format: str | None,
-    progress: Progress | None,
+    progress: ProgressCallback | None,
 ) -> Scene:
     kind = find_format(path, format)
     capture = _read_capture(path, images, kind)
@@ -344,7 +349,7 @@ def _scene_scale(source: str, viewmats: Sequence[np.ndarray], cloud: Cloud | Non
     return scale
 
 
-def _workers(path: Path, images: str, downscale: int, channels: int, jobs: list[Job]) -> int:
+def _workers(path: Path, images: str, downscale: int, channels: int, jobs: list[PlannedView]) -> int:
     """How many photos to read at a time, so that what reading takes beside them fits as well."""
     free = check_memory(path, images, [(job.target.width, job.target.height) for job in jobs], downscale, channels)
     largest = max(
@@ -356,7 +361,7 @@ def _workers(path: Path, images: str, downscale: int, channels: int, jobs: list[
 
 
 def _map(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int, progress: Progress | None = None
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, progress: ProgressCallback | None = None
 ) -> list[Result]:
     """Apply a function in threads: decoding frees the GIL."""
     results = []

@@ -1,4 +1,4 @@
-"""From a photo's file to a view: masks, transparency, undistortion, reduction."""
+"""Read the views of a scene: masks, transparency, undistortion and reduction of photos."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -21,30 +21,30 @@ from nexwarp.data.images import (
     read_transparent,
     resize_mask,
 )
-from nexwarp.data.lens import FACES, PANORAMA, Lens, Maps, Pinhole
+from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, Maps
 from nexwarp.io.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
-# A small camera's photo is not decoded when it is huge: one of a single colour takes hardly a byte in its file.
+# A larger side than this ratio times the camera's is refused before decoding, since tiny files can hold huge images.
 MAX_ENLARGED, SMALL = 16, 1024
-HALF = 128  # alpha of a pixel that counts
+HALF = 128  # smallest alpha of a used pixel, with alpha as the mask
 
 
 @dataclass(frozen=True)
 class View:
-    """One posed photo.
+    """A posed photo with its pixels.
 
     Attributes:
         camera: its pinhole camera, float32 on the CPU, in pixels of `image`.
-        image: (H, W, 3) uint8 sRGB on the CPU; a transparent photo lies on the scene's background.
-        mask: (H, W) bool, True where the photo counts; None when all of it does.
-        name: name of the photo below the images folder.
-        alpha: (H, W) uint8, 255 where the photo is opaque; None when all of it is, or when the scene has no
-            background for transparent photos. On another background B the photo is
+        image: (H, W, 3) uint8 sRGB on the CPU; a transparent photo is composited on the scene's background.
+        mask: (H, W) bool, True for the pixels that are used; None if all are.
+        name: path of the photo below the images folder.
+        alpha: (H, W) uint8, 255 for opaque pixels; None if all are opaque, or if the scene has no background for
+            transparent photos. On another background B the photo is
             image + (1 - alpha / 255) (B - background), in sRGB.
-        points: (M, 3) float32 world positions of the sparse points that were triangulated from the photo; None when
-            unknown. They may lie outside the image where a lens was undistorted.
+        points: (M, 3) float32 world positions of the sparse points that were triangulated from the photo; None if
+            unknown. Points of an undistorted photo may project outside the image.
     """
 
     camera: Camera
@@ -56,22 +56,22 @@ class View:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A photo whose header is read.
+class PlannedView:
+    """A view before its pixels are read.
 
     Attributes:
-        photo: the photo.
-        size: width and height of its file.
-        target: the pinhole image that it becomes, before it is reduced.
+        photo: the photo, or a face of it if it is a panorama.
+        size: width and height of its file in pixels.
+        target: intrinsics after undistortion, before the reduction.
     """
 
     photo: Photo
     size: tuple[int, int]
-    target: Pinhole
+    target: Intrinsics
 
 
 class ViewReader:
-    """Reads views; safe to use from several threads."""
+    """Reads views; thread-safe."""
 
     def __init__(
         self,
@@ -81,22 +81,31 @@ class ViewReader:
         alpha_mask: bool,
         cache: PhotoCache,
     ) -> None:
-        """Choose how views are made.
+        """Set the options of all views.
 
         Args:
-            downscale: average blocks of this many pixels squared.
+            downscale: reduce images by this factor, averaging blocks of pixels.
             background: colour behind transparent photos; None drops their alpha.
-            alpha_mask: let alpha of one half and more be the mask.
-            cache: where undistorted photos are kept.
+            alpha_mask: use alpha >= 128 as the mask.
+            cache: cache of undistorted photos.
         """
         self.downscale, self.background, self.alpha_mask, self.cache = downscale, background, alpha_mask, cache
         self.maps = Maps()
 
-    def plan(self, photo: Photo) -> list[Job]:
-        """Read a photo's header and check it against its lens; a panorama becomes six jobs."""
+    def plan(self, photo: Photo) -> list[PlannedView]:
+        """Read the header of a photo and check it against its lens.
+
+        Returns:
+            One view, or six for a panorama.
+
+        Raises:
+            FileNotFoundError: the photo does not exist.
+            ValueError: the photo or mask cannot be decoded or has another shape than its camera, or the camera is
+                invalid.
+        """
         size = width, height = image_size(photo.file)
         lens = photo.lens
-        # One pixel of the longer side's rounding may go either way when a folder like images_4 was made.
+        # Tolerance: the size of a reduced image, as in a folder images_4, is rounded by up to one pixel.
         if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
             raise ValueError(
                 f"{photo.file}: expected an image of {lens.width}x{lens.height} pixels, or that shape at another "
@@ -104,9 +113,9 @@ class ViewReader:
             )
         _check_enlarged(photo.file, size, (lens.width, lens.height), "its camera")
         if photo.mask is not None and not self.alpha_mask:
-            _check_mask(photo, size)
+            _check_mask(photo, photo.mask, size)
         try:
-            target = _pinhole(lens)
+            target = _undistorted_intrinsics(lens)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {one_line(error)}") from error
         ratio = width / lens.width, height / lens.height
@@ -119,18 +128,26 @@ class ViewReader:
                 f"got {self.downscale}"
             )
         if lens.model != PANORAMA:
-            return [Job(photo, size, target)]
-        return [Job(_face(photo, face), size, target) for face in FACES]
+            return [PlannedView(photo, size, target)]
+        return [PlannedView(_face(photo, face), size, target) for face in FACES]
 
-    def read(self, job: Job, near: float) -> View:
-        """Read, undistort and reduce a photo."""
-        photo = job.photo
-        image, alpha, mask = self._undistorted(job) if photo.lens.distorted else self._pixels(job, None)
+    def read(self, plan: PlannedView, near: float) -> View:
+        """Read, undistort and reduce a photo.
+
+        Args:
+            plan: a view of `plan`.
+            near: near depth of its camera, world units.
+
+        Raises:
+            ValueError: the photo or mask cannot be decoded, the mask is empty, or the camera is invalid.
+        """
+        photo = plan.photo
+        image, alpha, mask = self._undistorted(plan) if photo.lens.distorted else self._pixels(plan, None)
         if mask is not None and mask.all():
             mask = None
         if mask is not None and not mask.any():
             raise ValueError(f"{photo.mask or photo.file}: expected a mask with pixels that count, got none")
-        K = job.target.K.copy()
+        K = plan.target.K.copy()
         K[:2] /= self.downscale
         try:
             camera = Camera(
@@ -145,9 +162,11 @@ class ViewReader:
         points = None if photo.points is None else torch.from_numpy(photo.points)
         return View(camera, image, mask, photo.name, alpha, points)
 
-    def _pixels(self, job: Job, maps: Maps | None) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Image, alpha and mask, reduced; by way of a map where the lens needs one."""
-        photo = job.photo
+    def _pixels(
+        self, plan: PlannedView, maps: Maps | None
+    ) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        """Read image, alpha and mask, undistort them if `maps` is given, and reduce them."""
+        photo = plan.photo
         if self.background is None and not self.alpha_mask:
             image, alpha = read_image(photo.file), None
         else:
@@ -155,20 +174,20 @@ class ViewReader:
         mask = _mask(photo, image, alpha if self.alpha_mask else None)
         if self.background is None or (alpha is not None and bool((alpha == OPAQUE).all())):
             alpha = None
-        if alpha is not None:
+        elif alpha is not None:
             image = compose(image, alpha, self.background)
         if maps is not None:
-            way = maps.get(photo.lens, job.target, photo.face)
-            image, mask = way.colors(image), way.mask(mask)
-            alpha = way.colors(alpha[:, :, None])[:, :, 0] if alpha is not None else None
+            undistort = maps.get(photo.lens, plan.target, photo.face)
+            image, mask = undistort.colors(image), undistort.mask(mask)
+            alpha = undistort.colors(alpha[:, :, None])[:, :, 0] if alpha is not None else None
         image = downscale_image(image, self.downscale)
         mask = downscale_mask(mask, self.downscale) if mask is not None else None
         alpha = downscale_image(alpha[:, :, None], self.downscale)[:, :, 0] if alpha is not None else None
         return image, alpha, mask
 
-    def _undistorted(self, job: Job) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """As `_pixels`, from the cache where it has them."""
-        photo, target = job.photo, job.target
+    def _undistorted(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        """Load image, alpha and mask from the cache, or compute them with `_pixels` and save them."""
+        photo, target = plan.photo, plan.target
         settings = (
             photo.lens,
             photo.face,
@@ -185,14 +204,14 @@ class ViewReader:
             pixels, mask = kept
             alpha = pixels[:, :, 3].contiguous() if pixels.shape[2] == 4 else None
             return pixels[:, :, :3].contiguous(), alpha, mask
-        image, alpha, mask = self._pixels(job, self.maps)
+        image, alpha, mask = self._pixels(plan, self.maps)
         self.cache.save(key, image if alpha is None else torch.cat([image, alpha[:, :, None]], dim=2), mask)
         return image, alpha, mask
 
 
 @lru_cache(maxsize=4096)
-def _pinhole(lens: Lens) -> Pinhole:
-    return lens.pinhole()
+def _undistorted_intrinsics(lens: Lens) -> Intrinsics:
+    return lens.undistorted()
 
 
 def _face(photo: Photo, face: str) -> Photo:
@@ -204,7 +223,15 @@ def _face(photo: Photo, face: str) -> Photo:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of a photo in a folder of masks: the photo's name with .png after it, or its stem with any suffix."""
+    """Find the mask of a photo in a folder: the photo's name with ".png" appended, or its stem with another suffix.
+
+    Args:
+        folder: folder of the masks.
+        name: path of the photo below the images folder.
+
+    Returns:
+        The file, or None if there is none.
+    """
     path = folder / name
     for candidate in (path.with_name(f"{path.name}.png"), *(path.with_suffix(suffix) for suffix in MASK_SUFFIXES)):
         if candidate.is_file():
@@ -213,7 +240,7 @@ def find_mask(folder: Path, name: str) -> Path | None:
 
 
 def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torch.Tensor | None:
-    """(H, W) bool in the photo's pixels; masks of the same shape at another size are resampled."""
+    """The mask of a photo, (H, W) bool; a mask of another size is resampled."""
     if alpha is not None:
         return alpha >= HALF
     if photo.mask is None:
@@ -223,16 +250,16 @@ def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torc
     return mask if mask.shape == (height, width) else resize_mask(mask, width, height)
 
 
-def _check_mask(photo: Photo, size: tuple[int, int]) -> None:
-    """Compare a mask's header with its photo's size, before it is decoded."""
+def _check_mask(photo: Photo, mask: Path, size: tuple[int, int]) -> None:
+    """Check the size of a mask against its photo's width and height, before it is decoded."""
     width, height = size
-    columns, rows = image_size(photo.mask)
+    columns, rows = image_size(mask)
     if abs(columns * height - rows * width) > max(width, height, columns, rows):
         raise ValueError(
-            f"{photo.mask}: expected a mask of {width}x{height} pixels as {photo.file.name} has, or that shape at "
+            f"{mask}: expected a mask of {width}x{height} pixels as {photo.file.name} has, or that shape at "
             f"another size, got {columns}x{rows}"
         )
-    _check_enlarged(photo.mask, (columns, rows), size, "its photo")
+    _check_enlarged(mask, (columns, rows), size, "its photo")
 
 
 def _check_enlarged(file: Path, size: tuple[int, int], expected: tuple[int, int], what: str) -> None:

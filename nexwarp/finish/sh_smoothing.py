@@ -67,8 +67,8 @@ def seen_directions(model: Model, views: Iterable[View]) -> tuple[torch.Tensor, 
     In float64: what float32 rounds away of a sum of products is more than a weak smoothing adds to it.
 
     Args:
-        model: its N surfels and options count; C is the number of their coefficients a channel that are rendered, i <= j of those are
-            P = C (C + 1) / 2 pairs, row by row of a matrix's upper triangle.
+        model: its N surfels and options count; C is the number of their coefficients a channel that are rendered; pairs
+            i <= j are P = C (C + 1) / 2, row by row of a matrix's upper triangle.
         views: v, on any device; pixels that their masks leave out do not count.
     """
     bare = model.bare()

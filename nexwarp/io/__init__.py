@@ -1,1 +1,1 @@
-"""Files: written aside and renamed, JSON, pictures, video."""
+"""Input and output: atomic writes, JSON, pictures, video."""

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writes: a file exists complete or not at all."""
 
 import os
 import re
@@ -12,7 +12,7 @@ LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\.[^.]*)?")
 
 
 def one_line(text: object, limit: int = 300) -> str:
-    """Text that came out of a file, for a message: on one line, printable, of at most `limit` characters."""
+    """Text from a file as one printable line of at most `limit` characters, for a message."""
     line = "".join(
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
         for c in " ".join(str(text)[: 4 * limit].split())
@@ -22,17 +22,17 @@ def one_line(text: object, limit: int = 300) -> str:
 
 @contextmanager
 def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary name beside `path`, with its suffix, to write to; it becomes `path` when the block ends.
+    """Yield a temporary path beside `path`, with the same suffix; it is renamed to `path` when the block ends.
 
-    The folder is made if need be. When anything fails, a file already at `path` stays as it is, and neither the
-    temporary file nor a folder made for it stays behind.
+    Missing folders are created. If the block fails, an existing file at `path` stays unchanged, and the temporary file
+    and the folders created for it are removed.
 
     Args:
-        path: where to.
-        durable: wait until the disk has it: without that a power cut may leave an empty file under the new name.
+        path: the file to write.
+        durable: wait until the disk has stored the file. Otherwise a power failure can leave an empty file at `path`.
 
     Raises:
-        OSError: the folder cannot be made or written to, or `path` is a folder; StorageError where the disk is full.
+        OSError: the folder cannot be created or written to, or `path` is a folder. StorageError: the disk is full.
     """
     path = Path(path)
     if path.is_dir():
@@ -50,32 +50,32 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Ite
         if durable:
             sync(path.parent)
     except OSError as error:
-        # Those of a write or a flush do not say which file it was.
+        # An OSError from write or flush does not name the file.
         if isinstance(error, StorageError) or error.errno is None or error.filename not in (None, str(temporary)):
             raise
         raise StorageError.at(path, error) from error
     finally:
-        # Only what is there: below a file, that stands where a folder should, even looking for it is an error.
+        # unlink would raise NotADirectoryError if a parent of `path` were a file.
         if path.parent.is_dir():
             temporary.unlink(missing_ok=True)
         if not done:
             for folder in missing:
                 try:
                     folder.rmdir()
-                except OSError:  # not made, or others put something there
+                except OSError:  # not created, or not empty
                     break
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name and rename it, so that it is there whole or not at all, power cut or not."""
+    """Write a file to a temporary name and rename it: it is complete or absent, even after a power failure."""
     with written_aside(path, durable=True) as temporary:
         temporary.write_bytes(content)
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has what was written to a file, or the names in a folder."""
+    """Wait until the disk has stored the content of a file, or the entries of a folder."""
     folder = path.is_dir()
-    if folder and os.name == "nt":  # which has no such call
+    if folder and os.name == "nt":  # Windows cannot open a folder
         return
     number = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
     try:
@@ -85,21 +85,21 @@ def sync(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes left in a folder and below it."""
+    """Remove temporary files that killed processes left in a folder or its subfolders."""
     for file in folder.rglob(".*.tmp*"):
         if is_leftover(file):
             file.unlink(missing_ok=True)
 
 
 def is_leftover(file: Path) -> bool:
-    """Whether a file is a temporary one whose process is gone."""
+    """Whether a file is a temporary file of a process that no longer runs."""
     match = LEFTOVER.fullmatch(file.name)
     return match is not None and file.is_file() and not _runs(int(match[1]))
 
 
 def _runs(process: int) -> bool:
-    """Whether there is another process of that number."""
-    if process == os.getpid() or os.name == "nt":  # where asking would end it
+    """Whether another process with this id runs."""
+    if process == os.getpid() or os.name == "nt":  # on Windows, os.kill would end the process
         return False
     try:
         os.kill(process, 0)

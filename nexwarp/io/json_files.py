@@ -1,16 +1,24 @@
-"""JSON that others wrote: bounded in size and depth before it is parsed, and nothing but an error of one line."""
+"""JSON files: written atomically; read with bounds on size and depth, and with errors of one line."""
 
 import json
 import re
 from pathlib import Path
-from typing import Any, TypeAlias, Union
+from typing import Any, NoReturn, TypeAlias, Union
 
+from nexwarp.errors import FormatError
 from nexwarp.io.files import one_line, write_atomically
 
-# What reading a damaged file of ours may raise.
+# Exceptions that the use of a damaged file's content can raise.
 READ_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
-Json: TypeAlias = Union[None, bool, int, float, str, list["Json"], dict[str, "Json"]]  # noqa: UP007  # recursive
+Json: TypeAlias = Union[bool, int, float, str, list["Json"], dict[str, "Json"], None]  # noqa: UP007  # recursive
+JsonObject: TypeAlias = dict[str, Json]
+
+MAX_BYTES = 32 * 2**20  # enough for about 30,000 cameras; the parsed values take at most twenty times as much memory
+MAX_DEPTH = 64
+
+# The closing quote is optional: an unterminated string is scanned once, not again from each quote inside it.
+TOKENS = re.compile(rb'"(?:[^"\\]+|\\.)*"?|[\[\]{}]', re.DOTALL)
 
 
 def write_json(path: Path, data: object) -> None:
@@ -18,18 +26,17 @@ def write_json(path: Path, data: object) -> None:
     write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
 
 
-MAX_BYTES = 32 * 2**20  # some 30,000 cameras; parsed it takes at most twenty times as much
-MAX_DEPTH = 64
-
-# The closing quote is optional, so that a text without one is looked at once, not from each of its quotes.
-TOKENS = re.compile(rb'"(?:[^"\\]+|\\.)*"?|[\[\]{}]', re.DOTALL)
-
-
 def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
-    """Parse a JSON file; arguments and errors as of `parse_json`, with the file's name.
+    """Parse a JSON file.
+
+    Args:
+        path: the file, UTF-8.
+        max_bytes: refuse a larger file.
+        finite: refuse NaN and Infinity, which Python writes although JSON has no such numbers.
 
     Raises:
         FileNotFoundError: no such file.
+        ValueError: as of `parse_json`; the message names the file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected JSON")
@@ -40,16 +47,16 @@ def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -
 
 
 def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
-    """Parse JSON in UTF-8.
+    """Parse JSON in UTF-8; the caller has to check the type of what it uses.
 
     Args:
-        where: what the content is, for messages.
-        content: bytes.
-        max_bytes: refuse more than so many.
-        finite: refuse NaN and Infinity, which are no JSON, but which Python writes.
+        where: name of the content, for messages.
+        content: the bytes to parse.
+        max_bytes: refuse longer content.
+        finite: refuse NaN and Infinity, which Python writes although JSON has no such numbers.
 
     Raises:
-        ValueError: too long, nested deeper than 64, or no JSON.
+        ValueError: the content is too long, nested deeper than 64 levels, or not JSON.
     """
     if len(content) > max_bytes:
         raise ValueError(f"{where}: expected at most {max_bytes:,} bytes of JSON, got {len(content):,}")
@@ -65,5 +72,17 @@ def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite
         raise ValueError(f"{where}: expected JSON, could not parse it: {one_line(error)}") from None
 
 
-def _refuse(name: str) -> None:
+def read_object(path: Path, *, finite: bool = False) -> JsonObject:
+    """Parse a JSON file that holds an object; arguments and errors are those of `read_json`.
+
+    Raises:
+        FormatError: the file holds another kind of value.
+    """
+    data: Json = read_json(path, finite=finite)
+    if not isinstance(data, dict):
+        raise FormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _refuse(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON number")

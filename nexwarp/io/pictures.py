@@ -1,4 +1,4 @@
-"""Pictures: files written whole or not at all (PNG, OpenEXR), error maps, strips with captions."""
+"""Pictures: atomically written PNG and OpenEXR files, error maps, strips with captions."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from nexwarp.io.json_files import parse_json
 
 
 def to_uint8(image: torch.Tensor) -> torch.Tensor:
-    """Clamp a float image to [0, 1] and round it to 8 bits; an 8-bit image comes back as it is.
+    """Clamp a float image to [0, 1] and round it to uint8; a uint8 image is returned unchanged.
 
     Raises:
         TypeError: `image` is neither uint8 nor floating.
@@ -39,9 +39,13 @@ MAX_RATIO = 1100  # of zlib: pixels to bytes
 
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
-    """Write an (H, W, 3) image, uint8 or float in [0, 1], to a temporary name, then rename it to `path`.
+    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file.
 
-    The folder is made if need be; a file already at `path` stays as it is when anything fails.
+    Missing folders are created. The file is written to a temporary name and renamed; if that fails, an existing file
+    at `path` stays unchanged.
+
+    Raises:
+        TypeError, ValueError: `image` has another dtype or shape; OSError: `path` cannot be written.
     """
     from PIL import Image
 
@@ -51,24 +55,25 @@ def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
 
 
 def save_exr(
-    path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, object] | None = None
 ) -> None:
-    """Write tensors as the named parts of one OpenEXR file, exactly: float32 as FLOAT, int32 as UINT.
+    """Write tensors losslessly as the named parts of one OpenEXR file: float32 as FLOAT, int32 as UINT.
 
     Args:
-        path: where to; written aside, then renamed.
+        path: the file, written atomically.
         parts: name -> (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (channel Y; -1
             becomes 4294967295).
-        metadata: what JSON can hold, kept as the text attribute `nexwarp` of the first part; `parts` is added to it.
+        metadata: values that JSON can hold. They become the text attribute `nexwarp` of the first part, together with
+            the list `parts` of all part names.
 
     Raises:
-        TypeError, ValueError: no parts, or one whose shape or dtype does not fit; OSError: `path` cannot be written.
+        TypeError, ValueError: no parts, or a part of another shape or dtype; OSError: `path` cannot be written.
     """
     import OpenEXR
 
     if not parts:
         raise ValueError("parts: expected at least one, got none")
-    files = []
+    files: list[OpenEXR.Part] = []
     for name, tensor in parts.items():
         if tensor.dtype not in (torch.float32, torch.int32):
             raise TypeError(f"parts[{name!r}]: expected float32 or int32, got {tensor.dtype}")
@@ -84,63 +89,66 @@ def save_exr(
             header[METADATA] = json.dumps({"parts": list(parts), **(metadata or {})})
         files.append(OpenEXR.Part(header, channels, name))
     with written_aside(path) as temporary:
-        temporary.touch()  # an error of the operating system says more than OpenEXR's
+        temporary.touch()  # raises an OSError with the reason; OpenEXR gives none
         try:
             OpenEXR.File(files).write(str(temporary))
-        except RuntimeError as error:  # a full disk, for one
+        except RuntimeError as error:  # for example a full disk
             reason = str(error).replace(str(temporary), str(path))
             raise StorageError(f"{path}: cannot be written ({reason})") from None
 
 
 def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read what `save_exr` wrote, bit for bit.
+    """Read a file of `save_exr`; the tensors have the same bits.
 
     Returns:
-        The parts by name, on the CPU, and the metadata, with the list `parts` of their names.
+        The parts by name, on the CPU, and the metadata; its entry `parts` lists the part names.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: it is no OpenEXR file, it is damaged, or its channels are not those of `save_exr`.
+        ValueError: the file is not OpenEXR, is damaged, or has other channels than `save_exr` writes.
     """
     import OpenEXR
 
     path = Path(path)
     if not path.is_file():
         raise MissingError(f"{path}: no such file, expected an OpenEXR file")
-    parts, text = {}, ""
+    parts: dict[str, tuple[set[str], list[np.ndarray]]] = {}
+    text = ""
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             for part in file.parts:
                 text = str(part.header.get(METADATA, text))
-                planes = {name: channel.pixels for name, channel in part.channels.items()}
-                parts[part.name()] = (set(planes), [planes[name] for name in "RGBY" if name in planes])
-    except Exception as error:  # OpenEXR raises bare RuntimeErrors, and others
+                found = {name: channel.pixels for name, channel in part.channels.items()}
+                parts[part.name()] = (set(found), [found[name] for name in "RGBY" if name in found])
+    except Exception as error:  # OpenEXR raises RuntimeError and other types
         raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
     try:
-        metadata = dict(parse_json("metadata", text.encode("utf-8", "replace"))) if text else {"parts": list(parts)}
+        metadata: dict[str, Any] = {"parts": list(parts)}
+        if text:
+            metadata = dict(parse_json("metadata", text.encode("utf-8", "replace")))
         names = list(metadata["parts"])
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({one_line(error)})"
         ) from None
-    # OpenEXR leaves out, with no more than a message, the parts that it cannot read.
+    # OpenEXR prints a message and omits the parts that it cannot read.
     if not parts or names != list(parts):
         raise FormatError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
     tensors = {}
-    for name, (names, planes) in parts.items():
-        if names not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
-            kinds = ", ".join(sorted(names))
+    for name, (channels, planes) in parts.items():
+        if channels not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
+            kinds = ", ".join(sorted(channels))
             raise FormatError(
                 f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {one_line(kinds, 60)} in part {name!r}"
             )
-        planes = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
-        tensors[name] = torch.stack(planes, dim=-1) if len(planes) == 3 else planes[0]
+        slices = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
+        tensors[name] = torch.stack(slices, dim=-1) if len(slices) == 3 else slices[0]
     return tensors, metadata
 
 
 def _check_size(path: Path) -> None:
-    """Raise ValueError when the headers announce more pixels than the file can hold."""
+    """Raise ValueError if the headers announce more pixels than a file of this size can hold."""
     import OpenEXR
 
     total = 0
@@ -157,9 +165,13 @@ def _check_size(path: Path) -> None:
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Colour the absolute error, averaged over channels, of two (H, W, 3) images: (H, W, 3) uint8.
+    """Colour-code the absolute error of two (H, W, 3) images, uint8 or float in [0, 1], averaged over channels.
 
-    The colours are viridis over 0 (dark violet) to 0.25 (yellow), in 256 steps; larger errors are yellow too.
+    Returns:
+        (H, W, 3) uint8: viridis from 0 (dark violet) to 0.25 and above (yellow), in 256 steps.
+
+    Raises:
+        TypeError, ValueError: another dtype or shape, or two shapes that differ.
     """
     a, b = _to_uint8("image", image), _to_uint8("target", target)
     if a.shape != b.shape:
@@ -173,11 +185,14 @@ def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequenc
 
     Args:
         images: from left to right.
-        gap: white pixels between two neighbours.
-        captions: one for each image, printed on a white band above it that is 16 pixels high.
+        gap: white pixels between neighbouring images.
+        captions: one for each image, printed on a white band of 16 pixels above it.
 
     Returns:
-        (H, sum of W_i + gaps, 3), or 16 pixels higher with captions.
+        (H, sum of W_i + gaps, 3) uint8; (H + 16, ...) with captions.
+
+    Raises:
+        TypeError, ValueError: no images, another dtype or shape, heights or a number of captions that do not agree.
     """
     check_range("gap", gap, 0)
     if not images:
@@ -196,7 +211,7 @@ def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequenc
 
 
 def _caption(text: str, width: int) -> torch.Tensor:
-    """(CAPTION_HEIGHT, width, 3) uint8, black text on white, cut off at the right."""
+    """(CAPTION_HEIGHT, width, 3) uint8, black text on white, cropped at the right."""
     from PIL import Image, ImageDraw, ImageFont
 
     band = Image.new("RGB", (width, CAPTION_HEIGHT), "white")
@@ -213,7 +228,7 @@ def _viridis() -> torch.Tensor:
 
 
 def _to_uint8(name: str, image: torch.Tensor) -> torch.Tensor:
-    """Check an (H, W, 3) image and return it in 8 bits on the CPU; NaN becomes 0, so that it shows."""
+    """Check an (H, W, 3) image and return it as uint8 on the CPU; NaN becomes 0 (black)."""
     if not isinstance(image, torch.Tensor) or not (image.dtype == torch.uint8 or image.is_floating_point()):
         raise TypeError(
             f"{name}: expected a uint8 or floating torch.Tensor, got {getattr(image, 'dtype', type(image))}"

@@ -1,4 +1,4 @@
-"""Videos: H.264 (VP9 for .webm) through PyAV, written whole or not at all."""
+"""Videos: H.264, or VP9 for .webm, through PyAV; written atomically."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -12,24 +12,24 @@ from nexwarp.checks import check_range
 from nexwarp.errors import SettingError
 from nexwarp.io.files import written_aside
 
-# Suffix -> container, its options, encoder, its options: constant quality, at which no artefact is seen.
+# Encoder and its options: constant quality, without visible artefacts.
 H264 = ("libx264", {"crf": "16", "preset": "medium"})
 
-KINDS = {
-    ".mp4": ("mp4", {"movflags": "faststart"}, *H264),  # so that a browser plays it while it loads
+# Suffix -> container, its options, encoder, its options.
+KINDS: dict[str, tuple[str, dict[str, str], str, dict[str, str]]] = {
+    ".mp4": ("mp4", {"movflags": "faststart"}, *H264),  # a browser can play the file while it loads
     ".mov": ("mov", {"movflags": "faststart"}, *H264),
     ".mkv": ("matroska", {}, *H264),
     ".webm": ("webm", {}, "libvpx-vp9", {"crf": "24", "b": "0"}),
 }
 
 LARGEST_SIDE = 16384
-BT709, LIMITED_RANGE = 1, 1  # of ISO/IEC 23091-2
-
-FASTEST = 1000.0
+BT709, LIMITED_RANGE = 1, 1  # codes of ISO/IEC 23091-2
+FASTEST = 1000.0  # frames a second
 
 
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
-    """Raise ValueError unless `path` and `fps` suit a video, and PyAV is there to write it."""
+    """Raise SettingError unless the suffix of `path` and `fps` are valid for a video and PyAV is installed."""
     suffix = Path(path).suffix.lower()
     if suffix not in KINDS:
         raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
@@ -45,19 +45,19 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
 def video_writer(
     path: str | os.PathLike[str], width: int, height: int, fps: float = 30.0
 ) -> Iterator[Callable[[torch.Tensor], None]]:
-    """Yield a function that appends an (H, W, 3) uint8 frame; the video becomes `path` when the block ends.
+    """Yield a function that appends an (H, W, 3) uint8 frame; the video is complete at `path` when the block ends.
 
-    H.264 in BT.709 colours with 4:2:0 chroma, which everything plays. That has even sides: of an odd one, the last
-    column or row is cropped.
+    The video uses BT.709 colours and 4:2:0 chroma, which all players support. 4:2:0 needs even sizes: the last column
+    or row of an odd size is cropped.
 
     Args:
-        path: .mp4, .mov, .mkv or .webm (VP9); written aside, then renamed.
+        path: .mp4, .mov, .mkv (H.264) or .webm (VP9); written atomically.
         width: of the frames, pixels.
-        height: likewise.
+        height: of the frames, pixels.
         fps: frames a second.
 
     Raises:
-        ValueError: a suffix, size or rate that does not fit, no PyAV (extra `video`), a block without frames.
+        ValueError: an invalid suffix, size or rate, PyAV (extra `video`) is missing, or the block appended no frame.
         OSError: `path` cannot be written.
     """
     check_video(path, fps)
@@ -70,10 +70,11 @@ def video_writer(
     even = (height // 2 * 2, width // 2 * 2)
     count = 0
     with written_aside(path) as temporary:
-        temporary.touch()  # an error of the operating system says more than FFmpeg's
+        temporary.touch()  # raises an OSError with the reason; FFmpeg gives none
         with av.open(str(temporary), "w", format=container_name, options=container_options) as container:
             rate = Fraction(fps).limit_denominator(1001)
             stream = container.add_stream(encoder, rate=rate, options=options)
+            assert isinstance(stream, av.VideoStream)
             stream.width, stream.height, stream.pix_fmt = even[1], even[0], "yuv420p"
             context = stream.codec_context
             context.color_primaries = context.color_trc = context.colorspace = BT709

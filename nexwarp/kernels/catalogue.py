@@ -9,21 +9,21 @@ from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernel
-from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel
-from nexwarp.kernels.cpu.hashgrid import hashgrid_rows_kernels
+from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
+from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.project import project_kernel
-from nexwarp.kernels.reduce import reduce_rows_kernel
+from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
-from nexwarp.kernels.ssim import LANES, ssim_kernels
+from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
 from nexwarp.kernels.tiles import (
     depth_keys_kernel,
-    footprint_kernel,
     list_kernels,
     surfel_ids_kernel,
     tile_offsets_kernel,
+    tile_polygon_kernel,
 )
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.unproject import unproject_kernel
@@ -37,7 +37,7 @@ def all_kernels(
     cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
-    yield from thread_kernels(real, storage, tile_size, ssim_lanes=(1, LANES) if cpu else (1,), cpu=cpu)
+    yield from thread_kernels(real, storage, tile_size, ssim_lengths=(1, SIMD_WIDTH) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
     yield antialias_kernels(real).backward  # of trained surfels, which training itself has no use for
 
@@ -51,19 +51,19 @@ def thread_kernels(
     features: Sequence[int] = (1, 2, 4, 8),
     clamps: Sequence[bool] = (False, True),
     low_passes: Sequence[bool] = (False, True),
-    ssim_lanes: Sequence[int] = (1, LANES),
+    ssim_lengths: Sequence[int] = (1, SIMD_WIDTH),
     cpu: bool = False,
-    fixed: bool = True,
+    fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
     yield antialias_kernels(real).forward
     yield from (surfel_ids_kernel, tile_offsets_kernel)
-    yield from (reduce_rows_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
+    yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
-    for lanes in ssim_lanes:
-        ssim = ssim_kernels(real, lanes)
+    for length in ssim_lengths:
+        ssim = ssim_kernels(real, length)
         yield from (ssim.moments, ssim.score, ssim.blur, ssim.gradient)
     for degree in degrees:
         plain = plain_colors_kernels(real, degree)
@@ -72,13 +72,13 @@ def thread_kernels(
             colors = textured_colors_kernels(real, storage, degree, clamp)
             yield from (colors.forward, colors.backward)
     for count in features:
-        lookup = (hashgrid_rows_kernels if cpu else hashgrid_kernels)(real, storage, count)
+        lookup = (hashgrid_simd_kernels if cpu else hashgrid_kernels)(real, storage, count)
         yield from (lookup.forward, lookup.backward)
-        if fixed and not cpu:
-            yield hashgrid_kernels(real, storage, count, fixed=True).backward
+        if fixed_point and not cpu:
+            yield hashgrid_kernels(real, storage, count, fixed_point=True).backward
     for low_pass in low_passes:
         lists = list_kernels(real, low_pass, tile_size)
-        yield footprint_kernel(real, low_pass, tile_size)
+        yield tile_polygon_kernel(real, low_pass, tile_size)
         yield from (lists.count, lists.emit)
 
 
@@ -89,18 +89,18 @@ def walk_kernels(
     *,
     low_passes: Sequence[bool] = (False, True),
     cpu: bool = False,
-    fixed: bool = True,
+    fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
-    """Yield the kernels that walk along a tile's list, on CUDA in blocks of `collect.BLOCK_DIM`."""
-    forward = collect_rows_kernel if cpu else collect_kernel
-    backward = collect_rows_backward_kernel if cpu else collect_backward_kernel
+    """Yield the kernels that walk along a tile's list, on CUDA in blocks of `walk.BLOCK_DIM`."""
+    forward = collect_simd_kernel if cpu else collect_kernel
+    backward = collect_simd_backward_kernel if cpu else collect_backward_kernel
     for low_pass in low_passes:
         yield splat_error_kernel(real, low_pass, tile_size)
-        if fixed and not cpu:
-            yield splat_error_kernel(real, low_pass, tile_size, fixed=True)
+        if fixed_point and not cpu:
+            yield splat_error_kernel(real, low_pass, tile_size, fixed_point=True)
         for hits in max_hits:
             yield forward(real, hits, low_pass, tile_size)
-            for watch in (False, True):
-                yield backward(real, hits, low_pass, tile_size, watch)
-                if fixed and not cpu:
-                    yield collect_backward_kernel(real, hits, low_pass, tile_size, watch, fixed=True)
+            for with_errors in (False, True):
+                yield backward(real, hits, low_pass, tile_size, with_errors)
+                if fixed_point and not cpu:
+                    yield collect_backward_kernel(real, hits, low_pass, tile_size, with_errors, fixed_point=True)

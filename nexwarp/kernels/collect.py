@@ -1,29 +1,17 @@
-"""Collection pass (paper Sec. 3.2): walk a tile's list near to far, blend plain colours, keep the K heaviest hits.
+"""Collection pass, forward (paper Sec. 4.2): walk a tile's list near to far, blend, keep the K heaviest hits.
 
-One thread a pixel. The forward pass writes
+A thread is a pixel (see `walk`). Read: records, centres and limits of the surfels, and the tiles' lists. Written:
 
-    plain    N = sum over hits outside the buffer of weight * colour (paper Eq. 4)
+    plain    N = sum over the hits outside the buffer of weight * plain colour (paper Eq. 6)
     base     the same sum over the hits in the buffer: what they would look like without a texture
     ids, depths, weights    the K heaviest hits, heaviest first; on a tie the nearer one stays
     alphas   1 - final transmittance
-    stops    end of the part of the list that was walked
+    stops    end of the part of the walk that was taken
 
-Discrete and frozen for the backward pass: the lists, which hits count, which are in the buffer, where the walk stops.
-Warp's own adjoint of such a loop is silently wrong (a carried transmittance is not replayed), so the recurrence is by
-hand, front to back in one pass. With q_i = dL/dw_i,
-
-    dL/dalpha_i = T_i q_i - (sum over j > i of q_j w_j) / (1 - alpha_i)
-
-and the sum over all i, which the walk then uses up hit by hit, is known from the outputs:
-
-    rest = gN . N + gB . B + sum_k gW_k W_k + gA A.
-
-Each hit is differentiated by `wp.grad` of the one function that the forward pass calls.
-
-A warp first culls the list for its 8 x 4 pixels, one entry a lane, then walks along what is left: of the entries of a
-tile about half. On a CPU a warp is one thread and one pixel, and there is nothing to share.
-Gradients of entry k go to the surfel (CUDA: atomics after a sum over the warp) or, where `rows` is given, to the slot
-rows[k] of its own (CPU: owned by one thread, then added up in a fixed order by `reduce_rows_kernel`).
+A hit counts where alpha >= 1/255 and its depth lies beyond `near`; the walk ends behind the hit that takes the
+transmittance below 1e-4. `collect_backward` differentiates all outputs but ids and stops with respect to records and,
+with the low-pass, centres. Frozen there: the lists, which hits count, which are in the buffer, where the walk ends.
+`cpu.collect` is the SIMD form of this kernel.
 """
 
 import functools
@@ -31,17 +19,10 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.vector_loads import load_function
-from nexwarp.kernels.native.warp import (
-    any_lane,
-    ballot,
-    first_lane,
-    from_lane,
-    lane,
-    lanes,
-)
-from nexwarp.kernels.surfel import frame_functions, hit_functions
+from nexwarp.kernels.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_size
+from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, overflowed, surfel_at, view_functions, walk
+from nexwarp.kernels.walk import buffer_types, walk, walk_functions
 
 
 @functools.cache
@@ -49,12 +30,11 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     """Make the forward kernel."""
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     vec, ivec, colors = buffer_types(real, max_hits)
-    view = view_functions(real, tile_size)
-    pixels = view.pixels
+    w = walk_functions(real, low_pass, tile_size)
+    pixels = w.pixels
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     @wp.kernel(
@@ -87,17 +67,14 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         stops: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        tile = thread // pixels
-        xy = view.pixel_of(thread, tile_columns)
-        # Lanes outside the image cull along: all lanes of a warp must reach the votes together.
-        done = int(0)
-        if xy[0] >= size[0] or xy[1] >= size[1]:
-            done = 1
-        intrinsics = intrinsics_of(Ks)
+        xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
+        middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        d = view.ray_of(xy, intrinsics)
-        middle = view.block_of(xy, intrinsics)
-        half = view.half_block(intrinsics)
+        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
+        # Threads outside the image cull along: all lanes of a warp must reach the votes together.
+        done = int(0)
+        if not inside:
+            done = 1
         transmittance = real(1.0)
         color = vec3()
         buffer_ids = ivec()
@@ -106,40 +83,31 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         buffer_colors = colors()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(tile, tile_offsets, ends, overflow)
-        stop = int(bounds[0])
-        width = lanes()
-        me = lane()
-        for batch in range(bounds[0], bounds[1], width):
-            if any_lane(1 - done) == 0:
+        stop = int(start)
+        width = warp_size()
+        lane = lane_index()
+        for batch in range(start, end, width):
+            if any_in_warp(1 - done) == 0:
                 break
-            mine = int(-1)
-            if batch + me < bounds[1]:
-                mine = surfel_at(batch + me, surfel_ids, order, overflow)
-                if width > 1:
-                    center = vec3()
-                    if wp.static(low_pass):
-                        center = centers[mine]
-                    m = load(records, mine, 3)[3]
-                    if h.misses_block(
-                        load(records, mine, 0),
-                        load(records, mine, 1),
-                        load(records, mine, 2),
-                        m,
-                        reaches[mine],
-                        limits[mine],
-                        center,
-                        middle,
-                        half,
-                        focal,
-                    ):
-                        mine = int(-1)
+            mine = w.candidate(
+                batch + lane,
+                end,
+                surfel_ids,
+                order,
+                overflow,
+                records,
+                centers,
+                limits,
+                reaches,
+                middle,
+                half,
+                focal,
+            )
             left = ballot(wp.where(mine >= 0, 1, 0))
             while left != 0:
-                next_lane = first_lane(left)
+                source = lowest_lane(left)
                 left = left & (left - 1)
-                i = from_lane(mine, next_lane)
+                i = from_lane(mine, source)
                 if done == 0:
                     ra = load(records, i, 0)
                     rb = load(records, i, 1)
@@ -156,7 +124,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                     if alpha >= ALPHA_MIN and depth > near:
                         weight = alpha * transmittance
                         transmittance = transmittance * (ONE - alpha)
-                        stop = batch + next_lane + 1
+                        stop = batch + source + 1
                         # Insert into the buffer before the first lighter hit, and move that and all behind it down by
                         # one, so that of equal ones the nearer stays; what falls out is blended as plain.
                         displaced = int(0)
@@ -185,7 +153,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                         color += out_color * out_weight
                         if transmittance < TRANSMITTANCE_MIN:
                             done = 1
-        if xy[0] >= size[0] or xy[1] >= size[1]:
+        if not inside:
             return
         p = xy[1] * size[0] + xy[0]
         plain[p] = color

@@ -1,50 +1,77 @@
-"""Backward pass of the collection pass."""
+"""Collection pass, backward (paper Sec. 4.2): the derivative of `collect`, front to back in one pass.
+
+A thread is a pixel (see `walk`). Read: what `collect` read and wrote, and the gradients of its differentiable outputs.
+Added to:
+
+    grad_records, grad_centers    gradients of the surfels' records and, with the low-pass, centres
+    error_sums                    with_errors: sum over pixels of weight * error, as `splat_error` gives
+
+Gradients of the walk's place k go to gradient slot gradient_slots[k], which one CPU thread owns and `reduce` adds up in
+a fixed order; without `gradient_slots`, as on CUDA, they go to the surfel, by atomics after a sum over the warp.
+
+Warp's own adjoint of such a loop is silently wrong, since it does not replay a carried transmittance. The recurrence
+is therefore written by hand. With q_i = dL/dw_i,
+
+    dL/dalpha_i = T_i q_i - (sum over j > i of q_j w_j) / (1 - alpha_i),
+
+where the sum over all i is known from the outputs,
+
+    rest = gN . N + gB . B + sum_k gW_k W_k + gA A,
+
+and the walk subtracts its terms one by one. Each hit is differentiated by `wp.grad` of the function that `collect`
+calls. Frozen: the lists, which hits count, which are in the buffer, where the walk ends.
+"""
 
 import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_add, fixed_record_sum
+from nexwarp.kernels.native.fixed_point import fixed_point_add, fixed_point_record_sum
 from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.native.warp import (
-    any_lane,
+    any_in_warp,
     ballot,
-    first_lane,
     from_lane,
-    lane,
-    lane_max,
-    lane_sum,
-    lanes,
-    record_sum,
+    lane_index,
+    lowest_lane,
+    warp_max,
+    warp_record_sum,
+    warp_size,
+    warp_sum,
 )
-from nexwarp.kernels.surfel import frame_functions, hit_functions
+from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, overflowed, surfel_at, view_functions, walk
+from nexwarp.kernels.walk import buffer_types, walk, walk_functions
 
 
 @functools.cache
 def collect_backward_kernel(
-    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False, fixed: bool = False
+    real: type, max_hits: int, low_pass: bool, tile_size: int, with_errors: bool = False, fixed_point: bool = False
 ) -> wp.Kernel:
-    """Make the backward kernel; with `watch` it also adds up weight * error a row, as `splat_error` does alone.
+    """Make the backward kernel.
 
-    With `fixed` the sums are pairs of integers, see `kernels.fixed`, and so do not depend on any order.
+    Args:
+        real: scalar type.
+        max_hits: K.
+        low_pass: as in `collect`.
+        tile_size: pixels along a tile's side.
+        with_errors: also add up weight * error.
+        fixed_point: add up pairs of integers, see `native.fixed_point`, so that sums do not depend on any order.
     """
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
     hit_dot = h.hit_dot
     vec, ivec, _ = buffer_types(real, max_hits)
-    view = view_functions(real, tile_size)
-    pixels = view.pixels
-    sum1, sum3, add_record = lane_sum(real), lane_sum(vec3), record_sum(real)
-    put_record, put3, put1 = fixed_record_sum(real), fixed_add(vec3), fixed_add(real)
+    w = walk_functions(real, low_pass, tile_size)
+    pixels = w.pixels
+    sum1, sum3, add_record = warp_sum(real), warp_sum(vec3), warp_record_sum(real)
+    put_record, put3, put1 = fixed_point_record_sum(real), fixed_point_add(vec3), fixed_point_add(real)
     pairs = wp.array2d(dtype=wp.int64)
-    rows_of_records = pairs if fixed else wp.array2d(dtype=vec4)
-    rows_of_centers = pairs if fixed else wp.array(dtype=vec3)
-    rows_of_errors = pairs if fixed else wp.array(dtype=real)
+    record_slots = pairs if fixed_point else wp.array2d(dtype=vec4)
+    center_slots = pairs if fixed_point else wp.array(dtype=vec3)
+    error_slots = pairs if fixed_point else wp.array(dtype=real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -67,7 +94,7 @@ def collect_backward_kernel(
         Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
-        rows: wp.array(dtype=wp.int32),
+        gradient_slots: wp.array(dtype=wp.int32),
         plain: wp.array(dtype=vec3),
         base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
@@ -81,73 +108,61 @@ def collect_backward_kernel(
         grad_alphas: wp.array(dtype=real),
         errors: wp.array(dtype=real),
         # outputs
-        grad_records: rows_of_records,
-        grad_centers: rows_of_centers,
-        error_sums: rows_of_errors,
+        grad_records: record_slots,
+        grad_centers: center_slots,
+        error_sums: error_slots,
         bad: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        tile = thread // pixels
-        xy = view.pixel_of(thread, tile_columns)
-        # Lanes outside the image walk along with nothing to give: all lanes of a warp must reach the sums together.
+        xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
+        middle, half = w.block_of(xy, intrinsics)
+        focal = vec2(intrinsics[0], intrinsics[1])
+        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
+        # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
-        if xy[0] >= size[0] or xy[1] >= size[1]:
+        if not inside:
             stop = int(0)
-        intrinsics = intrinsics_of(Ks)
-        focal = vec2(intrinsics[0], intrinsics[1])
-        d = view.ray_of(xy, intrinsics)
-        middle = view.block_of(xy, intrinsics)
-        half = view.half_block(intrinsics)
         gn = grad_plain[p]
         gb = grad_base[p]
         ga = grad_alphas[p]
         rest = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + ga * alphas[p]
         gw = vec()
         gd = vec()
-        slots = ivec()
+        buffered_ids = ivec()
         for j in range(wp.static(max_hits)):
-            slots[j] = ids[p, j]
+            buffered_ids[j] = ids[p, j]
             gw[j] = grad_weights[p, j]
             gd[j] = grad_depths[p, j]
             rest += gw[j] * weights[p, j]
         error = real(0.0)
-        if wp.static(watch):
+        if wp.static(with_errors):
             error = errors[p]
         transmittance = real(1.0)
-        me = lane()
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(tile, tile_offsets, ends, overflow)
-        width = lanes()
-        last = wp.min(lane_max(stop), bounds[1])
-        for batch in range(bounds[0], last, width):
-            mine = int(-1)
-            if batch + me < last:
-                mine = surfel_at(batch + me, surfel_ids, order, overflow)
-                if width > 1:
-                    center = vec3()
-                    if wp.static(low_pass):
-                        center = centers[mine]
-                    m = load(records, mine, 3)[3]
-                    if h.misses_block(
-                        load(records, mine, 0),
-                        load(records, mine, 1),
-                        load(records, mine, 2),
-                        m,
-                        reaches[mine],
-                        limits[mine],
-                        center,
-                        middle,
-                        half,
-                        focal,
-                    ):
-                        mine = int(-1)
+        width = warp_size()
+        lane = lane_index()
+        last = wp.min(warp_max(stop), end)
+        for batch in range(start, last, width):
+            mine = w.candidate(
+                batch + lane,
+                last,
+                surfel_ids,
+                order,
+                overflow,
+                records,
+                centers,
+                limits,
+                reaches,
+                middle,
+                half,
+                focal,
+            )
             left = ballot(wp.where(mine >= 0, 1, 0))
             while left != 0:
-                next_lane = first_lane(left)
+                source = lowest_lane(left)
                 left = left & (left - 1)
-                i = from_lane(mine, next_lane)
-                k = batch + next_lane
+                i = from_lane(mine, source)
+                k = batch + source
                 ra = load(records, i, 0)
                 rb = load(records, i, 1)
                 rn = load(records, i, 2)
@@ -162,7 +177,7 @@ def collect_backward_kernel(
                     alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
                 if not (k < stop and alpha >= ALPHA_MIN and depth > near):
                     alpha = ZERO
-                if any_lane(wp.where(alpha > ZERO, 1, 0)) != 0:
+                if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
                     g0 = vec4()
                     g1 = vec4()
                     g2 = vec4()
@@ -176,7 +191,7 @@ def collect_backward_kernel(
                         gt = real(0.0)
                         g = gn
                         for j in range(wp.static(max_hits)):
-                            if i == slots[j]:
+                            if i == buffered_ids[j]:
                                 q += gw[j]
                                 gt = gd[j]
                                 g = gb
@@ -189,25 +204,25 @@ def collect_backward_kernel(
                             ra, rb, rn, rc[3], center, d[0], d[1], focal, near, grad_alpha, gt
                         )
                         g3[3] = gm
-                    row = int(i)
-                    if k < rows.shape[0]:
-                        row = rows[k]
-                    if wp.static(fixed):
-                        put_record(grad_records, row, g0, g1, g2, g3, bad)
+                    slot = int(i)
+                    if k < gradient_slots.shape[0]:
+                        slot = gradient_slots[k]
+                    if wp.static(fixed_point):
+                        put_record(grad_records, slot, g0, g1, g2, g3, bad)
                     else:
-                        add_record(grad_records, row, g0, g1, g2, g3)
+                        add_record(grad_records, slot, g0, g1, g2, g3)
                     if wp.static(low_pass):
                         gc = sum3(gc)
-                    if wp.static(watch):
+                    if wp.static(with_errors):
                         share = sum1(share)
-                    if me == 0:
-                        if wp.static(watch and fixed):
-                            put1(error_sums, row, share, bad)
-                        if wp.static(watch and not fixed):
-                            wp.atomic_add(error_sums, row, share)
-                        if wp.static(low_pass and fixed):
-                            put3(grad_centers, row, gc, bad)
-                        if wp.static(low_pass and not fixed):
-                            wp.atomic_add(grad_centers, row, gc)
+                    if lane == 0:
+                        if wp.static(with_errors and fixed_point):
+                            put1(error_sums, slot, share, bad)
+                        if wp.static(with_errors and not fixed_point):
+                            wp.atomic_add(error_sums, slot, share)
+                        if wp.static(low_pass and fixed_point):
+                            put3(grad_centers, slot, gc, bad)
+                        if wp.static(low_pass and not fixed_point):
+                            wp.atomic_add(grad_centers, slot, gc)
 
     return collect_backward

@@ -1,4 +1,4 @@
-"""Composition (paper Eq. 5): image = plain + textured + (1 - alpha) background, textured = base + sum_k weight_k T_k.
+"""Composition (paper Eq. 7): image = plain + textured + (1 - alpha) background, textured = base + sum_k weight_k T_k.
 
 Without `base`, a null array, it is 0. One thread a pixel; Warp's own adjoint.
 """

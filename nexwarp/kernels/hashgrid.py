@@ -1,13 +1,18 @@
-"""Hash-grid lookup (paper Eq. 1 and 2): unbounded, every level hashed, features down-weighted by a pixel's footprint.
+"""Lookup in the hash grid (paper Eq. 2), its features down-weighted by the pixel's size (Delta, paper Eq. 4).
 
-Forward one thread a (level, point), backward one thread a point. Features are stored level-major,
-(levels * features, n): neighbouring threads write neighbouring values, and the MLP's matrix product takes the array as
-it is. A point with depth 0 (an empty hit slot) gets zeros and gives no gradient.
+Every level is hashed, so the field is unbounded. Forward, a thread is a (level, point); backward, a thread is a (run of
+`levels_per_thread` levels, point). Read: the table (L, T) of F features, the points (n) and their z-depths; a point of
+depth 0, an empty hit slot, gets zeros and gives no gradient. Written:
 
-The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so tables may
-be half precision while their gradients are summed in float32. The backward kernel adds to the table by atomics; a CPU
-has none: see `hashgrid_rows`. Its fixed-point form adds up integers, one an entry and feature (L, T * F), in units that
-the caller chooses: the same bits in whatever order.
+    encoded        (L * F, n), level-major: neighbouring threads write neighbouring values, and the MLP's matrix product
+                   takes the array as it is
+    grad_table     added to, by atomics on CUDA. A CPU has none: there a thread owns the tables of its run of levels
+    grad_points    (runs, n) gradients of position and depth, one for each run of levels
+
+The lookup gathers the eight corners and interpolates by the pure function that `wp.grad` differentiates, so that tables
+may be half precision while their gradients are summed in float32. Resolutions and focal length are not differentiated;
+the cell of a point is frozen. The fixed-point form adds up integers, one for each entry and feature (L, T * F), in
+units that the caller chooses: the same bits in whatever order.
 """
 
 import functools
@@ -16,8 +21,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_units
-from nexwarp.kernels.native.simd import lane_functions, slot_functions
+from nexwarp.kernels.native.fixed_point import fixed_point_units
+from nexwarp.kernels.native.simd import simd_functions
+from nexwarp.kernels.native.simd.slots import slot_functions
 from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.types import types
 
@@ -102,26 +108,26 @@ def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
 
 
 @functools.cache
-def interpolation_functions(real: type, features: int, lanes: int = 1) -> SimpleNamespace:
-    """Interpolation in a cell, and its contraction for `wp.grad`, for one point or for `lanes` of them (see `simd`).
+def interpolation_functions(real: type, features: int, width: int = 1) -> SimpleNamespace:
+    """Interpolation in a cell, and its contraction for `wp.grad`, for one point or for `width` of them.
 
     Returns:
-        Types `corners` (8 corners x features; for more points, rows of lanes, corner-major) and `values` (features; for
-        more points, rows of lanes), and functions interpolate and interpolate_dot.
+        Types `corners` (8 corners x features; for more points, a SIMD vector in each slot, corner-major) and `values`
+        (features; for more points, likewise), and functions interpolate and interpolate_dot.
     """
-    values = _interpolation(real, features, lanes, for_gradients=False)
-    copies = _interpolation(real, features, lanes, for_gradients=True)
+    values = _interpolation(real, features, width, for_gradients=False)
+    copies = _interpolation(real, features, width, for_gradients=True)
     values.interpolate_dot = copies.interpolate_dot  # see `surfel.hit_functions`
     return values
 
 
-def _interpolation(real: type, features: int, lanes: int, for_gradients: bool) -> SimpleNamespace:
-    f = lane_functions(real, lanes, for_gradients)
-    lane, splat, scaled, times, over, inner = f.lane, f.splat, f.scaled, f.times, f.over, f.inner
+def _interpolation(real: type, features: int, width: int, for_gradients: bool) -> SimpleNamespace:
+    f = simd_functions(real, width, for_gradients)
+    reals, splat, scaled, times, over, inner = f.reals, f.splat, f.scaled, f.times, f.over, f.inner
     power_of_e = f.power_of_e
     ONE = types(real).ONE
     INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
-    if lanes == 1:
+    if width == 1:
         corners_type = wp.types.matrix(shape=(8, features), dtype=real)
         values_type = wp.types.vector(length=features, dtype=real)
 
@@ -129,17 +135,17 @@ def _interpolation(real: type, features: int, lanes: int, for_gradients: bool) -
         def corner_of(corners: corners_type, j: int, k: int):
             return corners[j, k]
     else:
-        table = slot_functions(real, lanes, 8 * features, for_gradients)
-        corners_type, row_at = table.lanes_by_slot, table.lane_at
-        values_type = wp.types.matrix(shape=(features, lanes), dtype=real)
+        table = slot_functions(real, width, 8 * features, for_gradients)
+        corners_type, slot_at = table.reals_by_slot, table.reals_at
+        values_type = wp.types.matrix(shape=(features, width), dtype=real)
 
         @wp.func
         def corner_of(corners: corners_type, j: int, k: int):
-            return row_at(corners, j * features + k)
+            return slot_at(corners, j * features + k)
 
     @wp.func
-    def interpolate(fx: lane, fy: lane, fz: lane, corners: corners_type, scale: real, depth: lane, focal: real):
-        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 2."""
+    def interpolate(fx: reals, fy: reals, fz: reals, corners: corners_type, scale: real, depth: reals, focal: real):
+        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 4."""
         gx = splat(ONE) - fx
         gy = splat(ONE) - fy
         gz = splat(ONE) - fz
@@ -162,12 +168,12 @@ def _interpolation(real: type, features: int, lanes: int, for_gradients: bool) -
 
     @wp.func
     def interpolate_dot(
-        fx: lane,
-        fy: lane,
-        fz: lane,
+        fx: reals,
+        fy: reals,
+        fz: reals,
         corners: corners_type,
         scale: real,
-        depth: lane,
+        depth: reals,
         focal: real,
         grad: values_type,
     ):
@@ -183,14 +189,14 @@ def _interpolation(real: type, features: int, lanes: int, for_gradients: bool) -
 
 
 @functools.cache
-def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = False) -> SimpleNamespace:
+def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool = False) -> SimpleNamespace:
     """Make the forward and backward kernels.
 
     Args:
         real: scalar type of positions, table gradients and arithmetic.
         storage: scalar type of the table and of the features written (`real` or wp.float16).
         features: features a level, 1, 2, 4 or 8.
-        fixed: let the backward kernel add to the table in fixed point: integers, `units` of them in 1.
+        fixed_point: let the backward kernel add to the table in fixed point, as integers, `units` of them in 1.
     """
     t = types(real)
     vec3, vec4 = t.vec3, t.vec4
@@ -202,11 +208,11 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
     load = load_function(features, storage)
     options = {"fast_math": real is wp.float32}
     # In fixed point the lanes of a cell do not add up theirs first: which ones come together may change.
-    merged = features in (2, 4) and real is wp.float32 and not fixed
+    merged = features in (2, 4) and real is wp.float32 and not fixed_point
     scatter = scatter_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
     merge_cells, add_row = scatter.merge_cells, scatter.add_row
-    table_of_sums = wp.array2d(dtype=wp.int64) if fixed else wp.array2d(dtype=vec)
-    add_units = fixed_units(real)
+    table_of_sums = wp.array2d(dtype=wp.int64) if fixed_point else wp.array2d(dtype=vec)
+    add_units = fixed_point_units(real)
 
     @wp.func
     def cell(x: vec3):
@@ -259,19 +265,22 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
         grad_encoded: wp.array2d(dtype=storage),
         unscale: wp.array(dtype=real),
         units: wp.array(dtype=wp.float64),
+        levels_per_thread: wp.int32,
         # outputs
         grad_table: table_of_sums,
-        grad_points: wp.array(dtype=vec4),
+        grad_points: wp.array2d(dtype=vec4),
         bad: wp.array(dtype=wp.int32),
     ):
-        p = first + wp.tid()
+        r_, p = wp.tid()
+        run = first + r_
         depth = depths[p]
         if not (depth > ZERO):
             if grad_points.shape[0] > 0:
-                grad_points[p] = vec4()
+                grad_points[run, p] = vec4()
             return
         total = vec4()
-        for level in range(resolutions.shape[0]):
+        start = run * levels_per_thread
+        for level in range(start, wp.min(start + levels_per_thread, resolutions.shape[0])):
             grad = vec()
             for k in range(wp.static(features)):
                 grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
@@ -286,7 +295,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
             if wp.static(merged):
                 gc = merge_cells(corner[0], corner[1], corner[2], gc)
             for j in range(8):
-                if wp.static(fixed):
+                if wp.static(fixed_point):
                     first_sum = int(hash_slot(corner, j, mask)) * wp.static(features)
                     for k in range(wp.static(features)):
                         add_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
@@ -305,6 +314,6 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed: bool = Fal
                         wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
             total += vec4(gx * scale, gy * scale, gz * scale, gd)
         if grad_points.shape[0] > 0:
-            grad_points[p] = total
+            grad_points[run, p] = total
 
     return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)

@@ -5,9 +5,10 @@ The number of chunks is fixed, whatever the number of threads, so that nothing d
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from contextlib import contextmanager
+from typing import Any, Literal
 
 import warp as wp
 
@@ -15,6 +16,10 @@ CHUNKS = 16
 SMALLEST_CHUNK = 256
 # Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
 LIGHT_CHUNK = 2048
+
+CpuForm = Literal["simd", "scalar"]
+
+_cpu_form: CpuForm = "simd"
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -30,6 +35,29 @@ def set_num_threads(count: int) -> None:
 def get_num_threads() -> int:
     """Return how many CPU threads kernels use."""
     return _threads
+
+
+@contextmanager
+def cpu_form(form: CpuForm) -> Iterator[None]:
+    """Choose, inside the context and for all threads, which form of a stage a CPU runs.
+
+    Args:
+        form: "simd" is the form written for CPUs, where a stage has one, and what is used outside of any such context.
+            "scalar" is the body that runs on CUDA, compiled for the CPU. The forms agree to rounding.
+    """
+    global _cpu_form
+    if form not in ("simd", "scalar"):
+        raise ValueError(f"form: expected 'simd' or 'scalar', got {form!r}")
+    before, _cpu_form = _cpu_form, form
+    try:
+        yield
+    finally:
+        _cpu_form = before
+
+
+def uses_simd(device: wp.Device) -> bool:
+    """Whether stages run on a device in the form written for CPUs."""
+    return device.is_cpu and _cpu_form == "simd"
 
 
 @functools.lru_cache(maxsize=1)

@@ -64,7 +64,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     """Make the kernels of max(0, 0.5 + SH(direction from the camera's centre to the surfel's)).
 
     `sh0` is (N, 1), `shN` (N, C - 1). Backward is one kernel for the coefficients and one, a thread a surfel, for the
-    ray from the camera's centre to the surfel's. In the former, `lanes` threads share a surfel: with C of them each
+    ray from the camera's centre to the surfel's. In the former, `sharing` threads share a surfel: with C of them each
     writes one coefficient and neighbours write neighbouring addresses; one alone evaluates the basis but once. Both
     read the colours: where one is 0 it was clamped and has no gradient.
     """
@@ -116,7 +116,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module="unique")
     def plain_coefficients_backward(
         first: wp.int32,
-        lanes: wp.int32,
+        sharing: wp.int32,
         means: wp.array(dtype=vec3),
         position: wp.array(dtype=vec3),
         colors: wp.array(dtype=vec3),
@@ -126,10 +126,10 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
         grad_shN: wp.array2d(dtype=vec3),
     ):
         thread = first + wp.tid()
-        i = thread // lanes
+        i = thread // sharing
         grad = unclamped(grad_colors[i], colors[i])
         b = basis_along(means[i] - position[0])
-        for k in range(thread - i * lanes, grad_shN.shape[1] + 1, lanes):
+        for k in range(thread - i * sharing, grad_shN.shape[1] + 1, sharing):
             # Not b[k]: an index that the compiler does not know moves the basis from registers to memory.
             value = real(0.0)
             for c in range(wp.static(count)):

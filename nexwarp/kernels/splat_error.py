@@ -1,36 +1,36 @@
-"""Blended error of each surfel, for densification."""
+"""Blended error of each surfel, for densification (paper Sec. 4.3).
+
+A thread is a pixel (see `walk`). It takes the walk that `collect` took, as far as `stops` says. Read: what `collect`
+read, and the error of each pixel. Added to:
+
+    sums    sum over pixels of weight * error, by gradient slot or by surfel, as `collect_backward` adds gradients
+
+Nothing is differentiable. `collect_backward` adds up the same on its way, at hardly any cost.
+"""
 
 import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_add
+from nexwarp.kernels.native.fixed_point import fixed_point_add
 from nexwarp.kernels.native.vector_loads import load_function
-from nexwarp.kernels.native.warp import (
-    any_lane,
-    lane,
-    lane_sum,
-)
-from nexwarp.kernels.surfel import frame_functions, hit_functions
+from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_sum
+from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import overflowed, surfel_at, view_functions, walk
+from nexwarp.kernels.walk import surfel_at, walk, walk_functions
 
 
 @functools.cache
-def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed: bool = False) -> wp.Kernel:
-    """Make the kernel that gives each entry the sum over pixels of weight * error (densification, paper Sec. 3.3).
-
-    With `fixed` the sums are pairs of integers, as those of `collect_backward_kernel`.
-    """
+def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed_point: bool = False) -> wp.Kernel:
+    """Make the kernel; with `fixed_point` the sums are pairs of integers, as those of `collect_backward_kernel`."""
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    intrinsics_of = frame_functions(real).intrinsics_of
     h = hit_functions(real, low_pass)
     load = load_function(4, real)
-    view = view_functions(real, tile_size)
-    pixels = view.pixels
-    sum1, put1 = lane_sum(real), fixed_add(real)
-    rows_of_sums = wp.array2d(dtype=wp.int64) if fixed else wp.array(dtype=real)
+    w = walk_functions(real, low_pass, tile_size)
+    pixels = w.pixels
+    sum1, put1 = warp_sum(real), fixed_point_add(real)
+    slots = wp.array2d(dtype=wp.int64) if fixed_point else wp.array(dtype=real)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -52,33 +52,30 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed: bool =
         tile_columns: wp.int32,
         Ks: wp.array(dtype=mat33),
         near: real,
-        rows: wp.array(dtype=wp.int32),
+        gradient_slots: wp.array(dtype=wp.int32),
         stops: wp.array(dtype=wp.int32),
         errors: wp.array(dtype=real),
         # outputs
-        sums: rows_of_sums,
+        sums: slots,
         bad: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        tile = thread // pixels
-        xy = view.pixel_of(thread, tile_columns)
+        xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
+        focal = vec2(intrinsics[0], intrinsics[1])
+        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
+        # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
-        if xy[0] >= size[0] or xy[1] >= size[1]:
+        if not inside:
             stop = int(0)
-        intrinsics = intrinsics_of(Ks)
-        focal = vec2(intrinsics[0], intrinsics[1])
-        d = view.ray_of(xy, intrinsics)
         error = errors[p]
         transmittance = real(1.0)
-        me = lane()
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(tile, tile_offsets, ends, overflow)
-        for k in range(bounds[0], bounds[1]):
+        lane = lane_index()
+        for k in range(start, end):
             live = int(0)
             if k < stop:
                 live = 1
-            if any_lane(live) == 0:
+            if any_in_warp(live) == 0:
                 break
             i = surfel_at(k, surfel_ids, order, overflow)
             ra = load(records, i, 0)
@@ -99,16 +96,16 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed: bool =
             counts = int(0)
             if share > ZERO:
                 counts = 1
-            if any_lane(counts) == 0:
+            if any_in_warp(counts) == 0:
                 continue
             share = sum1(share)
-            if me == 0:
-                row = int(i)
-                if k < rows.shape[0]:
-                    row = rows[k]
-                if wp.static(fixed):
-                    put1(sums, row, share, bad)
-                if wp.static(not fixed):
-                    wp.atomic_add(sums, row, share)
+            if lane == 0:
+                slot = int(i)
+                if k < gradient_slots.shape[0]:
+                    slot = gradient_slots[k]
+                if wp.static(fixed_point):
+                    put1(sums, slot, share, bad)
+                if wp.static(not fixed_point):
+                    wp.atomic_add(sums, slot, share)
 
     return splat_error

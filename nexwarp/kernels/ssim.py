@@ -10,9 +10,9 @@ The blur is its own adjoint, hence dS/dx = blur(ds/dmx) + x blur(ds/dq) + y blur
 Images are read as they lie, rows of `width` = 3 W values, so that a neighbour in the same channel is 3 values away.
 What is blurred down the columns is written to padded rows, with PAD zeros on either side.
 
-A thread takes a block of `lanes` neighbouring values of a row. On CUDA that is 1, which makes neighbouring threads read
-neighbouring addresses, and 4 rows of them, which share what they read down the columns. On a CPU it is LANES, which
-the compiler turns into vector instructions. Arrays of blocks overlap: there is a block at every address. The last
+A thread takes a block of `length` neighbouring values of a row. On CUDA that is 1, which makes neighbouring threads
+read neighbouring addresses, and 4 rows of them, which share what they read down the columns. On a CPU it is SIMD_WIDTH,
+which the compiler turns into vector instructions. Arrays of blocks overlap: there is a block at every address. The last
 block of a row ends where the row ends, and agrees with the one before it where both write.
 """
 
@@ -24,8 +24,9 @@ import warp as wp
 
 from nexwarp.kernels.types import types
 
-LANES = 16
-PAD = 16  # a multiple of LANES, at least the 5 pixels of 3 values by which the window reaches past the end of a row
+SIMD_WIDTH = 16
+# A multiple of SIMD_WIDTH, at least the 5 pixels of 3 values by which the window reaches past the end of a row.
+PAD = 16
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
@@ -40,49 +41,49 @@ def tap(i: int) -> float:
     return _GAUSSIAN[i] / sum(_GAUSSIAN) if 0 <= i < WINDOW_SIZE else 0.0
 
 
-def rows_a_thread(lanes: int) -> int:
-    """Rows that a thread blurs down the columns: more save reading, but must fit in registers with their lanes."""
-    return 4 if lanes == 1 else 1
+def rows_a_thread(length: int) -> int:
+    """Rows that a thread blurs down the columns: more save reading, but must fit in registers."""
+    return 4 if length == 1 else 1
 
 
 @functools.cache
-def ssim_kernels(real: type, lanes: int) -> SimpleNamespace:
+def ssim_kernels(real: type, length: int) -> SimpleNamespace:
     """Make the kernels `moments` and `score` of the forward pass, `blur` and `gradient` of the backward pass.
 
     Args:
         real: scalar type.
-        lanes: values a block, 1 or LANES.
+        length: values of a block, 1 or SIMD_WIDTH.
     """
     t = types(real)
     HALF, ONE, ZERO = t.HALF, t.ONE, t.ZERO
     HALF_C1, HALF_C2 = wp.constant(real(C1 / 2.0)), wp.constant(real(C2 / 2.0))
-    vec = wp.types.vector(length=lanes, dtype=real)
-    rows = rows_a_thread(lanes)
+    vec = wp.types.vector(length=length, dtype=real)
+    rows = rows_a_thread(length)
 
     @wp.func
     def padded_block(thread: wp.int32, width: wp.int32):
         """Which `rows` rows a thread has, and where its block starts in a row: in [0, width), or else in the pads."""
-        count = (width + lanes - 1) // lanes
-        padded = count + wp.static(2 * PAD // lanes)
-        block = thread % padded - wp.static(PAD // lanes)
-        start = block * lanes
+        count = (width + length - 1) // length
+        padded = count + wp.static(2 * PAD // length)
+        block = thread % padded - wp.static(PAD // length)
+        start = block * length
         if block >= 0:
-            start = wp.min(start, width - lanes)
+            start = wp.min(start, width - length)
         if block >= count:
-            start = width + (block - count) * lanes
+            start = width + (block - count) * length
         return (thread // padded) * wp.static(rows), start
 
     @wp.func
     def inner_block(thread: wp.int32, width: wp.int32):
         """Where a thread's block lies: the address in rows without pads, and that of its window in padded rows."""
-        count = (width + lanes - 1) // lanes
+        count = (width + length - 1) // length
         row = thread // count
-        at = row * width + wp.min((thread % count) * lanes, width - lanes)
+        at = row * width + wp.min((thread % count) * length, width - length)
         return at, at + row * wp.static(2 * PAD) + wp.static(PAD - 3 * _REACH)
 
     def column_blur(count: int) -> wp.Kernel:
         """Make the kernel that blurs 4 moments of 2 images, or 3 maps, down the columns."""
-        mat = wp.types.matrix(shape=(count * rows, lanes), dtype=real)
+        mat = wp.types.matrix(shape=(count * rows, length), dtype=real)
         of_images = count == 4
 
         @wp.kernel(enable_backward=False, module="unique")
@@ -153,7 +154,7 @@ def ssim_kernels(real: type, lanes: int) -> SimpleNamespace:
         product = wp.cw_mul(mx, my)
         square = (wp.cw_mul(mx, mx) + wp.cw_mul(my, my)) * HALF
         variance = q - square
-        for i in range(lanes):  # rounding can take a variance below zero; wp.max would hide NaN
+        for i in range(length):  # rounding can take a variance below zero; wp.max would hide NaN
             variance[i] = wp.where(variance[i] < ZERO, ZERO, variance[i])
         a = product + vec(HALF_C1)
         b = p - product + vec(HALF_C2)

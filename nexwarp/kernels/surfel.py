@@ -16,12 +16,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.simd import lane_functions
+from nexwarp.kernels.native.simd import simd_functions
 from nexwarp.kernels.types import types
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
 BLOCK_SLACK = 1e-6
-# Bounds for SIMD, where a lane without a hit is computed too, and for the low-pass, which hits where the surfel does
+# Bounds for SIMD, where a ray without a hit is computed too, and for the low-pass, which hits where the surfel does
 # not: far beyond what a hit of the surfel can have, and finite, since their derivatives meet a 0.
 LARGEST_SQUARE = 1e30
 LARGEST_EXPONENT = 80.0
@@ -92,25 +92,25 @@ def frame_functions(real: type) -> SimpleNamespace:
 
 
 @functools.cache
-def hit_functions(real: type, low_pass: bool, lanes: int = 1) -> SimpleNamespace:
+def hit_functions(real: type, low_pass: bool, width: int = 1) -> SimpleNamespace:
     """The hit of a ray on a surfel (paper Eq. 3), and its contraction for `wp.grad`.
 
-    Rays have directions (dx, dy, 1). With `lanes` of them at once (see `simd`), dx and what follows from it are
-    vectors, dy and the surfel are the same for all, and the contraction is the sum over the lanes.
+    Rays have directions (dx, dy, 1). With `width` of them at once (see `native.simd`), dx and what follows from it are
+    vectors, dy and the surfel are the same for all, and the contraction is the sum over the rays.
 
     The contraction calls copies of the functions: `wp.grad` finds no derivative, and silently takes 0, of a function
     two calls down that the kernel has already used for its value.
     """
-    values = _hit_functions(real, low_pass, lanes, lane_functions(real, lanes))
-    values.hit_dot = _hit_functions(real, low_pass, lanes, lane_functions(real, lanes, for_gradients=True)).hit_dot
+    values = _hit_functions(real, low_pass, width, simd_functions(real, width))
+    values.hit_dot = _hit_functions(real, low_pass, width, simd_functions(real, width, for_gradients=True)).hit_dot
     return values
 
 
-def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -> SimpleNamespace:
+def _hit_functions(real: type, low_pass: bool, width: int, f: SimpleNamespace) -> SimpleNamespace:
     t = types(real)
     vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
     ZERO, HALF, ONE, TWO = t.ZERO, t.HALF, t.ONE, t.TWO
-    lane = f.lane
+    reals = f.reals
     splat, scaled, times, over, inner = f.splat, f.scaled, f.times, f.over, f.inner
     power_of_e, logarithm, below, pick = f.power_of_e, f.logarithm, f.below, f.pick
     at_least, at_most = f.at_least, f.at_most
@@ -120,11 +120,11 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
     LARGE, LEAST = wp.constant(real(LARGEST_SQUARE)), wp.constant(real(LEAST_COSINE))
 
     @wp.func
-    def plane(a: vec4, b: vec4, n: vec4, m: real, dx: lane, dy: real):
+    def plane(a: vec4, b: vec4, n: vec4, m: real, dx: reals, dy: real):
         """(u, v, t) where the rays meet the surfel's plane."""
         cosine = scaled(n[0], dx) + splat(n[1] * dy + n[2])
-        if wp.static(lanes > 1):
-            # All lanes are differentiated, those without a hit by 0: which must not meet an infinity.
+        if wp.static(width > 1):
+            # All rays are differentiated, those without a hit by 0: which must not meet an infinity.
             cosine = pick(below(times(cosine, cosine), splat(LEAST * LEAST)), splat(LEAST), cosine)
         inverse = over(splat(ONE), cosine)
         u = times(scaled(a[0], dx) + splat(a[1] * dy + a[2]), inverse)
@@ -181,19 +181,29 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
         return out
 
     @wp.func
-    def power(x: lane, gamma: real):
+    def power(x: reals, gamma: real):
         """|x|^(2 gamma)."""
         square = at_least(times(x, x), TINY)
-        if wp.static(lanes > 1 or low_pass):
+        if wp.static(width > 1 or low_pass):
             square = at_most(square, LARGE)
         exponent = scaled(gamma, logarithm(square))
-        if wp.static(lanes == 1 and low_pass):
+        if wp.static(width == 1 and low_pass):
             exponent = at_most(exponent, EXPONENT)
         return power_of_e(exponent)
 
     @wp.func
     def kernel(
-        u: lane, v: lane, t: lane, a: vec4, b: vec4, n: vec4, center: vec3, dx: lane, dy: real, focal: vec2, near: real
+        u: reals,
+        v: reals,
+        t: reals,
+        a: vec4,
+        b: vec4,
+        n: vec4,
+        center: vec3,
+        dx: reals,
+        dy: real,
+        focal: vec2,
+        near: real,
     ):
         """(alpha, t): the generalised Gaussian, its low-pass where asked for, and the depth of the hit."""
         exponent = power(u, b[3]) + power(v, n[3])
@@ -218,12 +228,12 @@ def _hit_functions(real: type, low_pass: bool, lanes: int, f: SimpleNamespace) -
         n: vec4,
         m: real,
         center: vec3,
-        dx: lane,
+        dx: reals,
         dy: real,
         focal: vec2,
         near: real,
-        grad_alpha: lane,
-        grad_depth: lane,
+        grad_alpha: reals,
+        grad_depth: reals,
     ):
         """grad_alpha * alpha + grad_depth * t: wp.grad of a scalar contraction is the vector-Jacobian product."""
         u, v, t = plane(a, b, n, m, dx, dy)

@@ -1,7 +1,7 @@
 """Tile lists: which surfels may be seen in which tile, near to far. Integers only, nothing here is differentiable.
 
 A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
-projected: a convex polygon of at most five corners, its footprint. A tile row's slab cuts out one span of it, so the
+projected: a convex polygon of at most five corners, the tile polygon. A tile row's slab cuts out one span of it, so the
 tiles that the polygon touches are listed exactly, not those of its bounding box. The support only culls; alpha >= 1/255
 decides.
 """
@@ -45,7 +45,7 @@ def check_entries(total: int, count: int, tiles: int) -> int:
 
 
 @functools.cache
-def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
+def tile_polygon_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the kernel that projects supports to polygons, one thread a surfel."""
     t = types(real)
     vec2, vec3, vec4, mat33, mat44 = t.vec2, t.vec3, t.vec4, t.mat33, t.mat44
@@ -62,7 +62,7 @@ def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         return vec2(intrinsics[0] * x[0] / x[2] + intrinsics[2], intrinsics[1] * x[1] / x[2] + intrinsics[3])
 
     @wp.kernel(enable_backward=False, module="unique")
-    def footprint(
+    def tile_polygon(
         first: wp.int32,
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),
@@ -164,7 +164,7 @@ def footprint_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         margins[i] = margin
         shapes[i] = wp.vec3i(count, wp.max(y0, 0), wp.min(y1, tile_rows - 1))
 
-    return footprint
+    return tile_polygon
 
 
 @functools.cache
@@ -181,7 +181,7 @@ def index_function(real: type) -> wp.Function:
 
 @functools.cache
 def span_function(real: type, low_pass: bool, tile_size: int) -> wp.Function:
-    """Make the function that cuts a footprint with the slab of a tile row."""
+    """Make the function that cuts a tile polygon with the slab of a tile row."""
     t = types(real)
     vec2, vec3 = t.vec2, t.vec3
     HALF, ONE, ZERO = t.HALF, t.ONE, t.ZERO
@@ -199,7 +199,7 @@ def span_function(real: type, low_pass: bool, tile_size: int) -> wp.Function:
         margin: real,
         discs: wp.array(dtype=vec3),
     ):
-        """First and last tile of a tile row that the footprint touches; first > last when none."""
+        """First and last tile of a tile row that the tile polygon touches; first > last when none."""
         top = real(float(row)) * SIZE + HALF - margin
         bottom = real(float(row + 1)) * SIZE - HALF + margin
         low = real(HUGE)
@@ -261,9 +261,9 @@ def depth_keys_kernel(real: type) -> wp.Kernel:
 
 @functools.cache
 def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
-    """Make the kernels that count and emit (tile, surfel) entries: `lanes` threads a surfel, in depth order.
+    """Make the kernels that count and emit (tile, surfel) entries: `sharing` threads a surfel, in depth order.
 
-    The lanes of a surfel take turns at its tile rows: near surfels cover many, and alone one thread would be long.
+    The threads of a surfel take turns at its tile rows: near surfels cover many, and alone one thread would be long.
     """
     t = types(real)
     vec2, vec3 = t.vec2, t.vec3
@@ -278,16 +278,16 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         margins: wp.array(dtype=real),
         discs: wp.array(dtype=vec3),
         grid: wp.vec2i,
-        lanes: wp.int32,
+        sharing: wp.int32,
         # outputs
         counts: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        i = order[thread // lanes]
+        i = order[thread // sharing]
         shape = shapes[i]
         margin = margins[i]
         total = int(0)
-        for row in range(shape[1] + thread % lanes, shape[2] + 1, lanes):
+        for row in range(shape[1] + thread % sharing, shape[2] + 1, sharing):
             s = span(i, row, grid[0], shape[0], corners, margin, discs)
             total += wp.max(s[1] - s[0] + 1, 0)
         counts[thread] = total
@@ -301,7 +301,7 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         margins: wp.array(dtype=real),
         discs: wp.array(dtype=vec3),
         grid: wp.vec2i,
-        lanes: wp.int32,
+        sharing: wp.int32,
         ends: wp.array(dtype=wp.int32),
         # outputs
         tiles: wp.array(dtype=wp.int32),
@@ -316,10 +316,10 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         # Where there are more entries than an int32 counts, some ends are negative, and the lists will not be used.
         if e < 0 or e >= end:
             return
-        i = order[thread // lanes]
+        i = order[thread // sharing]
         shape = shapes[i]
         margin = margins[i]
-        for row in range(shape[1] + thread % lanes, shape[2] + 1, lanes):
+        for row in range(shape[1] + thread % sharing, shape[2] + 1, sharing):
             s = span(i, row, grid[0], shape[0], corners, margin, discs)
             for column in range(s[0], s[1] + 1):
                 # Lists may be too short (see `nexwarp.ops.tiles`), and a compiler may round here otherwise than in

@@ -1,1 +1,1 @@
-"""The trained scene: its value and its files."""
+"""The trained scene and its file formats."""

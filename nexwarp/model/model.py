@@ -1,4 +1,4 @@
-"""The model: a trained scene, and how it is rendered."""
+"""The model: a trained scene with the options of its rendering."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -20,19 +20,19 @@ from nexwarp.representation.texture import NeuralTexture
 
 
 class Model(nn.Module):
-    """A trained scene: what was learned, what is known of the photos, and how to render it.
+    """A trained scene: surfels, texture, exposures, detail limits, and the options of its rendering.
 
     Attributes:
         surfels: the N surfels, float32.
-        texture: the neural texture, float32; None where the scene has none.
-        exposures: gains of the training photos and their lens's falloff; None renders at the mean exposure.
-        detail_limits: of the N surfels; None limits nothing.
-        options: how the model is rendered.
-        meta: what else is known of it, JSON values: `near` [world units], `scene_scale` [world units], `preset`,
-            `iteration`, and of a finished model `smooth_sh`.
+        texture: the neural texture, float32; None for a model without texture.
+        exposures: gains of the training photos and the falloff of their lens; None renders at the mean exposure.
+        detail_limits: detail limits of the N surfels; None limits nothing.
+        options: the options of its rendering.
+        meta: further facts, as JSON values: `near` [world units], `scene_scale` [world units], `preset`, `iteration`;
+            a finished model also has `smooth_sh`.
 
     Raises:
-        TypeError, ValueError: naming the argument that does not fit.
+        TypeError, ValueError: the message names the argument.
     """
 
     surfels: Surfels
@@ -106,25 +106,25 @@ class Model(nn.Module):
         generator: torch.Generator | None = None,
         **changes: Unpack[RenderChanges],
     ) -> Rendering | list[Rendering]:
-        """Render the scene as `nexwarp render` shows it: with exposures and detail limits. Differentiable.
+        """Render the scene as `nexwarp render` does, with exposures and detail limits. Differentiable.
 
         Args:
-            camera: one camera, or several of any sizes; moved to the model's device.
-            background: as `nexwarp.render` takes it; None is the options' background.
-            depth_jitter: for training, as `nexwarp.render` takes it.
-            generator: of the jitter's random numbers.
+            camera: one camera, or several, which may differ in size. Cameras are moved to the model's device.
+            background: see `nexwarp.render`; None takes that of the options.
+            depth_jitter: see `nexwarp.render`; for training.
+            generator: random generator of the jitter.
             changes: fields of `RenderOptions` to change for this rendering, such as `exposure="mean"`.
 
         Returns:
             The rendering of the camera, or a list with one rendering for each camera.
 
         Raises:
-            TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+            TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
-        if isinstance(camera, Sequence):
+        if isinstance(camera, Sequence) and not isinstance(camera, str):
             return [
-                self.render(each, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
-                for each in camera
+                self.render(item, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
+                for item in camera
             ]
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
@@ -145,7 +145,7 @@ class Model(nn.Module):
         )
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
-        """Return a model of the same surfels alone, without texture, exposures and detail limits.
+        """Return a model with the same surfels, but without texture, exposures and detail limits.
 
         Args:
             changes: fields of `RenderOptions` to change.
@@ -156,13 +156,14 @@ class Model(nn.Module):
         """Write the model; `nexwarp.load` reads it.
 
         Args:
-            path: a file that ends in `.safetensors`, or a folder, made if need be, which gets a `model.safetensors`.
+            path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
+                `model.safetensors` is written.
 
         Returns:
-            The file.
+            The file that was written.
 
         Raises:
-            OSError: it cannot be written; what was there is as it was.
+            OSError: the file cannot be written; an existing file stays unchanged.
         """
         from nexwarp.model.model_file import save_model
 

@@ -1,4 +1,4 @@
-"""Models on disk: one safetensors file with JSON metadata, written aside, then renamed. See docs/format.md."""
+"""Model files: one safetensors file with JSON metadata, written atomically; docs/format.md describes it."""
 
 import dataclasses
 import json
@@ -28,9 +28,9 @@ DTYPES = ("F16", "F32")
 
 LARGEST_LENGTH = 1e15
 ROUNDING = 1 + 1e-6
-# Attributes of DetailLimits by the names of their tensors in the file, which are older.
+# Tensor names in the file of DetailLimits' attributes; the format keeps its first names.
 DETAIL_LIMITS = {"nearest": "footprints", "farthest": "far_footprints"}
-# Options that files of version 0.1 do not have.
+# Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits")
 
 
@@ -38,11 +38,12 @@ def save_model(path: str | os.PathLike[str], model: Model) -> Path:
     """Write a model: surfels, exposures and detail limits in float32, grid and MLP in half precision.
 
     Args:
-        path: a file that ends in `.safetensors`, or a folder, made if need be, which gets a `model.safetensors`.
-        model: what to write.
+        path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
+            `model.safetensors` is written.
+        model: the model.
 
     Returns:
-        The file.
+        The file that was written.
     """
     from safetensors.torch import save
 
@@ -70,14 +71,14 @@ def save_model(path: str | os.PathLike[str], model: Model) -> Path:
 
 
 def load(path: str | os.PathLike[str]) -> Model:
-    """Load a trained scene, on the CPU; needs neither the photos nor the training set.
+    """Load a model onto the CPU. The scene's photos are not needed.
 
     Args:
-        path: a run folder or a `model.safetensors`.
+        path: a run folder or a model file.
 
     Raises:
-        FileNotFoundError: nothing there.
-        ValueError: not a nexwarp model, of another format version, damaged, or tensors that do not fit.
+        FileNotFoundError: the folder or the file does not exist.
+        ValueError: the file is not a nexwarp model, has another format version, is damaged, or its tensors do not fit.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -87,7 +88,7 @@ def load(path: str | os.PathLike[str]) -> Model:
     if path.is_dir():
         path = path / MODEL_FILE
     if not path.is_file():
-        raise MissingError(f"{path}: expected a run folder with a {MODEL_FILE}, or such a file")
+        raise MissingError(f"{path}: expected a model file, or a run folder with a {MODEL_FILE}")
     try:
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get("nexwarp")
@@ -104,7 +105,13 @@ def load(path: str | os.PathLike[str]) -> Model:
 
 @dataclass(frozen=True)
 class _Header:
-    """A model file's metadata: how to render, the arguments of `NeuralTexture` or None, and the rest."""
+    """A model file's metadata.
+
+    Attributes:
+        options: the options of the rendering.
+        texture: the arguments of `NeuralTexture`; None for a model without texture.
+        meta: the other entries.
+    """
 
     options: RenderOptions
     texture: dict[str, Json] | None
@@ -112,14 +119,14 @@ class _Header:
 
 
 def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
-    """Make the model of a file's tensors; whatever does not fit raises."""
+    """Make a model from a file's metadata and tensors; raise an error if they do not fit."""
     surfels = Surfels(_part(tensors, "surfels."))
     limits = None
     if any(stored in tensors for stored in DETAIL_LIMITS.values()):
         for stored in DETAIL_LIMITS.values():
             if stored in tensors:
                 check_tensors({stored: (tensors[stored], (len(surfels),))}, dtype=torch.float32)
-        # Files of older versions may have one of them alone.
+        # Files of older versions may have only one of the two.
         nearest = tensors.get(DETAIL_LIMITS["nearest"], surfels.means.new_zeros(len(surfels)))
         farthest = tensors.get(DETAIL_LIMITS["farthest"], surfels.means.new_full((len(surfels),), NEVER))
         limits = DetailLimits(nearest.detach(), farthest.detach())
@@ -137,12 +144,12 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    """Tensors whose names begin with a prefix, by the rest of their names, as float32."""
+    """Return the tensors with a prefix in their names, as float32, by the names without it."""
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
 
 
 def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, list[int]]]) -> _Header:
-    """Read the metadata, and check it against dtypes and shapes before anything is allocated."""
+    """Read the metadata; check the tensors' dtypes and shapes against it before anything is allocated."""
     if text is None:
         raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     try:
@@ -162,7 +169,7 @@ def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, li
             raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
         expected = {}
         if texture is not None:
-            with torch.device("meta"):  # shapes without memory, whatever sizes the metadata names
+            with torch.device("meta"):  # allocates nothing, even if the metadata gives huge sizes
                 state = NeuralTexture(**texture).state_dict()
             expected = {f"texture.{name}": list(x.shape) for name, x in state.items()}
         for name, (dtype, shape) in kinds.items():
@@ -179,15 +186,15 @@ def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, li
 
 
 def _no_model(path: Path, error: Exception) -> FormatError:
-    return FormatError(f"{path}: the tensors do not make a model ({one_line(error)})")
+    return FormatError(f"{path}: expected the tensors of a nexwarp model ({one_line(error)})")
 
 
 def _read_options(meta: dict[str, Json]) -> RenderOptions:
-    """Take the options out of the metadata; raise ValueError or TypeError where a value is not as expected."""
+    """Remove the options from the metadata and return them; raise ValueError or TypeError for an invalid value."""
     names = [field.name for field in dataclasses.fields(RenderOptions)]
     missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
     if missing:
-        raise ValueError(f"no {missing[0]} in the metadata")
+        raise ValueError(f"metadata: expected {missing[0]}, found none")
     values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
     if isinstance(color := values["background"], list):
         values["background"] = tuple(color)

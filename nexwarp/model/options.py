@@ -1,4 +1,4 @@
-"""How a model is rendered."""
+"""Options of a model's rendering."""
 
 import dataclasses
 import numbers
@@ -15,7 +15,7 @@ LARGEST_COLOR = 1e6
 
 
 class RenderChanges(TypedDict, total=False):
-    """Fields of `RenderOptions`, but for the background, to change for one rendering."""
+    """Fields of `RenderOptions`, without the background, that one rendering may change."""
 
     max_hits: int
     sh_degree: int
@@ -27,21 +27,21 @@ class RenderChanges(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a model is rendered; a model keeps the options that it was trained with.
+    """Options of a model's rendering; a trained model has those of its training.
 
     Attributes:
-        max_hits: K, how many hits a pixel textures, 0 to 8.
-        background: sRGB colour behind everything, seen through what is left of the transmittance.
-        sh_degree: 0 to 3, limits the degree of both appearances.
-        low_pass: give surfels smaller than a pixel a screen-space Gaussian (2DGS's low-pass).
-        clamp_texture: limit textured colours to >= 0; not for residual textures.
-        exposure: "photos" renders with the gains and the lens's falloff that the training photos around the camera
-            predict; "mean" renders all cameras with the photos' mean exposure.
-        detail_limits: limit the texture's detail, and blur surfels, outside the range of distances that the training
-            views had.
+        max_hits: K, number of hits textured in each pixel, 0 to 8.
+        background: sRGB colour behind the surfels, weighted by the final transmittance.
+        sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
+        low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
+        clamp_texture: clamp textured colours to >= 0; not for residual textures.
+        exposure: "photos" predicts the gains from the training photos near the camera, and applies the falloff of their
+            lens; "mean" renders every camera at the photos' mean exposure.
+        detail_limits: limit the texture's detail closer than the training views, and also blur surfels farther than
+            them (see `DetailLimits`).
 
     Raises:
-        TypeError, ValueError: naming the field.
+        TypeError, ValueError: the message names the field.
     """
 
     max_hits: int = 2
@@ -71,7 +71,7 @@ class RenderOptions:
             check_range("background", float(value), -LARGEST_COLOR, LARGEST_COLOR)
 
     def changed(self, **changes: Unpack["RenderChanges"]) -> "RenderOptions":
-        """Return these options with other values; TypeError and ValueError name the field."""
+        """Return a copy with some fields changed; a TypeError or ValueError names the field."""
         known = [field.name for field in dataclasses.fields(self)]
         for name in changes:
             if name not in known:

@@ -1,7 +1,7 @@
-"""Surfels as Gaussians for renderers that project each Gaussian as if perspective were linear across it.
+"""Surfels as Gaussians for renderers of 3D Gaussian splatting, which linearise the projection at each centre.
 
-That holds as long as a Gaussian is small beside its distance. A large surfel becomes a grid of smaller, overlapping
-Gaussians in its plane whose blended alpha is the surfel's.
+The linearisation is accurate for Gaussians that are small compared with their distance. A large surfel therefore
+becomes a grid of smaller, overlapping Gaussians in its plane, whose blended alpha approximates the surfel's.
 """
 
 import math
@@ -13,34 +13,32 @@ import torch
 
 from nexwarp.camera import Camera
 
+# Distance between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %.
 SPACING = 1.4
 
-"""Between neighbouring pieces, in their standard deviations: the ripple that it leaves is below 2 %."""
-
+# Largest number of pieces on either side of a surfel's centre, along one axis.
 MOST_STEPS = 16
 
-"""Pieces on either side of a surfel's centre, at most, along one axis."""
-
+# Number of opacities that grids are fitted for; other opacities scale the nearest grid.
 LEVELS = 128
-
-"""Opacities that grids are fitted for; others take the nearest one's, times a factor."""
 
 LARGEST_ALPHA, LEAST_ALPHA = 0.99, 1.0 / 255.0  # of a surfel's hit
 
 FITTING_STEPS = 40
+# Candidate widths of a row of pieces, in standard deviations of the surfel.
 WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Gaussians that M surfels, or pieces of surfels, become.
+    """M Gaussians: whole surfels first, then pieces of split surfels.
 
     Attributes:
-        ids: (M,) int64 which surfel.
-        offsets: (M, 2) of the centre along the surfel's two axes, world units.
-        scales: (M, 2) standard deviations along them, world units.
-        opacities: (M,).
-        whole: how many come first that are surfels as they are.
+        ids: (M,) int64, indices of the surfels.
+        offsets: (M, 2) offsets of the centres along the surfel's two axes, world units.
+        scales: (M, 2) standard deviations along the two axes, world units.
+        opacities: (M,) opacities.
+        whole: number of whole surfels.
     """
 
     ids: torch.Tensor
@@ -54,17 +52,17 @@ class Pieces:
 def split_large(
     means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, cameras: Sequence[Camera], max_extent: float
 ) -> Pieces:
-    """Split surfels, taken with gamma = 1, that are large beside their distance from the nearest camera.
+    """Split surfels that are large compared with their distance to the nearest camera. Gamma is taken as 1.
 
     Args:
-        means: (N, 3) world.
+        means: (N, 3) centres, world frame.
         scales: (N, 2) standard deviations, world units.
         opacities: (N,) in [0, 1].
-        cameras: those to look right from; without any nothing is split.
-        max_extent: the standard deviation to allow, as a share of the distance; > 0, infinite for no splitting.
+        cameras: cameras to render accurately from; without any, nothing is split.
+        max_extent: largest standard deviation, as a fraction of the distance; > 0, infinity splits nothing.
 
     Returns:
-        The surfels that are small enough as they are, in order, then the pieces of the others.
+        The surfels that are small enough, in order, then the pieces of the others.
     """
     limit = means.new_full((len(means),), math.inf)
     for camera in cameras:
@@ -91,16 +89,24 @@ def split_large(
 
 
 def _reach(peak: torch.Tensor) -> torch.Tensor:
-    """How far from the centre, in standard deviations, a hit's alpha is at least 1/255."""
+    """Return the distance from the centre, in standard deviations, at which a hit's alpha falls to 1/255."""
     return (2 * (peak / LEAST_ALPHA).log().clamp(min=0)).sqrt()
 
 
 @lru_cache(4096)
 def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Centres (P, 2), standard deviations (2,), both in those of the surfel, and opacities (P,) of its pieces.
+    """Fit the pieces of a surfel of one opacity.
 
-    Optical depths -log(1 - alpha) add up where alphas blend; those of the pieces are scaled, each by the share that
-    is lacking at its centre, until their sum is the surfel's.
+    Blending adds optical depths -log(1 - alpha). Those of the pieces are scaled until their sum at each piece's centre
+    is the surfel's.
+
+    Args:
+        across: number of pieces on either side of the centre, along x.
+        along: likewise along y.
+        level: opacity of the surfel times `LEVELS`.
+
+    Returns:
+        Centres (P, 2) and standard deviations (2,), in standard deviations of the surfel, and opacities (P,).
     """
     peak = torch.tensor(level / LEVELS, dtype=torch.float64)
     reach = float(_reach(peak))
@@ -112,24 +118,24 @@ def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tens
     places = torch.cartesian_prod(side, side)
     wanted = peak * _falloff(places)
     best = math.inf
-    # Across a row of pieces, opaque ones blend to a profile that is wider than theirs.
+    # Opaque pieces of a row blend to a profile that is wider than each of them: try narrower pieces.
     for narrower in WIDTHS if 0.0 in spacing else (1.0,):
-        tried = torch.tensor([step / SPACING if step else narrower for step in spacing], dtype=torch.float64)
-        fitted = _fitted(grid, tried, peak)
-        falloff = _falloff((places[:, None] - grid) / tried)
+        candidate = torch.tensor([step / SPACING if step else narrower for step in spacing], dtype=torch.float64)
+        fitted = _fitted(grid, candidate, peak)
+        falloff = _falloff((places[:, None] - grid) / candidate)
         error = float((1 - (1 - fitted * falloff).prod(1) - wanted).square().mean())
         if error < best:
-            best, size, alpha = error, tried, fitted
+            best, size, alpha = error, candidate, fitted
     kept = alpha >= LEAST_ALPHA
     return grid[kept], size, alpha[kept]
 
 
-def _falloff(apart: torch.Tensor) -> torch.Tensor:
-    return torch.exp(-0.5 * apart.square().sum(-1))
+def _falloff(offsets: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-0.5 * offsets.square().sum(-1))
 
 
 def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
-    """Opacities (P,) with which pieces of one size add up to the surfel's optical depth at each one's centre."""
+    """Return the opacities (P,) of pieces whose optical depths add up to the surfel's at each piece's centre."""
     wanted = -torch.log1p(-peak * _falloff(grid))
     falloff = _falloff((grid[:, None] - grid) / size)
     depths = wanted / falloff.sum(1)

@@ -1,8 +1,8 @@
-"""Surfels as PLY files: all their parameters, for programs; and as Gaussians, for the viewers of 3D Gaussian splatting.
+"""Surfels as PLY files: with all parameters, or as Gaussians for viewers of 3D Gaussian splatting.
 
-Both list one vertex a surfel, little-endian, every property of one floating type. Names and activations are those of
-3DGS's files: `opacity` is a logit, `scale_*` are logarithms, `rot_*` a quaternion wxyz, surfel to world, `f_dc_*` the
-constant SH coefficient of red, green and blue, `f_rest_*` the others, all of red, then green, then blue.
+Both are little-endian lists of vertices whose properties have one floating type. Names and activations are those of
+3DGS's files: `opacity` is a logit, `scale_*` are logarithms, `rot_*` is a quaternion wxyz, surfel to world, `f_dc_*`
+are the constant SH coefficients of red, green and blue, `f_rest_*` the others: all of red, then green, then blue.
 """
 
 import os
@@ -19,17 +19,14 @@ from nexwarp.io.files import one_line, written_aside
 from nexwarp.model.splats import Pieces, split_large
 from nexwarp.representation.surfels import Surfels
 
+# Largest scale of an exported Gaussian, as a fraction of its distance to the nearest camera.
 MAX_EXTENT = 0.3
 
-"""Largest scale of an exported Gaussian, as a share of its distance from the nearest camera."""
-
+# Third scale of an exported Gaussian, as a fraction of the surfel's smaller scale.
 THINNESS = 1e-3
 
-"""Third scale of an exported Gaussian, as a share of the smaller of the surfel's two."""
-
+# Viewers expect the coefficients of SH degree 3.
 SPLAT_COEFFICIENTS = 16
-
-"""Viewers expect those of SH degree 3."""
 
 TYPES = {"float": np.dtype("<f4"), "float32": np.dtype("<f4"), "double": np.dtype("<f8"), "float64": np.dtype("<f8")}
 
@@ -40,7 +37,7 @@ SPLATS = "nexwarp surfels as 3DGS Gaussians: the plain appearance, without textu
 
 
 def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
-    """Write surfels with all their properties; `load_surfels_ply` reads the very same bits.
+    """Write surfels with all their properties; `load_surfels_ply` reads them bit for bit.
 
     Properties: `x y z`, `nx ny nz` (unit normal, for viewers), `f_dc_0..2`, `f_rest_*` (3 (C - 1)), `opacity`
     (logit), `scale_0 scale_1` (logarithms), `rot_0..3` (wxyz, not normalised), `gamma_0 gamma_1` (log(gamma - 1)).
@@ -68,26 +65,26 @@ def save_splats_ply(
     cameras: Sequence[Camera] = (),
     max_extent: float = MAX_EXTENT,
 ) -> None:
-    """Write the plain appearance of surfels as a file of 3D Gaussian splatting, which ordinary viewers open.
+    """Write surfels as Gaussians for viewers of 3D Gaussian splatting, without the texture and with gamma = 1.
 
-    Each surfel becomes a flat Gaussian: its third scale is a thousandth of its smaller one. That is the rendering of
-    the surfels without texture and with gamma = 1, but for the affine projection and the blur of such viewers. As an
-    affine projection is wrong for what is large beside its distance, surfels that are, from one of the cameras, become
-    several Gaussians; these come last.
+    Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two. Viewers
+    approximate the projection of a Gaussian as affine, which is inaccurate for one that is large compared with its
+    distance. A surfel that is large for one of the cameras therefore becomes several Gaussians; these come last.
 
     Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44` (0 above `sh_degree`), `opacity` (logit),
     `scale_0..2` (logarithms), `rot_0..3` (wxyz, unit).
 
     Args:
-        path: where to; written aside, then renamed.
-        surfels: on any device.
-        sh_degree: 0 to 3, limits the degree of the appearance, as in `nexwarp.render`.
-        cameras: from where the file is to look right; without any, each surfel is one Gaussian.
-        max_extent: the largest scale of a Gaussian, as a share of its distance from the nearest camera; `math.inf`
-            for no splitting.
+        path: file to write, atomically.
+        surfels: the surfels, on any device.
+        sh_degree: largest SH degree to write, 0 to 3; higher coefficients are 0.
+        cameras: cameras to render accurately from; without any, each surfel is one Gaussian.
+        max_extent: largest scale of a Gaussian, as a fraction of its distance to the nearest camera; `math.inf` splits
+            nothing.
 
     Raises:
-        ValueError: `sh_degree` out of its range, `max_extent` not > 0; OSError: `path` cannot be written.
+        ValueError: `sh_degree` is out of its range, or `max_extent` is not > 0.
+        OSError: `path` cannot be written.
     """
     check_range("sh_degree", sh_degree, 0, 3)
     if not max_extent > 0:
@@ -114,7 +111,7 @@ def save_splats_ply(
 
 
 def _moved(surfels: Surfels, pieces: Pieces) -> torch.Tensor:
-    """Centres of the pieces of surfels that are split, world."""
+    """Return the centres of the pieces of split surfels, world frame."""
     ids, (along_x, along_y) = pieces.ids[pieces.whole :], pieces.offsets[pieces.whole :, :, None].unbind(1)
     w, x, y, z = surfels.quats.detach()[ids].unbind(-1)
     axis_x = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
@@ -123,10 +120,11 @@ def _moved(surfels: Surfels, pieces: Pieces) -> torch.Tensor:
 
 
 def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
-    """Read what `save_surfels_ply` wrote, bit for bit, onto the CPU. Other properties are left out.
+    """Read a file of `save_surfels_ply` onto the CPU, bit for bit. Other properties are ignored.
 
     Raises:
-        FileNotFoundError: no such file; ValueError: it is no such file, it is damaged, or values are not finite.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format, is damaged, or holds values that are not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -204,11 +202,11 @@ def _write(path: str | os.PathLike[str], columns: dict[str, torch.Tensor], comme
 
 
 def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
-    """Number of vertices, their layout, and where they start."""
+    """Return the number of vertices, their layout, and the offset of the first in bytes."""
     mark = b"end_header\n"
     end = data.find(mark, 0, LONGEST_HEADER)
     if not data.startswith(b"ply\n") or end < 0:
-        raise FormatError(f"{path}: expected a PLY file as nexwarp writes it")
+        raise FormatError(f"{path}: expected a PLY file written by nexwarp")
     lines = [line.split() for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]]
     lines = [words for words in lines if words and words[0] != "comment"]
     try:
@@ -219,7 +217,7 @@ def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
             raise ValueError(f"expected vertices, got {element} {name}")
         wrong = next((words for words in properties if words[0] != "property" or len(words) != 3), None)
         if wrong:
-            raise ValueError(f"expected one value a property, and vertices alone, got {' '.join(wrong)}")
+            raise ValueError(f"expected vertices only, with one value per property, got {' '.join(wrong)}")
         kinds = {words[1] for words in properties}
         if len(kinds) != 1 or not kinds <= TYPES.keys():
             raise ValueError(f"expected properties of one floating type, got {', '.join(sorted(kinds)) or 'none'}")

@@ -3,7 +3,7 @@
 import functools
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 import warp as wp
@@ -11,8 +11,18 @@ import warp as wp
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.native.fixed_point import HIGH, LOW
 
+# What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.
+Argument: TypeAlias = object
+
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
 STORAGES = {**REALS, torch.float16: wp.float16}
+
+
+class Context(torch.autograd.function.FunctionCtx):
+    """What torch hands from the forward to the backward pass of an op, as the type checker sees it."""
+
+    saved_tensors: tuple[torch.Tensor, ...]
+    needs_input_grad: tuple[bool, ...]
 
 
 def real_of(tensor: torch.Tensor) -> type:
@@ -23,11 +33,11 @@ def real_of(tensor: torch.Tensor) -> type:
 
 
 # Descriptors by layout: copying one costs a quarter of making it anew, and a step makes hundreds.
-_layouts: dict[tuple, Any] = {}
+_layouts: dict[tuple[object, ...], Any] = {}
 _MOST_LAYOUTS = 4096
 
 
-def array(tensor: torch.Tensor | None, dtype: type) -> Any:
+def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     """View a tensor as a Warp array argument of the given element type; None stays None."""
     if tensor is None:
         return None
@@ -39,7 +49,7 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Any:
     if layout is None:
         if len(_layouts) >= _MOST_LAYOUTS:
             _layouts.clear()
-        owner = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        owner: Any = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         # Without what it keeps alive.
         layout = _layouts[key] = type(owner).from_buffer_copy(owner)
     view = type(layout).from_buffer_copy(layout)
@@ -85,12 +95,32 @@ def launch(
     like: torch.Tensor,
     kernel: wp.Kernel,
     dim: int | tuple[int, int],
-    inputs: Sequence[Any],
-    outputs: Sequence[Any],
-    **options: Any,
+    inputs: Sequence[Argument],
+    outputs: Sequence[Argument],
+    *,
+    block_dim: int = 256,
+    align: int = 1,
+    smallest: int = launching.LIGHT_CHUNK,
+    adjoint: tuple[Sequence[Argument], Sequence[Argument]] | None = None,
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`."""
-    launching.launch(kernel, dim, inputs, outputs, device=device_of(like), stream=stream_of(like), **options)
+    launching.launch(
+        kernel,
+        dim,
+        inputs,
+        outputs,
+        device=device_of(like),
+        stream=stream_of(like),
+        block_dim=block_dim,
+        align=align,
+        smallest=smallest,
+        adjoint=adjoint,
+    )
+
+
+def uses_simd(like: torch.Tensor) -> bool:
+    """Whether stages run on a tensor's device in the form written for CPUs; see `nexwarp.kernels.launch.cpu_form`."""
+    return launching.uses_simd(device_of(like))
 
 
 def grad_like(tensor: torch.Tensor, needed: bool) -> torch.Tensor | None:
@@ -103,9 +133,9 @@ def sums_in_fixed_point(like: torch.Tensor) -> bool:
     return like.is_cuda and torch.are_deterministic_algorithms_enabled()
 
 
-def sums_like(like: torch.Tensor, shape: tuple[int, ...], fixed: bool) -> torch.Tensor:
+def sums_like(like: torch.Tensor, shape: tuple[int, ...], fixed_point: bool) -> torch.Tensor:
     """Zeros to add floats to: of the dtype of `like`, or, in fixed point, a pair of integers each (..., 2)."""
-    return like.new_zeros(*shape, 2, dtype=torch.int64) if fixed else like.new_zeros(shape)
+    return like.new_zeros(*shape, 2, dtype=torch.int64) if fixed_point else like.new_zeros(shape)
 
 
 def from_fixed_point(pairs: torch.Tensor, bad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:

@@ -1,7 +1,6 @@
 """Activation of the surfels' raw parameters."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -9,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 def activate(
@@ -43,14 +42,14 @@ def activate(
     return _Activate.apply(*(x.contiguous() for x in (raw_quats, log_scales, logit_opacities, raw_gammas)))
 
 
-def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Any]:
+def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
     t = types(real)
     return [array(x, dtype) for x, dtype in zip(tensors, (t.vec4, t.vec2, real, t.vec2), strict=True)]
 
 
 class _Activate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *raw: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Context, *raw: torch.Tensor) -> tuple[torch.Tensor, ...]:
         real = real_of(raw[0])
         activated = tuple(torch.empty_like(x) for x in raw)
         launch(raw[0], activate_kernels(real).forward, len(raw[0]), _arrays(real, raw), _arrays(real, activated))
@@ -59,7 +58,7 @@ class _Activate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         raw = ctx.saved_tensors
         real = real_of(raw[0])
         grad_raw = [torch.empty_like(x) for x in raw]

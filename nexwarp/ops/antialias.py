@@ -1,7 +1,6 @@
 """Surfels as they look from farther away than training saw them."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -9,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 def antialias(
@@ -49,14 +48,18 @@ def antialias(
     return _Widen.apply(farthest.contiguous(), float(focal), *tensors)
 
 
-def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Any]:
+def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
     """Of scalars (N,) and pairs (N, 2)."""
     return [array(x, real if x.ndim == 1 else types(real).vec2) for x in tensors]
 
 
+class _Context(Context):
+    focal: float
+
+
 class _Widen(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: _Context, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
         real = real_of(farthest)
         wide = tuple(torch.empty_like(x) for x in shape[1:])
         inputs = [*_arrays(real, (*shape, farthest)), focal]
@@ -67,7 +70,7 @@ class _Widen(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         *shape, farthest = ctx.saved_tensors
         real = real_of(farthest)
         found = [torch.empty_like(x) for x in shape]

@@ -1,7 +1,6 @@
-"""Collection pass: the K heaviest hits of every pixel, their plain colour, and that of all others."""
+"""Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import warp as wp
@@ -10,12 +9,22 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
-from nexwarp.kernels.cpu.collect import collect_rows_backward_kernel, collect_rows_kernel, row_lanes
-from nexwarp.kernels.reduce import reduce_rows_kernel
+from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel, strip_width
+from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.walk import BLOCK_DIM
-from nexwarp.ops._interop import array, from_fixed_point, launch, real_of, sums_in_fixed_point, sums_like
+from nexwarp.ops._interop import (
+    Argument,
+    Context,
+    array,
+    from_fixed_point,
+    launch,
+    real_of,
+    sums_in_fixed_point,
+    sums_like,
+    uses_simd,
+)
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 from nexwarp.ops.tiles import Tiles
@@ -39,7 +48,7 @@ class Hits:
     """What the collection pass found.
 
     Attributes:
-        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 4); differentiable.
+        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6); differentiable.
         base: (H, W, 3) the same sum over the hits in the buffer: their colour without a texture; differentiable.
         ids: (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots.
         depths: (H, W, K) z-depths in world units, 0 in empty slots; differentiable.
@@ -77,7 +86,8 @@ def collect(
     buffers = _Collect.apply(
         projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, request
     )
-    return Hits(*buffers, request)
+    plain, base, ids, depths, weights, alpha, stops = buffers
+    return Hits(plain, base, ids, depths, weights, alpha, stops, request)
 
 
 def splat_error(
@@ -105,35 +115,24 @@ def splat_error(
     check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
     records = projection.records.detach()
     real = real_of(records)
-    rows, slots = _rows(tiles, records)
-    fixed = sums_in_fixed_point(records)
-    sums = sums_like(records, (slots,), fixed)
-    inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
+    sums = _SlotSums(records, tiles)
+    slots = sums.new()
     errors = errors.detach().to(records.dtype).contiguous()
-    inputs += [array(rows, wp.int32), array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
-    kernel = splat_error_kernel(real, low_pass, tiles.tile_size, fixed)
-    if fixed:
-        bad = torch.zeros(1, dtype=torch.int32, device=records.device)
-        launch_walk(records, kernel, tiles, inputs, [array(sums, wp.int64), array(bad, wp.int32)])
-        sums = from_fixed_point(sums, bad, records.dtype)
-    else:
-        launch_walk(records, kernel, tiles, inputs, [array(sums, real), None])
-    return _reduce(sums[:, None], tiles, len(records), real)[:, 0]
+    inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
+    inputs += [sums.slots, array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
+    kernel = splat_error_kernel(real, low_pass, tiles.tile_size, sums.fixed_point)
+    launch_walk(records, kernel, tiles, inputs, [sums.array(slots, real), sums.bad_array])
+    return sums.reduce(slots[:, None], real)[:, 0]
 
 
 def launch_walk(
-    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Any], outputs: list[Any], lanes: int = 1
+    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Argument], outputs: list[Argument], width: int = 1
 ) -> None:
-    """Launch a kernel over the pixels of all tiles, `lanes` of them a thread."""
-    threads = tiles.tile_size**2 // lanes
+    """Launch a kernel over the pixels of all tiles, `width` of them a thread."""
+    threads = tiles.tile_size**2 // width
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    options = {"block_dim": BLOCK_DIM, "align": threads, "smallest": threads}
-    launch(like, kernel, (len(tiles.tile_offsets) - 1) * threads, inputs, outputs, **options)
-
-
-def _rows_a_thread(like: torch.Tensor) -> bool:
-    """Whether a thread walks with a row of pixels, as pays on a CPU, or with one pixel."""
-    return like.device.type == "cpu"
+    count = (len(tiles.tile_offsets) - 1) * threads
+    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=threads, smallest=threads)
 
 
 def walk_inputs(
@@ -142,7 +141,7 @@ def walk_inputs(
     limits: torch.Tensor,
     tiles: Tiles,
     camera: Pinhole,
-) -> list[Any]:
+) -> list[Argument]:
     """Arguments that the kernels share, from `records` to `near`."""
     t = types(real_of(records))
     return [
@@ -157,27 +156,53 @@ def walk_inputs(
     ]
 
 
-def _rows(tiles: Tiles, records: torch.Tensor) -> tuple[torch.Tensor | None, int]:
-    """Row that each entry's gradient goes to, and how many rows: by entry on a CPU; None is by surfel, on CUDA."""
-    if tiles.exact:
-        return tiles.entries, len(tiles.entries)
-    return None, len(records)
+class _SlotSums:
+    """Where a walk adds up what it finds for each surfel.
+
+    On a CPU each (tile, surfel) entry has a slot, which one thread owns, and `reduce` adds up each surfel's slots in a
+    fixed order. On CUDA, and on a CPU with lists of a given capacity, each surfel has one slot, to which all its pixels
+    add by atomics: in fixed point, if the order must not matter.
+    """
+
+    def __init__(self, like: torch.Tensor, tiles: Tiles) -> None:
+        self.like, self.tiles = like, tiles
+        self.count = len(tiles.entries) if tiles.exact else len(like)
+        self.slots = array(tiles.entries if tiles.exact else None, wp.int32)
+        self.fixed_point = sums_in_fixed_point(like)
+        self.bad = torch.zeros(1, dtype=torch.int32, device=like.device) if self.fixed_point else None
+        self.bad_array = array(self.bad, wp.int32)
+
+    def new(self, *shape: int) -> torch.Tensor:
+        """Zeros (slots, *shape), in fixed point (slots, *shape, 2)."""
+        return sums_like(self.like, (self.count, *shape), self.fixed_point)
+
+    def array(self, slots: torch.Tensor | None, dtype: type) -> Argument:
+        """View what `new` returned as the kernels do: (slots, ...) of `dtype`, in fixed point (slots, integers)."""
+        if slots is not None and self.fixed_point:
+            return array(slots.view(len(slots), -1), wp.int64)
+        return array(slots, dtype)
+
+    def reduce(self, slots: torch.Tensor, dtype: type) -> torch.Tensor:
+        """Return each surfel's sum (N, columns, ...) of slots (slots, columns, ...), a column being a `dtype`."""
+        if self.bad is not None:
+            slots = from_fixed_point(slots, self.bad, self.like.dtype)
+        if not self.tiles.exact:
+            return slots
+        sums = slots.new_zeros(len(self.like), *slots.shape[1:])
+        order, ends = (array(x, wp.int32) for x in (self.tiles.order, self.tiles.ends))
+        inputs = [order, ends, array(slots, dtype), slots.shape[1]]
+        launch(slots, reduce_slots_kernel(dtype), len(self.like), inputs, [array(sums, dtype)])
+        return sums
 
 
-def _reduce(slots: torch.Tensor, tiles: Tiles, count: int, dtype: type) -> torch.Tensor:
-    """Add up each surfel's rows; on CUDA they already are. A row is (columns,) elements of `dtype`."""
-    if not tiles.exact:
-        return slots
-    sums = slots.new_zeros(count, *slots.shape[1:])
-    inputs = [array(tiles.order, wp.int32), array(tiles.ends, wp.int32), array(slots, dtype), slots.shape[1]]
-    launch(slots, reduce_rows_kernel(dtype), count, inputs, [array(sums, dtype)])
-    return sums
+class _Context(Context):
+    rest: tuple[Tiles, Pinhole, int, bool, SplatErrorRequest]
 
 
 class _Collect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
+        ctx: _Context,
         records: torch.Tensor,
         centers: torch.Tensor,
         limits: torch.Tensor,
@@ -195,20 +220,20 @@ class _Collect(torch.autograd.Function):
         alphas = records.new_empty(shape)
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
         outputs = [
-            array(plain.view(-1, 3), types(real).vec3),
-            array(base.view(-1, 3), types(real).vec3),
-            array(ids.view(-1, max_hits) if max_hits else ids.new_empty(1, 1), wp.int32),
-            array(depths.view(-1, max_hits) if max_hits else depths.new_empty(1, 1), real),
-            array(weights.view(-1, max_hits) if max_hits else weights.new_empty(1, 1), real),
+            *(array(x.view(-1, 3), types(real).vec3) for x in (plain, base)),
+            _buffer_array(ids, wp.int32),
+            _buffer_array(depths, real),
+            _buffer_array(weights, real),
             array(alphas.view(-1), real),
             array(stops.view(-1), wp.int32),
         ]
         inputs = [*walk_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
-        if _rows_a_thread(records):
-            kernel = collect_rows_kernel(real, max_hits, low_pass, tiles.tile_size)
-            launch_walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
+        variant = (real, max_hits, low_pass, tiles.tile_size)
+        if uses_simd(records):
+            width = strip_width(tiles.tile_size)
+            launch_walk(records, collect_simd_kernel(*variant), tiles, inputs, outputs, width)
         else:
-            launch_walk(records, collect_kernel(real, max_hits, low_pass, tiles.tile_size), tiles, inputs, outputs)
+            launch_walk(records, collect_kernel(*variant), tiles, inputs, outputs)
         ctx.save_for_backward(records, centers, limits, plain, base, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, request)
@@ -217,7 +242,7 @@ class _Collect(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any,
+        ctx: _Context,
         grad_plain: torch.Tensor,
         grad_base: torch.Tensor,
         _ids: None,
@@ -230,56 +255,41 @@ class _Collect(torch.autograd.Function):
         tiles, camera, max_hits, low_pass, request = ctx.rest
         real = real_of(records)
         t = types(real)
-        slots = max(max_hits, 1)
-
-        def buffer(tensor: torch.Tensor, dtype: type) -> Any:
-            return array(tensor.contiguous().view(-1, slots) if max_hits else tensor.new_empty(1, 1), dtype)
-
-        rows, count = _rows(tiles, records)
-        # Where rows are by surfel, many warps add to one: in fixed point, if their order must not matter.
-        fixed = sums_in_fixed_point(records)
-        grad_rows = sums_like(records, (count, 4, 4), fixed)
-        # Centres carry a gradient only through the low-pass.
-        grad_center_rows = sums_like(centers, (count if low_pass else 1, 3), fixed)
+        sums = _SlotSums(records, tiles)
         inputs = [
             *walk_inputs(records, centers, limits, tiles, camera),
             array(tiles.reaches, t.vec2),
-            array(rows, wp.int32),
-            array(plain.view(-1, 3), t.vec3),
-            array(base.view(-1, 3), t.vec3),
-            buffer(ids, wp.int32),
-            buffer(weights, real),
+            sums.slots,
+            *(array(x.view(-1, 3), t.vec3) for x in (plain, base)),
+            _buffer_array(ids, wp.int32),
+            _buffer_array(weights, real),
             array(alphas.view(-1), real),
             array(stops.view(-1), wp.int32),
-            array(grad_plain.contiguous().view(-1, 3), t.vec3),
-            array(grad_base.contiguous().view(-1, 3), t.vec3),
-            buffer(grad_depths, real),
-            buffer(grad_weights, real),
+            *(array(x.contiguous().view(-1, 3), t.vec3) for x in (grad_plain, grad_base)),
+            *(_buffer_array(x.contiguous(), real) for x in (grad_depths, grad_weights)),
             array(grad_alphas.contiguous().view(-1), real),
             array(None if request.errors is None else request.errors.view(-1), real),
         ]
-        error_rows = None if request.errors is None else sums_like(records, (count,), fixed)
         variant = (real, max_hits, low_pass, tiles.tile_size, request.errors is not None)
-        if fixed:
-            bad = torch.zeros(1, dtype=torch.int32, device=records.device)
-            sums = (grad_rows, grad_center_rows, error_rows)
-            outputs = [None if x is None else array(x.view(len(x), -1), wp.int64) for x in sums]
-            kernel = collect_backward_kernel(*variant, fixed=True)
-            launch_walk(records, kernel, tiles, inputs, [*outputs, array(bad, wp.int32)])
-            grad_rows, grad_center_rows, error_rows = (
-                None if x is None else from_fixed_point(x, bad, records.dtype) for x in sums
-            )
+        grad_records = sums.new(4, 4)
+        # Centres carry a gradient only through the low-pass.
+        grad_centers = sums.new(3) if low_pass else None
+        error_sums = None if request.errors is None else sums.new()
+        outputs = [sums.array(grad_records, t.vec4), sums.array(grad_centers, t.vec3), sums.array(error_sums, real)]
+        if uses_simd(records) and not sums.fixed_point:
+            width = strip_width(tiles.tile_size)
+            launch_walk(records, collect_simd_backward_kernel(*variant), tiles, inputs, outputs, width)
         else:
-            outputs = [array(grad_rows, t.vec4), array(grad_center_rows, t.vec3), array(error_rows, real)]
-            if _rows_a_thread(records):
-                kernel = collect_rows_backward_kernel(*variant)
-                launch_walk(records, kernel, tiles, inputs, outputs, row_lanes(tiles.tile_size))
-            else:
-                launch_walk(records, collect_backward_kernel(*variant), tiles, inputs, [*outputs, None])
-        if error_rows is not None:
-            request.sums_after_backward = _reduce(error_rows[:, None], tiles, len(records), real)[:, 0]
-        grad_records = _reduce(grad_rows, tiles, len(records), t.vec4)
-        grad_centers = None
-        if low_pass:
-            grad_centers = _reduce(grad_center_rows[:, None], tiles, len(records), t.vec3)[:, 0]
+            kernel = collect_backward_kernel(*variant, sums.fixed_point)
+            launch_walk(records, kernel, tiles, inputs, [*outputs, sums.bad_array])
+        if error_sums is not None:
+            request.sums_after_backward = sums.reduce(error_sums[:, None], real)[:, 0]
+        grad_records = sums.reduce(grad_records, t.vec4)
+        if grad_centers is not None:
+            grad_centers = sums.reduce(grad_centers[:, None], t.vec3)[:, 0]
         return grad_records, grad_centers, *(None,) * 6
+
+
+def _buffer_array(buffer: torch.Tensor, dtype: type) -> Argument:
+    """View a K-buffer (H, W, K) as the kernels do, (H * W, K); K = 0 gives one unused element."""
+    return array(buffer.view(-1, buffer.shape[-1]) if buffer.shape[-1] else buffer.new_empty(1, 1), dtype)

@@ -1,13 +1,11 @@
 """Composition of the passes into one image."""
 
-from typing import Any
-
 import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.compose import compose_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, grad_like, launch, real_of
 
 
 def compose(
@@ -18,7 +16,7 @@ def compose(
     background: torch.Tensor,
     base: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Add up the passes (paper Eq. 5); differentiable in every argument.
+    """Add up the passes (paper Eq. 7); differentiable in every argument.
 
     Args:
         plain: (H, W, 3) colour of the hits outside the buffer.
@@ -36,7 +34,7 @@ def compose(
     return _Compose.apply(*(None if x is None else x.contiguous() for x in inputs))
 
 
-def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
+def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Argument]:
     vec3 = types(real).vec3
     plain, base, colors, weights, alpha, background = tensors
 
@@ -56,18 +54,20 @@ def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Any]:
 
 class _Compose(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        plain = inputs[0]
+    def forward(ctx: Context, plain: torch.Tensor, *others: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        inputs = (plain, *others)
         real = real_of(plain)
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
         outputs = [array(x.view(-1, 3), types(real).vec3) for x in (image, textured)]
         launch(plain, compose_kernel(real), plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs)
-        ctx.save_for_backward(*inputs)
+        ctx.save_for_backward(*inputs)  # type: ignore[arg-type]  # torch saves None too
         return image, textured
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_image: torch.Tensor, grad_textured: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(
+        ctx: Context, grad_image: torch.Tensor, grad_textured: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         plain, alpha = inputs[0], inputs[4]
         real = real_of(plain)

@@ -1,7 +1,6 @@
 """The losses that compare pixel by pixel, several in one go."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -9,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.photometric import photometric_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 Factors = tuple[float, float, float]
 
@@ -43,31 +42,35 @@ def photometric_terms(
     Raises:
         ValueError: a shape or device does not fit, or `target` requires a gradient, which it would not get.
     """
-    wanted = {
+    wanted: dict[str, tuple[torch.Tensor | None, tuple[int | str, ...], float]] = {
         "image": (image, ("H", "W", 3), l1),
         "textured": (textured, ("H", "W", 3), texture),
         "weights": (weights, ("H", "W", "K"), texture or alpha),
         "target": (target, ("H", "W", 3), l1 or texture),
     }
-    read = {name: (tensor, shape) for name, (tensor, shape, factor) in wanted.items() if factor}
+    read = {name: (tensor, shape) for name, (tensor, shape, factor) in wanted.items() if factor and tensor is not None}
     if not read:
         return None, None, None
     check_tensors(read)
-    if "target" in read and target.requires_grad:
+    if "target" in read and read["target"][0].requires_grad:
         raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
-    tensors = [tensor.contiguous() if name in read else None for name, (tensor, _, _) in wanted.items()]
+    tensors = [read[name][0].contiguous() if name in read else None for name in wanted]
     return _Photometric.apply((l1, texture, alpha), *tensors)
 
 
-def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Any]:
+def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Argument]:
     """View image, textured, weights and any more images, (H, W, ...) each, as arrays of pixels."""
     flat = [None if x is None else x.view(x.shape[0] * x.shape[1], x.shape[2]) for x in tensors]
     return [array(x, real if i == 2 else types(real).vec3) for i, x in enumerate(flat)]
 
 
+class _Context(Context):
+    scales: tuple[float, float, float]
+
+
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, factors: Factors, *tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+    def forward(ctx: _Context, factors: Factors, *tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
         ctx.scales = (factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
@@ -76,14 +79,14 @@ class _Photometric(torch.autograd.Function):
         outputs = [array(next(rows), real) if factor else None for factor in factors]
         inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales)]
         launch(like, photometric_kernels(real).forward, pixels, inputs, outputs)
-        ctx.save_for_backward(*tensors)
+        ctx.save_for_backward(*tensors)  # type: ignore[arg-type]  # torch saves None too
         ctx.set_materialize_grads(False)
         sums = iter(maps.sum(1).unbind())
         return tuple(next(sums) if factor else None for factor in factors)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: _Context, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         tensors = ctx.saved_tensors
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]

@@ -1,7 +1,6 @@
 """Projection of surfels into a camera's frame."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -9,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.project import project_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, grad_like, launch, real_of
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def project(
     return Projection(*_Project.apply(*(x.contiguous() for x in tensors)))
 
 
-def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Any]:
+def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Argument]:
     t = types(real)
     dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2, t.vec3, t.mat44)
     return [array(x, dtype) for x, dtype in zip(tensors, dtypes, strict=True)]
@@ -73,7 +72,7 @@ def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Any]:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Context, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         means = inputs[0]
         real = real_of(means)
         t = types(real)
@@ -95,7 +94,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, grad_records: torch.Tensor, grad_centers: torch.Tensor, _limits: None
+        ctx: Context, grad_records: torch.Tensor, grad_centers: torch.Tensor, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:
         inputs = ctx.saved_tensors
         means, viewmat = inputs[0], inputs[6]
@@ -116,4 +115,4 @@ class _Project(torch.autograd.Function):
             outputs,
             adjoint=([*_arrays(real, (*grads, grad_viewmats)), None], adjoint_outputs),
         )
-        return (*grads, grad_viewmats.sum(0) if step else None)
+        return (*grads, None if grad_viewmats is None else grad_viewmats.sum(0))

@@ -1,14 +1,12 @@
 """Plain colours of surfels from spherical harmonics."""
 
-from typing import Any
-
 import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops._interop import Context, array, launch, real_of, uses_simd
 
 
 def plain_colors(
@@ -45,10 +43,14 @@ def plain_colors(
     return _PlainColors.apply(*(x.contiguous() for x in (sh0, shN, means, position)), degree)
 
 
+class _Context(Context):
+    degree: int
+
+
 class _PlainColors(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
+        ctx: _Context, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
     ) -> torch.Tensor:
         real = real_of(means)
         vec3 = types(real).vec3
@@ -61,7 +63,7 @@ class _PlainColors(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: _Context, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         shN, means, position, colors = ctx.saved_tensors
         need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad
         real, count = real_of(means), len(means)
@@ -72,9 +74,9 @@ class _PlainColors(torch.autograd.Function):
         if need_sh0 or need_shN:
             grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
             # Memory is what counts on CUDA, arithmetic on a CPU.
-            lanes = 1 if means.device.type == "cpu" else shN.shape[1] + 1
+            sharing = 1 if uses_simd(means) else shN.shape[1] + 1
             outputs = [array(x, vec3) for x in (grad_sh0, grad_shN)]
-            launch(means, kernels.coefficients_backward, count * lanes, [lanes, *seen], outputs)
+            launch(means, kernels.coefficients_backward, count * sharing, [sharing, *seen], outputs)
         if need_means or need_position:
             grad_means = torch.empty_like(means)
             launch(means, kernels.rays_backward, count, [array(shN, vec3), *seen], [array(grad_means, vec3)])

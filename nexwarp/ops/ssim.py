@@ -1,14 +1,12 @@
 """Structural dissimilarity of two images."""
 
-from typing import Any
-
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.checks import check_tensors
-from nexwarp.kernels.ssim import LANES, PAD, rows_a_thread, ssim_kernels
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.kernels.ssim import PAD, SIMD_WIDTH, rows_a_thread, ssim_kernels
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of, uses_simd
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
@@ -34,28 +32,30 @@ class _Blocks:
     def __init__(self, image: torch.Tensor) -> None:
         real = real_of(image)
         self.height, self.width = image.shape[0], 3 * image.shape[1]
-        self.lanes = LANES if image.device.type == "cpu" and self.width >= LANES else 1
-        self.kernels = ssim_kernels(real, self.lanes)
-        self.dtype = wp.types.vector(length=self.lanes, dtype=real)
+        self.length = SIMD_WIDTH if uses_simd(image) and self.width >= SIMD_WIDTH else 1
+        self.kernels = ssim_kernels(real, self.length)
+        self.dtype = wp.types.vector(length=self.length, dtype=real)
         self.padded_size = self.height * (self.width + 2 * PAD)
 
-    def array(self, values: torch.Tensor | None) -> Any:
-        """View (n,) or (M, n) contiguous values as blocks, one at every address: (n - lanes + 1,) or (M, ...)."""
-        return None if values is None else array(values.unfold(-1, self.lanes, 1), self.dtype)
+    def array(self, values: torch.Tensor | None) -> Argument:
+        """View (n,) or (M, n) contiguous values as blocks, one at every address: (n - length + 1,) or (M, ...)."""
+        return None if values is None else array(values.unfold(-1, self.length, 1), self.dtype)
 
     def blur_columns(self, kernel: wp.Kernel, *sources: torch.Tensor) -> torch.Tensor:
         """Launch `moments` on two images or `blur` on three maps, (n,) each: (4 or 3, padded_size)."""
         blurred = sources[0].new_empty(4 if len(sources) == 2 else 3, self.padded_size)
-        blocks = -(-self.width // self.lanes) + 2 * PAD // self.lanes
-        groups = -(-self.height // rows_a_thread(self.lanes))
+        blocks = -(-self.width // self.length) + 2 * PAD // self.length
+        groups = -(-self.height // rows_a_thread(self.length))
         inputs = [self.array(sources[i] if i < len(sources) else None) for i in range(3)]
         inputs += [self.height, self.width]
         launch(blurred, kernel, groups * blocks, inputs, [self.array(blurred)], align=blocks, smallest=blocks)
         return blurred
 
-    def blur_rows(self, kernel: wp.Kernel, blurred: torch.Tensor, inputs: list[Any], outputs: list[Any]) -> None:
+    def blur_rows(
+        self, kernel: wp.Kernel, blurred: torch.Tensor, inputs: list[Argument], outputs: list[Argument]
+    ) -> None:
         """Launch `score` or `gradient` on what `blur_columns` returned."""
-        blocks = -(-self.width // self.lanes)
+        blocks = -(-self.width // self.length)
         launch(
             blurred,
             kernel,
@@ -67,9 +67,13 @@ class _Blocks:
         )
 
 
+class _Context(Context):
+    scale: float
+
+
 class _DSSIM(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
+    def forward(ctx: _Context, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
         b = _Blocks(image)
         moments = b.blur_columns(b.kernels.moments, image.view(-1), target.view(-1))
         losses = image.new_empty(image.numel())
@@ -82,7 +86,7 @@ class _DSSIM(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+    def backward(ctx: _Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         image, target, derivatives = ctx.saved_tensors
         b = _Blocks(image)
         blurred = b.blur_columns(b.kernels.blur, *derivatives)

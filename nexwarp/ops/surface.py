@@ -51,7 +51,7 @@ def surface(
     expected, median, top = (records.new_empty(camera.height, camera.width) for _ in range(3))
     normals = records.new_empty(camera.height, camera.width, 3)
     inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
-    inputs.append(array(hits.stops.view(-1), wp.int32))
+    inputs += [array(tiles.reaches, types(real).vec2), array(hits.stops.view(-1), wp.int32)]
     outputs = [array(x.view(-1), real) for x in (expected, median, top)]
     outputs.append(array(normals.view(-1, 3), types(real).vec3))
     launch_walk(records, surface_kernel(real, low_pass, tiles.tile_size), tiles, inputs, outputs)

@@ -8,12 +8,11 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.cpu.hashgrid import LANES as ROW
-from nexwarp.kernels.cpu.hashgrid import hashgrid_rows_kernels
+from nexwarp.kernels.cpu.hashgrid import WIDTH, hashgrid_simd_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point
+from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point, uses_simd
 from nexwarp.ops.columns import parts_of, share_columns
 
 # Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
@@ -49,7 +48,7 @@ def texture(
         grid: (L, T, F) features, T a power of two, F in 1, 2, 4, 8.
         weights: the MLP's matrices (out, in), ReLU between them, no biases; 3 (d + 1)^2 outputs for SH degree d.
         resolutions: (L,) cells per world unit.
-        focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 2.
+        focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 4.
         directions: (P, 3) unit directions, world, where n = P * K and point i belongs to direction i // K.
         offset: colour of coefficients of 0; 0 makes them residuals.
         clamp: limit colours to >= 0.
@@ -92,7 +91,7 @@ class _Texture(torch.autograd.Function):
         launch(
             positions,
             kernels.forward,
-            (grid.shape[0], -(-count // ROW) if _rows_a_thread(positions) else count),
+            (grid.shape[0], _groups(positions)),
             arguments,
             [array(encoded, STORAGES[dtype])],
         )
@@ -246,13 +245,13 @@ def _lookup(
         array(focal, real),
         wp.uint32(size - 1),
     ]
-    make = hashgrid_rows_kernels if _rows_a_thread(positions) else hashgrid_kernels
+    make = hashgrid_simd_kernels if uses_simd(positions) else hashgrid_kernels
     return make(real, storage, features), arguments
 
 
-def _rows_a_thread(like: torch.Tensor) -> bool:
-    """Whether a thread takes one level of a row of points, as pays on a CPU, or one point."""
-    return like.device.type == "cpu"
+def _groups(positions: torch.Tensor) -> int:
+    """Threads a level: one for each point, in the SIMD form one for WIDTH of them."""
+    return -(-len(positions) // WIDTH) if uses_simd(positions) else len(positions)
 
 
 def _lookup_backward(
@@ -266,34 +265,34 @@ def _lookup_backward(
     need_points: bool,
 ) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
     real = real_of(positions)
+    vec4 = types(real).vec4
     levels, _, features = table.shape
-    count = len(positions)
-    fixed = sums_in_fixed_point(positions)
-    grad_grid = torch.zeros_like(table, dtype=torch.int64 if fixed else positions.dtype)
-    # On a CPU a run of levels has its slots, since its thread owns their tables; on CUDA a thread takes all levels.
-    rows = _rows_a_thread(positions)
-    run = -(-levels // RUNS)
-    runs = -(-levels // run)
-    grad_points = positions.new_empty((runs if rows else 1) if need_points else 0, count, 4)
+    fixed_point = sums_in_fixed_point(positions)
+    # On a CPU a thread owns the tables of its run of levels; on CUDA a thread takes all levels.
+    levels_per_thread = levels if positions.is_cuda else -(-levels // RUNS)
+    runs = -(-levels // levels_per_thread)
+    grad_points = positions.new_empty(runs if need_points else 0, len(positions), 4)
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
-    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real), *([run] * rows)]
-    points_out = array(grad_points if rows else grad_points.view(-1, 4), types(real).vec4)
-    threads = (runs, -(-count // ROW)) if rows else count
-    if fixed:
+    arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real)]
+    threads = (runs, _groups(positions))
+    if fixed_point:
+        kernel = hashgrid_kernels(real, STORAGES[table.dtype], features, fixed_point=True).backward
         units = _units(grad_encoded, unscale)
         bad = torch.zeros(1, dtype=torch.int32, device=table.device)
-        outputs = [array(grad_grid.view(levels, -1), wp.int64), points_out, array(bad, wp.int32)]
-        backward = hashgrid_kernels(real, STORAGES[table.dtype], features, fixed=True).backward
-        launch(positions, backward, threads, [*arguments, array(units, wp.float64)], outputs)
-        grad_grid = torch.where(bad.bool(), torch.nan, (grad_grid.double() / units).to(positions.dtype))
+        sums = torch.zeros_like(table, dtype=torch.int64)
+        outputs = [array(sums.view(levels, -1), wp.int64), array(grad_points, vec4), array(bad, wp.int32)]
+        launch(positions, kernel, threads, [*arguments, array(units, wp.float64), levels_per_thread], outputs)
+        grad_grid = torch.where(bad.bool(), torch.nan, (sums.double() / units).to(positions.dtype))
     else:
-        outputs = [array(grad_grid, wp.types.vector(length=features, dtype=real)), points_out]
-        if not rows:
-            arguments, outputs = [*arguments, None], [*outputs, None]
-        launch(positions, kernels.backward, threads, arguments, outputs)
+        grad_grid = torch.zeros_like(table, dtype=positions.dtype)
+        outputs = [array(grad_grid, wp.types.vector(length=features, dtype=real)), array(grad_points, vec4)]
+        if uses_simd(positions):
+            launch(positions, kernels.backward, threads, [*arguments, levels_per_thread], outputs)
+        else:
+            launch(positions, kernels.backward, threads, [*arguments, None, levels_per_thread], [*outputs, None])
     if not need_points:
         return grad_grid, None, None
-    points = grad_points.sum(0) if rows else grad_points[0]
+    points = grad_points.sum(0) if runs > 1 else grad_points[0]
     return grad_grid, points[:, :3], points[:, 3]
 
 

@@ -1,7 +1,6 @@
 """Tile lists: which surfels may be seen in which tile of the image, near to far."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import warp as wp
@@ -12,19 +11,19 @@ from nexwarp.kernels.tiles import (
     MAX_ENTRIES,
     check_entries,
     depth_keys_kernel,
-    footprint_kernel,
     list_kernels,
     surfel_ids_kernel,
     tile_offsets_kernel,
+    tile_polygon_kernel,
 )
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch, real_of, stream_of, warp_streams
+from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, uses_simd, warp_streams
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
-LANES = 8
+SHARING = 8
 
 
 @dataclass(frozen=True)
@@ -114,41 +113,34 @@ def intersect_tiles(
         raise ValueError(f"tile_size: expected a multiple of 8, got {tile_size}")
     tensors = [x.detach().contiguous() for x in (means, quats, scales, opacities, gammas)]
     real, count = real_of(means), len(means)
-    t = types(real)
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
-    order = _depth_order(projection.centers.detach(), t)
+    order = _depth_order(projection.centers.detach())
     kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
-    footprints, reaches = _footprints(tensors, viewmat, camera, low_pass, tile_size)
-    lanes = 1 if means.device.type == "cpu" else LANES
-    arguments = [array(order, wp.int32), *footprints, wp.vec2i(columns, rows), lanes]
-    counts = torch.empty(count * lanes, dtype=torch.int32, device=means.device)
-    launch(means, kernels.count, count * lanes, arguments, [array(counts, wp.int32)])
-    # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
-    total = counts.sum().clamp_max(LARGEST_INT).view(1) if count * columns * rows > LARGEST_INT else None
-    _scan(counts)
-    ends = counts[lanes - 1 :: lanes]
-    if total is not None:
-        ends[-1:] = total
+    polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
+    sharing = 1 if uses_simd(means) else SHARING
+    arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows), sharing]
+    counts = torch.empty(count * sharing, dtype=torch.int32, device=means.device)
+    launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)])
+    ends = _ends(counts, sharing, most=count * columns * rows)
     exact = means.device.type == "cpu" and room is None
     if room is None:
         room = _total(ends, columns * rows) if exact else _room(ends, kind)
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    fill = {"dtype": torch.int32, "device": means.device}
-    entries, tile_ids = torch.zeros(2 * room, **fill), torch.full((2 * room,), columns * rows, **fill)
-    surfels, surfel_ids = torch.zeros(room, **fill), torch.empty(room, **fill)
+    entries, tile_ids = order.new_zeros(2 * room), order.new_full((2 * room,), columns * rows)
+    surfels, surfel_ids = order.new_zeros(room), order.new_empty(room)
     emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
-    launch(means, kernels.emit, count * lanes, [*arguments, array(counts, wp.int32)], emitted)
+    launch(means, kernels.emit, count * sharing, [*arguments, array(counts, wp.int32)], emitted)
     _sort(tile_ids, entries, room, (columns * rows).bit_length())
     launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
-    offsets = torch.empty(columns * rows + 1, **fill)
+    offsets = order.new_empty(columns * rows + 1)
     launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
     return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact, kind)
 
 
-def _footprints(
+def _tile_polygons(
     shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, low_pass: bool, tile_size: int
-) -> tuple[list[Any], torch.Tensor]:
-    """The supports' polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
+) -> tuple[list[Argument], torch.Tensor]:
+    """The tile polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
     like, count = shape[0], len(shape[0])
     real = real_of(like)
     t = types(real)
@@ -163,14 +155,15 @@ def _footprints(
     reaches, corners = like.new_empty(count, 2), like.new_empty(count, MAX_CORNERS, 2)
     shapes = torch.empty(count, 3, dtype=torch.int32, device=like.device)
     margins, discs = like.new_empty(count), like.new_empty(count if low_pass else 1, 3)
-    footprints = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
-    kernel = footprint_kernel(real, low_pass, tile_size)
-    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *footprints])
-    return footprints, reaches
+    polygons = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
+    kernel = tile_polygon_kernel(real, low_pass, tile_size)
+    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *polygons])
+    return polygons, reaches
 
 
-def _depth_order(centers: torch.Tensor, t: Any) -> torch.Tensor:
+def _depth_order(centers: torch.Tensor) -> torch.Tensor:
     """Indices of surfels by signed depth, ties by index (the sort is stable)."""
+    t = types(real_of(centers))
     count = len(centers)
     keys, order = (torch.empty(2 * count, dtype=torch.int32, device=centers.device) for _ in range(2))
     outputs = [array(keys, wp.uint32), array(order, wp.int32)]
@@ -179,13 +172,24 @@ def _depth_order(centers: torch.Tensor, t: Any) -> torch.Tensor:
     return order[:count]
 
 
+def _ends(counts: torch.Tensor, sharing: int, most: int) -> torch.Tensor:
+    """Turn counts, `sharing` a surfel, into the ends of the surfels' entries, in place; `most` bounds their number."""
+    # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
+    total = counts.sum().clamp_max(LARGEST_INT).view(1) if most > LARGEST_INT else None
+    _scan(counts)
+    ends = counts[sharing - 1 :: sharing]
+    if total is not None:
+        ends[-1:] = total
+    return ends
+
+
 def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> None:
     """Sort the first `count` pairs by the low `bits` bits of their keys, stably, in place."""
     if count == 0:
         return
-    arrays = [wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)]
+    sorted_keys, sorted_values = wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
-        wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
+        wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)  # type: ignore[arg-type]  # no ctypes
 
 
 def _scan(counts: torch.Tensor) -> None:
@@ -194,7 +198,7 @@ def _scan(counts: torch.Tensor) -> None:
         return
     ends = wp.from_torch(counts, dtype=wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
-        wp.utils.array_scan(ends, ends, inclusive=True)
+        wp.utils.array_scan(ends, ends, inclusive=True)  # type: ignore[arg-type]  # no ctypes
 
 
 def _total(ends: torch.Tensor, tiles: int) -> int:
@@ -210,10 +214,10 @@ class _Need:
     copied: torch.cuda.Event
 
 
-_needs: dict[tuple, _Need] = {}
+_needs: dict[tuple[object, ...], _Need] = {}
 
 
-def _room(ends: torch.Tensor, kind: tuple) -> int:
+def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     """Entries to make room for on CUDA: what such renderings needed so far, and half as much again.
 
     Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
@@ -230,8 +234,8 @@ def _room(ends: torch.Tensor, kind: tuple) -> int:
             raise RuntimeError("expected a rendering of its kind before one is captured")
         return need.room
     arrived = need is not None and need.copied.query()
-    if arrived and int(need.total) > MAX_ENTRIES:
-        # That one was right, but no list is as long: look again whether this one's may be made.
+    if need is not None and arrived and int(need.total) > MAX_ENTRIES:
+        # That rendering was right, but no list can be as long: count again whether this one's can be made.
         del _needs[key]
         need = None
     if need is None:

@@ -1,13 +1,11 @@
 """World positions of hits and directions of rays."""
 
-from typing import Any
-
 import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernel
-from nexwarp.ops._interop import array, grad_like, launch, real_of
+from nexwarp.ops._interop import Context, array, grad_like, launch, real_of
 from nexwarp.ops.pinhole import Pinhole
 
 
@@ -26,10 +24,14 @@ def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> t
     return _Unproject.apply(depths.contiguous(), viewmat.contiguous(), camera)
 
 
+class _Context(Context):
+    camera: Pinhole
+
+
 class _Unproject(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
+        ctx: _Context, depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
     ) -> tuple[torch.Tensor, torch.Tensor]:
         positions = depths.new_empty(*depths.shape, 3)
         directions = depths.new_empty(*depths.shape[:2], 3)
@@ -45,7 +47,7 @@ class _Unproject(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
+        ctx: _Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         depths, viewmat = ctx.saved_tensors
         need_depths, step, _ = ctx.needs_input_grad
@@ -55,7 +57,7 @@ class _Unproject(torch.autograd.Function):
         viewmats = viewmat.expand(pixels, 4, 4) if step else viewmat[None]
         grads = (grad_positions, None if grad_directions is None else grad_directions.contiguous())
         _launch(depths, viewmats, int(step), ctx.camera, grads, (grad_depths, grad_viewmats))
-        return grad_depths, grad_viewmats.sum(0) if step else None, None
+        return grad_depths, None if grad_viewmats is None else grad_viewmats.sum(0), None
 
 
 def _rows(depths: torch.Tensor | None) -> torch.Tensor | None:

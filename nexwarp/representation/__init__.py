@@ -1,1 +1,1 @@
-"""What is learned: surfels, texture, exposures."""
+"""The representation (paper Sec. 4.1): surfels and texture, and beyond the paper exposures and detail limits."""

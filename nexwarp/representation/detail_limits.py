@@ -1,27 +1,27 @@
-"""Detail limits: how close and how far the training views saw each surfel. Not in the paper."""
+"""Detail limits: the nearest and farthest training view of each surfel. Not in the paper."""
 
 import torch
 from torch import nn
 
 from nexwarp.checks import check_tensors
 
-NEVER = 1e30  # depth / focal of a surfel that no training view saw: its texture has no detail anywhere
+NEVER = 1e30  # depth / focal of a surfel that no training view saw: its texture gets no detail
 
 
 class DetailLimits(nn.Module):
-    """The range of pixel sizes at which training views saw each of N surfels, in world units (depth / focal length).
+    """Range of pixel sizes at which training views saw each of N surfels: depth / focal length, in world units.
 
-    A rendering from closer than `nearest` gets the texture's detail of that closest training view: the training never
-    constrained finer levels. A rendering from farther than `farthest` gets the texture's detail of that farthest view,
-    and the surfel is blurred by the difference in pixel size, so that surfels smaller than a pixel do not alias.
+    Closer than `nearest`, the texture keeps the detail of the nearest training view, as no view constrained finer
+    levels. Farther than `farthest`, the texture keeps the detail of the farthest training view, and the surfel is
+    blurred by the difference in pixel size, so that surfels smaller than a pixel do not alias.
 
     Buffers:
-        nearest: (N,) depth / focal of the closest training view in which the surfel's texture was visible, `NEVER`
-            where there is none.
-        farthest: (N,) likewise of the farthest training view; of the surfel's centre where its texture was not visible.
+        nearest: (N,) depth / focal of the nearest training view in which the surfel's texture was visible; `NEVER` if
+            there is none.
+        farthest: (N,) the same of the farthest training view; of the surfel's centre if its texture was never visible.
 
     Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+        TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
     """
 
     nearest: torch.Tensor

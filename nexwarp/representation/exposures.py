@@ -1,9 +1,9 @@
-"""Exposures: how bright each training photo is, a gain a channel, and what a camera between them would take.
+"""Exposures: a gain per training photo and channel, predicted for other cameras. Not in the paper.
 
-Phones and cameras set their exposure and white balance anew for every photo, and lenses darken the corners
-(vignetting). A model that has to explain the differences by its surfels learns what no other view agrees with; here it
-learns the scene as at the mean exposure and through an even lens, and a rendering takes the gains of the photos around
-it and the falloff of the lens.
+Cameras set exposure and white balance anew for each photo, and lenses darken the corners (vignetting). Surfels that had
+to explain these differences would fit each photo with errors in all other views. The surfels are therefore trained at
+the mean exposure and without vignetting. A rendering is multiplied by the gains that the photos near its camera
+predict, and by the falloff of the lens.
 """
 
 from collections.abc import Sequence
@@ -15,27 +15,35 @@ from nexwarp.camera import Camera
 from nexwarp.checks import check_tensors
 from nexwarp.determinism import one_thread
 
-DECIMALS = 6  # of log gains: the solver's rounding must not make a run another one
-MOST_PHOTOS = 1000  # that renderings take their gains from
-EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without any
+DECIMALS = 6  # of log gains: rounding errors of the solver must not change a run
+MOST_PHOTOS = 1000  # largest number of photos that are kept
+EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without vignetting
 
-LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # of the kernel, over the spread of the cameras
+LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # candidates of the kernel's length, relative to the spread of the cameras
 
-MOST_FALLOFFS = 16  # of different cameras, to be kept
-NOISES = (1e-3, 1e-2, 1e-1)  # variance of a photo's own deviation, over that of the process
+MOST_FALLOFFS = 16  # largest number of falloff images that are cached
+NOISES = (1e-3, 1e-2, 1e-1)  # candidates of the noise variance, relative to that of the process
 
-TINY = 1e-9  # squared error that is none
+TINY = 1e-9  # added to the diagonal of matrices of squared errors, which may be singular
 
 
 class Exposures(nn.Module):
-    """Gains of photos by the pose of their cameras: a Gaussian process with the Matern 3/2 kernel.
+    """Gaussian process with a Matern 3/2 kernel that predicts gains from camera poses, fitted to V photos.
 
-    Places between the photos, whose gains were predicted (`nexwarp.finish.auto_exposure`), count as photos do.
+    The V photos may include virtual ones between the cameras, with gains from `nexwarp.finish.auto_exposure`.
 
-    Buffers: `log_gains` (V, 3); `positions` (V, 3) of the cameras, world units; `directions` (V, 3) unit, where they
-    look; `coefficients` (V, 3) and `mean` (3,) of the process; `lengths` (2,) world units: what a direction's change by
-    1 counts, and the kernel's length; `falloff` (3,): a, b and the largest T > 0 of the lens, which leaves
-    exp(a t + b t^2) of the light, where t = min(tan^2 / T, 1) and tan that of the angle to the optical axis.
+    Buffers:
+        log_gains: (V, 3) logarithms of the photos' gains.
+        positions: (V, 3) positions of the cameras, world units.
+        directions: (V, 3) unit viewing directions, world frame.
+        coefficients: (V, 3) coefficients of the process.
+        mean: (3,) mean log gain of the process.
+        lengths: (2,) world units: the distance that equals a change of the direction by 1, and the kernel's length.
+        falloff: (3,) a, b and T > 0. The lens transmits exp(a t + b t^2) of the light, where t = min(tan^2(x) / T, 1)
+            and x is the angle to the optical axis.
+
+    Raises:
+        TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
     """
 
     log_gains: torch.Tensor
@@ -57,7 +65,7 @@ class Exposures(nn.Module):
         falloff: torch.Tensor | None = None,
     ) -> None:
         super().__init__()
-        if falloff is None:  # as in files from before there was one
+        if falloff is None:  # older model files have none
             falloff = lengths.new_tensor(EVEN)
         shapes = {
             "log_gains": (log_gains, ("V", 3)),
@@ -75,7 +83,7 @@ class Exposures(nn.Module):
         self.register_load_state_dict_post_hook(lambda module, _: module._read_falloff())
 
     def _read_falloff(self) -> None:
-        """Keep the falloff as numbers, so that a rendering need not wait for the GPU."""
+        """Copy the falloff to Python numbers, so that renderings do not wait for the GPU."""
         a, b, largest = self.falloff.tolist()
         if not largest > 0:
             raise ValueError(f"falloff: expected a largest squared tangent > 0, got {largest:g}")
@@ -86,16 +94,23 @@ class Exposures(nn.Module):
     def of(
         cls, log_gains: torch.Tensor, cameras: Sequence[Camera], falloff: Sequence[float] | None = None
     ) -> "Exposures":
-        """Exposures of photos with log gains (V, 3) that these V cameras took, V >= 1; float32 on the CPU.
+        """Fit exposures to V >= 1 photos.
 
-        `falloff` (3,) is the lens's, None is an even one.
+        The kernel's length and the noise are those that best predict each photo from the others. Of many photos,
+        every n-th is kept, at most 1,000.
 
-        How far gains reach and how exact they are is what would have predicted each photo best from the others.
+        Args:
+            log_gains: (V, 3) log gains of the photos.
+            cameras: the V cameras of the photos.
+            falloff: (3,) falloff of the lens; None is a lens without vignetting.
+
+        Returns:
+            The exposures, float32 on the CPU.
         """
         viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
-        every = -(-len(cameras) // MOST_PHOTOS)
-        positions, directions = (x[::every] for x in _poses(viewmats))
-        gains = log_gains.double()[::every]
+        stride = -(-len(cameras) // MOST_PHOTOS)
+        positions, directions = (x[::stride] for x in _poses(viewmats))
+        gains = log_gains.double()[::stride]
         with one_thread():
             size, squares = _apart(positions, directions)
             kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
@@ -112,51 +127,55 @@ class Exposures(nn.Module):
         )
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Its buffers by name; `Exposures(**tensors)` makes it again."""
+        """Return the buffers by name; `Exposures(**tensors)` makes a copy."""
         return dict(self.named_buffers())
 
     @torch.no_grad()
     def gains(self, camera: Camera) -> torch.Tensor:
-        """Gains (3,) for the colours of a rendering; never beyond those of the photos, and their mean far away."""
+        """Return a camera's gains (3,), within the range of the photos' gains; far from all photos, their mean."""
         position, direction = _poses(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)
         squares = (self.positions - position).square().sum(1) + turned.square().sum(1)
-        found = self.mean + _matern(squares, self.lengths[1]) @ self.coefficients
-        return found.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
+        log_gains = self.mean + _matern(squares, self.lengths[1]) @ self.coefficients
+        return log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
 
     @torch.no_grad()
     def factors(self, camera: Camera) -> torch.Tensor:
-        """What the colours (H, W, 3) of a rendering are times: (H, W, 3), or (3,) where the lens is even."""
+        """Return gains times falloff of a camera, (H, W, 3), or (3,) for a lens without vignetting."""
         gains, light = self.gains(camera), self.falloff_of(camera)
         return gains if light is None else light * gains
 
     @torch.no_grad()
     def falloff_of(self, camera: Camera) -> torch.Tensor | None:
-        """What the lens leaves of the light at each pixel, (H, W, 1), not to be written to; None where it is even."""
+        """Return the fraction of light that the lens transmits to each pixel; None for a lens without vignetting.
+
+        Returns:
+            (H, W, 1), cached: callers must not write to it.
+        """
         a, b, largest = self._lens
         if a == b == 0:
             return None
         device = self.falloff.device
         key = (device, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        found = self._falloffs.get(key)
-        if found is None:
+        falloff = self._falloffs.get(key)
+        if falloff is None:
             x = (torch.arange(camera.width, device=device) + 0.5 - camera.cx) / camera.fx
             y = (torch.arange(camera.height, device=device) + 0.5 - camera.cy) / camera.fy
             t = ((x**2 + (y**2)[:, None]) / largest).clamp(max=1.0)
             if len(self._falloffs) >= MOST_FALLOFFS:
                 self._falloffs.clear()
-            found = self._falloffs[key] = (t * (a + b * t)).exp()[..., None]
-        return found
+            falloff = self._falloffs[key] = (t * (a + b * t)).exp()[..., None]
+        return falloff
 
 
 def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
-    """Matern 3/2 kernel of squared distances."""
+    """Evaluate the Matern 3/2 kernel at squared distances."""
     r = (3 * squares).sqrt() / length
     return (1 + r) * torch.exp(-r)
 
 
 def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Spread of cameras' positions (V, 3), and squares (V, V) of how far poses are apart."""
+    """Return the RMS spread of camera positions (V, 3), and the squared distances (V, V) of poses."""
     size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
     poses = torch.cat([positions, size * directions], 1)
     return size, torch.cdist(poses, poses).square()
@@ -165,10 +184,11 @@ def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Ten
 def _fit(
     kernel: torch.Tensor, values: torch.Tensor, noise: float
 ) -> tuple[float, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Fit a process to values (V, 3).
+    """Fit a process with a kernel matrix (V, V) to values (V, 3).
 
     Returns:
-        The sum of squares of the next; errors (V, 3) of each from the others; coefficients (V, 3); mean (3,).
+        Sum of the squared errors; errors (V, 3) of predicting each value from the others; coefficients (V, 3); mean
+        (3,).
     """
     inverse = torch.linalg.inv(kernel + noise * torch.eye(len(values), dtype=values.dtype))
     mean = inverse.sum(0) @ values / inverse.sum()
@@ -178,6 +198,6 @@ def _fit(
 
 
 def _poses(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions and viewing directions (..., 3) of world-to-camera matrices (..., 4, 4)."""
+    """Return positions and viewing directions (..., 3) of world-to-camera matrices (..., 4, 4)."""
     rotation, shift = viewmats[..., :3, :3], viewmats[..., :3, 3:]
     return -(rotation.mT @ shift)[..., 0], rotation[..., 2, :]

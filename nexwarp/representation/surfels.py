@@ -1,4 +1,4 @@
-"""The surfels: what is learned of the geometry and of the plain (untextured) appearance (paper Sec. 3.1)."""
+"""The surfels: geometry and plain (non-textured) appearance (paper Sec. 4.1)."""
 
 from typing import NamedTuple
 
@@ -8,19 +8,19 @@ from torch import nn
 from nexwarp import ops
 from nexwarp.checks import check_finite, check_tensors
 
-# Raw values stay finite at the ends of the ranges; activated ones come back within 2e-6.
+# Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
 END = 1e-6
 
 
 class Activated(NamedTuple):
-    """The geometry of N surfels as the passes read it; differentiable.
+    """Activated geometry of N surfels, as the kernels take it; differentiable.
 
     Attributes:
         means: (N, 3) centres, world units.
         quats: (N, 4) unit rotations surfel to world, wxyz.
         scales: (N, 2) along the surfel's x and y axes, world units.
         opacities: (N,) in (0, 1).
-        gammas: (N, 2) exponents of the generalised Gaussian, >= 1.
+        gammas: (N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1.
     """
 
     means: torch.Tensor
@@ -31,14 +31,13 @@ class Activated(NamedTuple):
 
 
 class Surfels(nn.Module):
-    """N surfels: raw values are the parameters, activated ones properties; `activated()` gives the passes all at once.
+    """N surfels. The parameters are raw values, the properties are activated ones.
 
     Parameters (raw): `means` (N, 3) world units; `raw_quats` (N, 4) wxyz, any length but zero; `log_scales` (N, 2);
     `logit_opacities` (N,); `raw_gammas` (N, 2), gamma = 1 + exp(raw); `sh0` (N, 1, 3); `shN` (N, C - 1, 3).
 
-    Activated properties, which carry the graph to them: `means`, `quats` (N, 4) wxyz unit, surfel to world, `normals`
-    (N, 3) their z axes, `scales` (N, 2) world units, `opacities` (N,) in (0, 1), `gammas` (N, 2) >= 1, `sh` (N, C, 3).
-
+    Properties (activated), differentiable: `quats` (N, 4) wxyz unit, surfel to world; `normals` (N, 3), the z axes;
+    `scales` (N, 2) world units; `opacities` (N,) in (0, 1); `gammas` (N, 2) >= 1; `sh` (N, C, 3).
     """
 
     means: nn.Parameter
@@ -50,7 +49,7 @@ class Surfels(nn.Module):
     shN: nn.Parameter
 
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
-        """Take the raw values by parameter name, as `state_dict` gives them."""
+        """Take the raw values by parameter name, as `state_dict` returns them."""
         super().__init__()
         shapes = {
             "means": ("N", 3),
@@ -78,18 +77,18 @@ class Surfels(nn.Module):
         gammas: torch.Tensor,
         sh: torch.Tensor,
     ) -> "Surfels":
-        """Make surfels, with fresh leaf parameters, from activated values.
+        """Make surfels with new leaf parameters from activated values.
 
         Args:
             means: (N, 3) centres, world units.
-            quats: (N, 4) rotations surfel to world, wxyz, need not be unit.
+            quats: (N, 4) rotations surfel to world, wxyz, of any length > 0.
             scales: (N, 2) > 0, world units along the surfel's x and y axes.
             opacities: (N,) in [0, 1].
             gammas: (N, 2) >= 1; 1 is a Gaussian, large values a hard-edged quad.
             sh: (N, C, 3) spherical harmonics of the plain colour, DC first, C in 1, 4, 9, 16.
 
         Raises:
-            TypeError, ValueError: naming the argument, when types, shapes, devices or values do not fit.
+            TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
         """
         arguments = {
             "means": (means, ("N", 3)),
@@ -130,7 +129,7 @@ class Surfels(nn.Module):
         return self.means.device
 
     def activated(self) -> Activated:
-        """Return what the properties of the same names do, to rounding, in one kernel."""
+        """Return the activated geometry from one kernel; up to rounding, the values of the properties."""
         raw = (self.raw_quats, self.log_scales, self.logit_opacities, self.raw_gammas)
         return Activated(self.means, *ops.activate(*raw))
 
@@ -157,7 +156,7 @@ class Surfels(nn.Module):
 
     @property
     def gammas(self) -> torch.Tensor:
-        """(N, 2) exponents of the generalised Gaussian, >= 1."""
+        """(N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1."""
         return 1 + self.raw_gammas.exp()
 
     @property

@@ -1,6 +1,7 @@
-"""The neural texture: one field shared by all surfels, a hash grid and a small MLP (paper Sec. 3.1)."""
+"""The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
+from typing import TypedDict
 
 import torch
 from torch import nn
@@ -10,21 +11,37 @@ from nexwarp.checks import check_range, check_tensors
 
 GRID_INIT = 0.01
 
-# Cells are indexed by int32: finer grids wrap around at once.
+# Cells have int32 indices: in finer grids these overflow.
 LARGEST_RESOLUTION = 1e9
 
-# A focal length in pixels at which every cell is larger than a pixel.
-NO_FOOTPRINT = 1e12
+# Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
+FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
+
+
+class TextureShape(TypedDict):
+    """Arguments of `NeuralTexture`, as a model file keeps them."""
+
+    levels: int
+    table_size: int
+    features: int
+    min_resolution: float
+    max_resolution: float
+    width: int
+    hidden_layers: int
+    sh_degree: int
+    residual: bool
+    down_weighting: bool
 
 
 class NeuralTexture(nn.Module):
-    """World-space field F(x) = G(Delta H(x)) that gives spherical harmonics coefficients (paper Eq. 1 and 2).
+    """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5; H of Eq. 2, Delta of Eq. 4).
 
-    Parameters: `grid` (levels, table_size, features), float32, in table order; `mlp`, a torch module without biases
-    whose `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, geometric.
+    Parameters: `grid` (levels, table_size, features), float32; `mlp`, a torch module without biases whose
+    `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, a geometric
+    series.
 
-    On CUDA the lookup and the MLP run in half precision on a copy made for each call, with float32 parameters and
-    gradient sums; set `half_precision` to False to keep float32.
+    On CUDA, lookup and MLP use half-precision copies of the float32 parameters, made for each call; gradients are
+    summed in float32. Set `half_precision` to False to compute in float32.
     """
 
     resolutions: torch.Tensor
@@ -42,23 +59,23 @@ class NeuralTexture(nn.Module):
         residual: bool = False,
         down_weighting: bool = True,
     ) -> None:
-        """Make a fresh field.
+        """Make a field with initial values.
 
         Args:
-            levels: L, resolution levels.
-            table_size: T, entries a level, a power of two.
-            features: F, features an entry: 1, 2, 4 or 8.
-            min_resolution: of the coarsest level, cells per world unit.
-            max_resolution: of the finest level.
-            width: of the hidden layers.
+            levels: L, number of resolution levels.
+            table_size: T, entries per level, a power of two.
+            features: F, features per entry: 1, 2, 4 or 8.
+            min_resolution: resolution of the coarsest level, cells per world unit.
+            max_resolution: resolution of the finest level, cells per world unit.
+            width: width of the hidden layers.
             hidden_layers: number of hidden layers.
-            sh_degree: of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
-            residual: colours are added to the surfels' plain ones instead of replacing them, so that a field of 0, as
-                it is where no photo looked, leaves those.
-            down_weighting: fade levels whose cells are smaller than a pixel (Delta of paper Eq. 2).
+            sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
+            residual: add the texture's colours to the surfels' plain colours instead of replacing them. Where no photo
+                trained the field it is 0, and the plain colours remain.
+            down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
 
         Raises:
-            ValueError: naming the argument that is out of its range.
+            TypeError, ValueError: the message names the argument.
         """
         super().__init__()
         _check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
@@ -66,7 +83,7 @@ class NeuralTexture(nn.Module):
         for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
             if not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected True or False, got {flag!r}")
-        self.config = {
+        self.config: TextureShape = {
             "levels": levels,
             "table_size": table_size,
             "features": features,
@@ -82,14 +99,11 @@ class NeuralTexture(nn.Module):
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
-        ends = torch.tensor([min_resolution, max_resolution], dtype=torch.float64).log()
-        steps = torch.linspace(0.0, 1.0, levels, dtype=torch.float64)
-        resolutions = (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
-        self.register_buffer("resolutions", resolutions)
+        self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
         layers: list[nn.Module] = []
         for fan_in, fan_out in itertools.pairwise(sizes):
-            # Linear's own initial values are U(+-1/sqrt(fan_in)), as the method wants.
+            # torch.nn.Linear's own initialisation, U(+-1/sqrt(fan_in)), is the method's.
             layers += [nn.Linear(fan_in, fan_out, bias=False), nn.ReLU()]
         self.mlp = nn.Sequential(*layers[:-1])
 
@@ -99,11 +113,11 @@ class NeuralTexture(nn.Module):
         return self.grid.device
 
     def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
-        """Return the field's spherical harmonics coefficients.
+        """Return the field's SH coefficients.
 
         Args:
-            positions: (..., 3) world.
-            depths: (...) z-depths at which the points are seen, world units; 0 marks a point to skip.
+            positions: (..., 3) points, world frame.
+            depths: (...) their z-depths in the camera, world units; 0 marks a point to skip.
             focal: focal length in pixels, a number or a tensor of one element.
 
         Returns:
@@ -126,15 +140,15 @@ class NeuralTexture(nn.Module):
         sh_degree: int = 3,
         clamp: bool = False,
     ) -> torch.Tensor:
-        """Return the textured colours 0.5 + SH(direction) of hits; SH(direction) alone when `residual`.
+        """Return the textured colours of hits: 0.5 + SH(direction), or SH(direction) if `residual`.
 
         Args:
-            positions: (..., K, 3) hit points, world.
+            positions: (..., K, 3) hit points, world frame.
             depths: (..., K) their z-depths, 0 in empty slots.
-            directions: (..., 3) unit ray directions, world.
+            directions: (..., 3) unit ray directions, world frame.
             focal: focal length in pixels, a number or a tensor of one element.
-            sh_degree: limits the degree that is evaluated.
-            clamp: limit colours to >= 0.
+            sh_degree: largest SH degree to evaluate.
+            clamp: clamp colours to >= 0.
 
         Returns:
             (..., K, 3) colours.
@@ -155,7 +169,7 @@ class NeuralTexture(nn.Module):
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if not self.down_weighting:
-            focal = NO_FOOTPRINT
+            focal = FOCAL_WITHOUT_DOWN_WEIGHTING
         if isinstance(focal, torch.Tensor):
             if focal.numel() != 1:
                 raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
@@ -178,8 +192,15 @@ class NeuralTexture(nn.Module):
         )
 
 
+def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
+    """Return (count,) float32, computed in float64."""
+    ends = torch.tensor([first, last], dtype=torch.float64).log()
+    steps = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+    return (ends[0] + (ends[1] - ends[0]) * steps).exp().float()
+
+
 def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
-    """Raise TypeError or ValueError unless each size of a field is an int in its range."""
+    """Raise TypeError or ValueError unless each size is an int in its range."""
     for name, value, low, high in (
         ("levels", levels, 1, 64),
         ("table_size", table_size, 1, 2**30),

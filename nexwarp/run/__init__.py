@@ -1,1 +1,1 @@
-"""What is done with a run folder."""
+"""Operations on run folders: evaluation, rendering, export, logging."""

@@ -1,4 +1,4 @@
-"""Evaluation on held-out views, by the field's conventions (see `nexwarp.run.metrics`)."""
+"""Evaluation on held-out views; `nexwarp.run.metrics` defines the metrics."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,15 +14,15 @@ from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
 
 
 class Evaluation(TypedDict, total=False):
-    """Metrics of held-out views: those asked for, each the mean over the views, and each view's own.
+    """The requested metrics of held-out views: their means over the views, and the values of each view.
 
     Attributes:
-        psnr: dB.
-        ssim: 0 to 1.
-        flip: 0 to 1, lower is better; None where its package is not there.
-        lpips: lower is better; None where its package is not there.
-        views: the same by the view's name.
-        convention: how the metrics are computed.
+        psnr: mean PSNR [dB].
+        ssim: mean SSIM, at most 1.
+        flip: mean FLIP error in [0, 1], lower is better; None if its package is not installed.
+        lpips: mean LPIPS, lower is better; None if its package is not installed.
+        views: the metrics of each view, by view name.
+        convention: how the metrics are computed, as text.
     """
 
     psnr: float
@@ -46,16 +46,18 @@ def evaluate(
     """Render views and compare them with their photos.
 
     Args:
-        model: on the device to render on.
+        model: the model, on the device to render on.
         views: held-out views.
-        renders: folder for each view's picture and its strip of photo, render and error; None writes nothing.
-        mask_mode: what the views' masks leave out: `ignore` does not judge it, `background` wants the background there.
-        metrics: which figures, of psnr, ssim, flip and lpips. FLIP and LPIPS are of whole pictures, the photo put where
-            a mask ignores them, and None where their packages are not there.
-        progress: called with each view's name when it is done.
+        renders: folder for the images: `test/` gets each rendering, `compare/` a strip of photo, rendering and error
+            map. None writes nothing.
+        mask_mode: treatment of masked-out pixels: `ignore` excludes them from the metrics, `background` compares them
+            with the background colour.
+        metrics: names among psnr, ssim, flip and lpips. FLIP and LPIPS need whole images: ignored pixels are copied
+            from the photo.
+        progress: called with each view's name after the view is evaluated.
 
     Raises:
-        ValueError: no views, or an unknown metric.
+        ValueError: there are no views, or a metric is unknown.
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
@@ -67,8 +69,8 @@ def evaluate(
         picture = to_uint8(out.image).cpu()
         photo, mask = to_uint8(view.image), view.mask
         if mask is not None and mask_mode == "background":
-            behind = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
-            photo, mask = torch.where(mask[..., None], photo, behind), None
+            background = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
+            photo, mask = torch.where(mask[..., None], photo, background), None
         results[view.name] = {name: METRICS[name](picture, photo, mask) for name in metrics}
         if renders is not None:
             stem = Path(view.name).with_suffix("")
@@ -90,12 +92,12 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _whole(metric: Callable[..., float | None]) -> Callable[..., float | None]:
-    """The metric of whole pictures, where what does not count is as it should be."""
+    """Return a metric of whole images that takes a mask: excluded pixels are copied from the photo."""
 
-    def judge(picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> float | None:
+    def masked_metric(picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> float | None:
         return metric(picture if mask is None else torch.where(mask[..., None], picture, photo), photo)
 
-    return judge
+    return masked_metric
 
 
 METRICS = {"psnr": psnr, "ssim": ssim, "flip": _whole(flip), "lpips": _whole(lpips_vgg)}

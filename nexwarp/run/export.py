@@ -1,4 +1,4 @@
-"""A run's files for other programs."""
+"""Export of run folders to the formats of other programs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,16 +15,19 @@ FORMATS = ("ply", "cameras")
 
 
 def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
-    """Write a run's files for other programs into a folder (see docs/outputs.md) and return them.
+    """Export a run to a folder; docs/outputs.md describes the files.
 
     Args:
         run: run folder.
         kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
-        folder: made if need be.
-        max_extent: of the Gaussians in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        folder: output folder, created if it does not exist.
+        max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+
+    Returns:
+        The files that were written.
 
     Raises:
-        ValueError, OSError: naming what is not as expected.
+        ValueError, OSError: the message names the option or file.
     """
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
@@ -35,14 +38,14 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
         model = load(run)
         files = [folder / "surfels.ply", folder / "splats.ply"]
         save_surfels_ply(files[0], model.surfels)
-        # A training that was broken off leaves a model without cameras.
+        # A training that stopped early leaves a model, but no cameras file.
         groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
-        every = [camera for members in groups for camera in members.values()]
+        all_cameras = [camera for members in groups for camera in members.values()]
         degree = model.options.sh_degree
-        save_splats_ply(files[1], model.surfels, degree, cameras=every, max_extent=max_extent)
+        save_splats_ply(files[1], model.surfels, degree, cameras=all_cameras, max_extent=max_extent)
         return files
     sets = load_cameras(run / CAMERAS_FILE)
-    # Named as from the scene's folder: a transforms.json lies there.
+    # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
         group: {f"{source.images}/{name}": camera for name, camera in members.items()}
         for group, members in sets.items()

@@ -1,7 +1,7 @@
-"""Run folders: what a training leaves behind, and how it is found again.
+"""Run folders: creating, checking and reading them.
 
 A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `metrics.jsonl`,
-`renders/` and `checkpoint/`: docs/format.md.
+`renders/` and `checkpoint/`; docs/format.md describes them.
 """
 
 import dataclasses
@@ -10,12 +10,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
 from nexwarp.io.files import is_leftover, one_line, remove_leftovers, write_atomically, written_aside
-from nexwarp.io.json_files import READ_ERRORS, read_json
+from nexwarp.io.json_files import READ_ERRORS, Json, read_json
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
 
@@ -27,22 +26,22 @@ DEMO = "demo"
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a run's photos come from."""
+    """Location of a run's scene, and the options for loading it."""
 
     path: str
-    """A folder (COLMAP, nerfstudio or Blender), or "demo"."""
+    """Scene folder (COLMAP, nerfstudio or Blender), or "demo"."""
     images: str = "images"
-    """Folder of the photos below it."""
+    """Folder of the photos, relative to `path`."""
     downscale: int = 1
-    """Factor by which photos are reduced, by area."""
+    """Factor by which photos are downscaled, with an area filter."""
     masks: str = "masks"
-    """Folder of the masks below it, "alpha" or "none"."""
+    """Folder of the masks, relative to `path`; "alpha" takes the photos' alpha channel, "none" takes no masks."""
     background: str | None = None
-    """Colour that transparent photos are put on: white, black, R,G,B or random."""
+    """Colour behind transparent photos: white, black, R,G,B or random."""
     points: str | None = None
-    """PLY file of the points to start from."""
+    """PLY file of the initial points; None takes the scene's points."""
     format: str | None = None
-    """Kind of the scene, where its folder holds more than one."""
+    """Format of the scene, for a folder that holds several; None detects it."""
 
     @property
     def name(self) -> str:
@@ -50,27 +49,32 @@ class SceneSource:
         return DEMO if self.path == DEMO else Path(self.path).resolve().name
 
     def load(self, progress: Callable[[int, int], None] | None = None) -> Scene:
-        """Load the scene, telling `progress` how many photos are read; the demo is made on first use."""
+        """Load the scene; the demo is generated on first use.
+
+        Args:
+            progress: called with the number of photos read so far and their total.
+        """
         options = dataclasses.asdict(self) | {"progress": progress}
         folder = options.pop("path")
         return load_scene(demo_folder() if folder == DEMO else folder, **options)
 
 
 def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> bool:
-    """Refuse a run folder that must not be touched; change nothing.
+    """Check that a run folder may be created, resumed or overwritten; change nothing.
 
     Returns:
-        Whether there is a run to continue: a folder that was made, but got nothing before the process was killed, is
-        none, though resuming may start there.
+        Whether the folder holds a run to resume. False with `resume` too, if a process was killed before it wrote the
+        run's config: the training then starts from the beginning.
 
     Raises:
-        ValueError: the folder exists and neither flag is given, or both are, or it is no run, or it holds the scene.
-        FileNotFoundError: there is nothing to resume.
+        ValueError: the folder exists and neither flag is given; both flags are given; the folder to overwrite is not a
+            run; or the folder contains the scene.
+        FileNotFoundError: the folder to resume is not a run.
     """
     if resume and overwrite:
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
-        raise SettingError(f"--run: expected a folder that does not hold the scene, got {run}")
+        raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
     exists = run.exists() and (not run.is_dir() or any(run.iterdir()))
     if resume:
         if (run / CONFIG_FILE).is_file():
@@ -82,15 +86,15 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
             f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
         )
     elif exists and not (run / CONFIG_FILE).is_file():
-        raise RunError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; not touching it")
+        raise RunError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; nothing was deleted")
     return False
 
 
 def create_run(run: Path, source: SceneSource, config: Config, device: str) -> None:
-    """Make an empty run folder (in place of an old one, see `prepare_run`) with its config.
+    """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
 
-    An old one goes only once the new config is on the disk, and loses its own config last: whenever that is
-    interrupted, what is there is a run still.
+    The new config is on the disk before anything is deleted, and replaces the old config last. An interruption at any
+    point thus leaves a folder that is still a run.
     """
     scene = dataclasses.asdict(source)
     if source.path != DEMO:
@@ -108,30 +112,39 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str) -> N
 
 
 def tidy_run(run: Path) -> None:
-    """Remove what killed processes left half-written in a run."""
+    """Remove the incomplete files that killed processes left in a run folder."""
     shutil.rmtree(run / "checkpoint.tmp", ignore_errors=True)
     remove_leftovers(run)
 
 
 def check_room(run: Path, size: int) -> None:
-    """Raise StorageError unless a run folder, there or not, can take files of that many bytes in all."""
+    """Raise StorageError unless the disk of a run folder has room.
+
+    Args:
+        run: run folder; it need not exist.
+        size: bytes that the run's files need in all.
+    """
     folder = next(f for f in (run, *run.absolute().parents) if f.is_dir())
     try:
         free = shutil.disk_usage(folder).free
-    except OSError:  # of a file system that cannot tell
+    except OSError:  # the file system does not report its free space
         return
     if free < size:
         raise StorageError(
-            f"{run}: expected room for a model and its checkpoints, about {size / 2**20:,.0f} MiB, but the disk has "
-            f"{free / 2**20:,.0f} MiB left; make room, give another --run, or lower --max-surfels"
+            f"{run}: expected about {size / 2**20:,.0f} MiB of free disk space for a model and its checkpoints, "
+            f"got {free / 2**20:,.0f} MiB; free some, give another --run, or lower --max-surfels"
         )
 
 
-def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
+def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
     """Read a run's config.
 
     Returns:
-        The scene's source, the settings, and everything in the file.
+        The scene's source, the settings, and all entries of the file.
+
+    Raises:
+        FileNotFoundError: the folder is not a run.
+        ValueError: the config is damaged.
     """
     path = run / CONFIG_FILE
     if not path.is_file():
@@ -149,8 +162,8 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Any]]:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
 
-def read_metrics(run: Path) -> dict[str, Any]:
-    """Read a run's metrics; nothing where there are none yet."""
+def read_metrics(run: Path) -> dict[str, Json]:
+    """Read a run's metrics; a run that has none yet gives an empty dict."""
     path = run / METRICS_FILE
     try:
         metrics = read_json(path) if path.is_file() else {}
@@ -165,7 +178,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 
 def keep_camera_path(run: Path, content: bytes) -> str:
-    """Write a camera path (JSON) into a run under the next free name, and tell how to render it."""
+    """Write a camera path (JSON) into a run under the next free name; return the command that renders it."""
     number = 1
     while (path := run / f"camera_path_{number}.json").exists():
         number += 1

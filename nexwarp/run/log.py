@@ -1,4 +1,4 @@
-"""What a training leaves behind of its course: a line of JSON every so often, and TensorBoard events if asked for."""
+"""Training logs: lines of JSON at regular iterations and, on request, TensorBoard events."""
 
 import importlib.util
 import json
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 LOG_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
 
-# A line every so many iterations; in short runs so many that there are about MIN_LINES of them.
+# Iterations between two lines, fewer in short runs, which get about MIN_LINES lines.
 EVERY = 100
 MIN_LINES = 100
 
-# Groups of the optimizer by what they hold, as `nexwarp.train.config.LearningRates` names them.
+# Names in `nexwarp.train.config.LearningRates` of the optimizer's parameters.
 RATES = {
     "means": "means",
     "raw_quats": "quats",
@@ -37,7 +37,7 @@ RATES = {
 
 
 def check_tensorboard() -> None:
-    """Raise ValueError unless the package that writes TensorBoard's files is there."""
+    """Raise ValueError unless the package tensorboard is installed."""
     if importlib.util.find_spec("tensorboard") is None:
         raise ValueError(
             "--tensorboard: expected the package tensorboard, found none; pip install 'nexwarp[tensorboard]'"
@@ -45,7 +45,7 @@ def check_tensorboard() -> None:
 
 
 def peak_memory(device: torch.device) -> int | None:
-    """Largest memory so far in bytes: torch's on the GPU in use, else this process's; None where nobody counts it."""
+    """Return the peak memory in bytes: torch's on a GPU, else this process's; None if the system does not report it."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     try:
@@ -58,7 +58,7 @@ def peak_memory(device: torch.device) -> int | None:
 
 
 class LogLine(TypedDict):
-    """One line of the log, as `TrainingLog` describes it."""
+    """One line of the log; `TrainingLog` describes the fields."""
 
     iteration: int
     loss: float
@@ -72,29 +72,29 @@ class LogLine(TypedDict):
 
 
 class TrainingLog:
-    """Observes a training and writes `metrics.jsonl`, a JSON object a line, flushed at once.
+    """Observer of a training that writes `metrics.jsonl`: one JSON object per line, flushed after each line.
 
-    Lines come at iteration 1, every `every` after that, and at the last one; between them nothing is fetched from the
-    device. A line holds
+    A line is written at iteration 1, every `every` iterations after it, and at the last iteration. At other iterations
+    nothing is fetched from the device. The fields of a line:
 
-        iteration, surfels;
-        loss, losses: the sum and its terms by name, factors included, of that step's view;
-        psnr: dB, of that view;
-        iterations_per_second: since the line before by the clock on the wall, checkpoints and pauses included;
-        seconds: of training so far, over all sessions of the run;
-        memory_bytes: `peak_memory`;
-        rates: learning rates by name (that of the means times the scene's scale, as the optimizer has it).
+        iteration, surfels: the number of each;
+        loss, losses: loss of this step's view, and its weighted terms by name;
+        psnr: PSNR of this step's view [dB];
+        iterations_per_second: mean since the previous line, in wall-clock time with checkpoints and pauses;
+        seconds: training time so far, over all sessions of the run;
+        memory_bytes: see `peak_memory`;
+        rates: learning rates by name, as the optimizer has them: that of the means includes the scene's scale.
 
-    Values that are not finite are null.
+    Values that are not finite are written as null.
     """
 
     def __init__(self, run: Path, trainer: Trainer, *, tensorboard: bool = False) -> None:
-        """Continue the log of a run folder at the trainer's iteration: lines beyond it, and damaged ones, are dropped.
+        """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
 
         Args:
             run: an existing folder.
-            trainer: that will be observed.
-            tensorboard: write the same values as scalars into `run/tensorboard`, too.
+            trainer: the trainer to observe.
+            tensorboard: also write the values as scalars to `run/tensorboard`.
         """
         self.run, self.trainer, self.tensorboard = run, trainer, tensorboard
         total = trainer.config.iterations
@@ -108,7 +108,7 @@ class TrainingLog:
         if self.tensorboard:
             from torch.utils.tensorboard import SummaryWriter
 
-            # Events of a session that got further than the checkpoint are not shown any more.
+            # TensorBoard hides older events of iterations that are trained again after the checkpoint.
             purge = self.trainer.iteration + 1 if self.trainer.iteration else None
             self.writer = SummaryWriter(str(self.run / TENSORBOARD_FOLDER), purge_step=purge)
         self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
@@ -120,12 +120,12 @@ class TrainingLog:
             try:
                 if file is not None:
                     file.close()
-            except OSError:  # what a full disk did not take, it does not take now: that was told before
+            except OSError:  # a full disk: an exception that is already being raised must not be replaced
                 if kind is None:
                     raise
 
     def rewind(self) -> None:
-        """Drop the lines beyond the trainer's iteration, after it has gone back."""
+        """Drop the lines after the trainer's iteration; for a trainer that was restored to an earlier one."""
         assert self.file is not None
         self.file.close()
         keep_lines(self.run / LOG_FILE, self.trainer.iteration)
@@ -133,8 +133,8 @@ class TrainingLog:
         self.last, self.written = self.trainer.iteration, time.perf_counter()
 
     def __call__(self, step: StepReport) -> None:
-        """Observe a step."""
-        # From 1 on: steps that are multiples of something often do more than others, such as to look beyond the frame.
+        """Write a line if one is due after this step."""
+        # Lines at 1, 1 + every, ...: steps at round numbers are often special, such as border steps.
         if (step.iteration - 1) % self.every and step.iteration != self.trainer.config.iterations:
             return
         assert self.file is not None
@@ -147,7 +147,7 @@ class TrainingLog:
             self.writer.flush()
 
     def _line(self, step: StepReport) -> LogLine:
-        # One transfer for all terms; it waits for the step, so the time is taken after it.
+        # One transfer for all terms. It waits for the step, so the clock is read after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr, now = step.psnr(), time.perf_counter()
         rate = (step.iteration - self.last) / max(now - self.written, 1e-9)
@@ -166,7 +166,7 @@ class TrainingLog:
 
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Learning rates at the trainer's last step, by the names of `nexwarp.train.config.LearningRates`."""
+    """Return the learning rates of the trainer's last step by the names of `nexwarp.train.config.LearningRates`."""
     modules = (trainer.surfels, trainer.texture)
     names = {id(parameter): name for module in modules for name, parameter in module.named_parameters()}
     rates = {}
@@ -177,7 +177,7 @@ def learning_rates(trainer: Trainer) -> dict[str, float]:
 
 
 def keep_lines(path: Path, iteration: int) -> None:
-    """Drop from a log the lines of later iterations, and any that is cut off; no file is no lines."""
+    """Drop lines of later iterations, and incomplete lines, from a log; the file need not exist."""
     if not path.exists():
         return
     lines = path.read_bytes().splitlines(keepends=True)
@@ -188,7 +188,7 @@ def keep_lines(path: Path, iteration: int) -> None:
 
 
 def _iteration(line: bytes) -> float:
-    """Iteration of a line; infinite when it is none."""
+    """Return the iteration of a line; infinity if the line is damaged."""
     try:
         iteration = json.loads(line)["iteration"]
     except (ValueError, TypeError, KeyError):  # bad UTF-8 is a ValueError
@@ -197,14 +197,14 @@ def _iteration(line: bytes) -> float:
 
 
 def _finite(value: object) -> object:
-    """The same with null for what JSON cannot express."""
+    """Return a JSON value in which None replaces numbers that are not finite."""
     if isinstance(value, dict):
         return {name: _finite(x) for name, x in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _scalars(line: LogLine) -> list[tuple[str, float]]:
-    """Tags and values for TensorBoard."""
+    """Return a line as tags and values for TensorBoard."""
     tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
     tags |= {f"loss/{name}": value for name, value in line["losses"].items()}
     tags["speed/iterations_per_second"] = line["iterations_per_second"]

@@ -1,20 +1,19 @@
-"""Image metrics as this field reports them: from 8-bit images, to compare with published numbers."""
+"""Image metrics, computed from 8-bit images to be comparable with published numbers."""
 
 import warnings
 from functools import lru_cache
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 
 from nexwarp.io.pictures import to_uint8
 
-PIXELS_PER_DEGREE = 67.02064514160156  # what FLIP's authors assume: 0.7 m from a display of 0.7 m and 3840 pixels
+PIXELS_PER_DEGREE = 67.02064514160156  # FLIP's default: a display 0.7 m and 3840 pixels wide, from 0.7 m
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
-    "C2 = 0.03^2, mean over all pixels and channels. PSNR and SSIM only over the pixels that count, where there is a "
-    "mask. LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the "
+    "C2 = 0.03^2, mean over all pixels and channels. With a mask, PSNR and SSIM over the included pixels only. "
+    "LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the "
     "map. A set's figure is the mean over its images."
 )
 
@@ -23,28 +22,28 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     """Peak signal-to-noise ratio in dB of two (H, W, 3) images, uint8 or float in [0, 1]; inf if equal.
 
     Args:
-        image: what is judged.
-        target: what it should be.
-        mask: (H, W) bool, True where pixels count; None is everywhere.
+        image: the rendering.
+        target: the photo.
+        mask: (H, W) bool, True for included pixels; None includes all.
     """
     image, target = _unit_images(image, target)
-    error = _counting((image.double() - target.double()).square(), mask).mean()
+    error = _included((image.double() - target.double()).square(), mask).mean()
     return (-10.0 * torch.log10(error)).item()
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1]; `mask` as in `psnr`.
+    """Structural similarity, at most 1, of two (H, W, 3) images, uint8 or float in [0, 1].
 
-    Windows of pixels that count reach into those that do not, where the image is taken to be the target.
+    `mask` is that of `psnr`. Excluded pixels take the target's values, as windows of included pixels may cover them.
     """
     if mask is not None:
         image, target = _unit_images(image, target)
         image = torch.where(_check_mask(mask, image)[..., None], image, target)
-    return _counting(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
+    return _included(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
 
 
 def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """(H, W, 3) float32 map whose mean is `ssim`."""
+    """Return the (H, W, 3) float32 map whose mean is `ssim`."""
     x, y = (picture.permute(2, 0, 1) for picture in _unit_images(image, target))
     mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
     c1, c2 = 0.01**2, 0.03**2
@@ -54,9 +53,9 @@ def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
-    """LPIPS (VGG, v0.1) of two (H, W, 3) images, or None, with one warning, when it is not available.
+    """LPIPS (VGG, v0.1) of two (H, W, 3) images; None, with one warning, if it is not available.
 
-    It needs the `lpips` package (`pip install nexwarp[lpips]`), which fetches the VGG weights on first use.
+    It needs the `lpips` package (`pip install nexwarp[lpips]`), which downloads the VGG weights on first use.
     """
     x, y = _unit_images(image, target)
     network = _lpips_network(x.device)
@@ -67,7 +66,7 @@ def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
 
 
 def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
-    """Mean LDR-FLIP error, 0 to 1, of two (H, W, 3) sRGB images at 67 pixels per degree, or None where not available.
+    """Mean LDR-FLIP error in [0, 1] of two (H, W, 3) sRGB images at 67 pixels per degree; None if not available.
 
     It needs the `flip-evaluator` package (`pip install nexwarp[flip]`).
     """
@@ -83,7 +82,7 @@ def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
 
 
 @lru_cache(maxsize=2)
-def _lpips_network(device: torch.device) -> Any:
+def _lpips_network(device: torch.device) -> torch.nn.Module | None:
     try:
         import lpips
 
@@ -114,12 +113,12 @@ def _check_mask(mask: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         expected = f"bool of shape {tuple(image.shape[:2])}"
         raise ValueError(f"mask: expected {expected}, got {mask.dtype} of shape {tuple(mask.shape)}")
     if not bool(mask.any()):
-        raise ValueError("mask: expected pixels that count, got none")
+        raise ValueError("mask: expected at least one included pixel, got none")
     return mask.to(image.device)
 
 
-def _counting(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """The values (H, W, C) of the pixels that count."""
+def _included(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Return the values (P, C) of the P included pixels of (H, W, C) values; all of them without a mask."""
     return values if mask is None else values[_check_mask(mask, values)]
 
 

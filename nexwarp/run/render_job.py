@@ -1,4 +1,4 @@
-"""What a finished run gives: still views, camera paths, videos, passes, files for other programs."""
+"""Rendering of a run: still views, camera paths, videos and buffers."""
 
 import math
 import re
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 import torch
 
@@ -28,13 +28,19 @@ PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
 
 SETS = {"test": ("test",), "train": ("train",), "all": ("train", "test"), None: ()}
 
-
-LARGEST_SIDE = 16384
+LARGEST_SIDE = 16384  # pixels
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One picture to render: its PNG file, its camera, whether it is a frame of the path, whether its passes go too."""
+class PictureJob:
+    """One image to render.
+
+    Attributes:
+        file: PNG file to write.
+        camera: the camera.
+        is_frame: whether the image is a frame of the camera path.
+        buffers: whether to write its buffers, too.
+    """
 
     file: Path
     camera: Camera
@@ -44,9 +50,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Pictures to render, in order, the video that their frames make, and the exposure of all (see `RenderOrder`)."""
+    """Images to render, and the video of their frames.
 
-    pictures: list[Picture]
+    Attributes:
+        pictures: the images, in the order of rendering.
+        video: video file to write; None writes none.
+        fps: frames per second.
+        exposure: see `RenderOptions`.
+    """
+
+    pictures: list[PictureJob]
     video: Path | None
     fps: float
     exposure: Exposure = "photos"
@@ -56,16 +69,21 @@ class RenderJob:
 
     @property
     def seconds(self) -> float:
-        """Length of the path."""
+        """Duration of the path in seconds."""
         return sum(picture.is_frame for picture in self.pictures) / self.fps
 
     @torch.no_grad()
-    def render(self, model: Model, done: Callable[[], Any] = lambda: None) -> None:
-        """Render and write everything; `done` is called after each picture. A broken-off video leaves nothing."""
+    def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
+        """Render and write all images and the video. An incomplete video is deleted.
+
+        Args:
+            model: the model, on the device to render on.
+            done: called after each image.
+        """
         frames = [picture for picture in self.pictures if picture.is_frame]
         with ExitStack() as stack:
             append = None
-            if self.video is not None:  # before the work: where it cannot be written, nothing is
+            if self.video is not None:  # before any rendering, which would be lost if the file cannot be written
                 size = (frames[0].camera.width, frames[0].camera.height)
                 append = stack.enter_context(video_writer(self.video, *size, self.fps))
             for picture in self.pictures:
@@ -87,21 +105,21 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class RenderOrder:
-    """What `nexwarp render` is asked for, in the terms of its options.
+    """The options of `nexwarp render`.
 
     Attributes:
-        path: "ellipse", "interpolate", "spiral" or a JSON file; None for no path.
-        video: file to write the path's frames to.
-        frames: of the path; None for 120, or as many as the file has.
-        fps: of the video; None for 30, or what the file says.
-        views: "test", "train", "all", or None for no still views.
-        buffers: also write passes: of the still views or, where there are none, of the frames.
-        size: "WIDTHxHEIGHT", or None for that of the cameras.
+        path: "ellipse", "interpolate", "spiral" or a JSON file; None renders no path.
+        video: video file of the path; None writes none.
+        frames: number of frames of the path; None is 120, or that of the JSON file.
+        fps: frames per second of the video; None is 30, or that of the JSON file.
+        views: "test", "train" or "all"; None renders no still views.
+        buffers: also write the buffers of the still views or, without still views, of the frames.
+        size: "WIDTHxHEIGHT" in pixels; None keeps the size of the cameras.
         scale: factor on the size of the cameras.
-        exposure: "photos", that of the photos around each camera, or "mean", one for all.
+        exposure: see `RenderOptions`.
 
     Raises:
-        ValueError: naming the option that is not as expected, in `prepare` too.
+        ValueError: the message names the option.
     """
 
     path: str | None
@@ -124,9 +142,9 @@ class RenderOrder:
         if self.frames == 0 and (self.video is not None or self.views is None):
             raise SettingError("--frames: expected at least 1 for a path or a video, got 0")
         if self.path is None and self.frames:
-            raise SettingError("--frames: expected with --path or --video, got it with --set alone")
+            raise SettingError("--frames: expected together with --path or --video, got --set alone")
         if self.fps is not None and self.video is None:
-            raise SettingError("--fps: expected with --video, got it without")
+            raise SettingError("--fps: expected together with --video, got no --video")
         if self.exposure not in get_args(Exposure):
             raise SettingError(f"--exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r}")
         self._size()
@@ -134,10 +152,10 @@ class RenderOrder:
             _check_video(self.video, FPS if self.fps is None else self.fps)
 
     def prepare(self, run: Path) -> RenderJob:
-        """Choose the cameras; writes nothing.
+        """Choose the cameras and the files; write nothing.
 
         Raises:
-            ValueError, FileNotFoundError: naming the option or file that is not as expected.
+            ValueError, FileNotFoundError: the message names the option or file.
         """
         size = self._size()
         read_run(run)
@@ -146,40 +164,40 @@ class RenderOrder:
         for group in SETS[self.views]:
             for name, camera in cameras.get(group, {}).items():
                 file = renders / group / f"{Path(name).with_suffix('')}.png"
-                pictures.append(Picture(file, size(camera), False, self.buffers))
+                pictures.append(PictureJob(file, size(camera), False, self.buffers))
         fps = FPS
         if self.path is not None and self.frames != 0:
             folder, path, fps = self._path(cameras, renders)
             first = size(path[0])
             for i, camera in enumerate(path):
                 camera = resized(size(camera), first.width, first.height)
-                pictures.append(Picture(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+                pictures.append(PictureJob(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
         return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure, self.exposure))
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
-        """Folder of the frames, cameras, frames a second."""
+        """Return the folder of the frames, their cameras, and the frames per second."""
         assert self.path is not None
         near = next((c.near for group in cameras.values() for c in group.values()), 0.01)
         if self.path not in PATHS:
             file = Path(self.path)
             if self.frames is not None:
-                raise SettingError(f"--frames: expected none with {file}, which says it itself, got {self.frames}")
+                raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
             path = load_camera_path(file, near)
             return renders / f"path_{file.stem}", path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
-        known = cameras.get("train", {})
+        views = cameras.get("train", {})
         if self.path == "interpolate":
-            known = dict(sorted((known | cameras.get("test", {})).items()))
+            views = dict(sorted((views | cameras.get("test", {})).items()))
         try:
-            return renders / self.path, PATHS[self.path](list(known.values()), count), FPS
+            return renders / self.path, PATHS[self.path](list(views.values()), count), FPS
         except ValueError as error:
             hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
             raise SettingError(f"--path {self.path}: {error}{hint}") from None
 
     def _size(self) -> Callable[[Camera], Camera]:
-        """Function that gives a camera the size asked for."""
+        """Return the function that resizes a camera's image as --size or --scale specify."""
         if not 0 < self.scale < math.inf:
             raise SettingError(f"--scale: expected a number above 0, got {self.scale:g}")
         if self.size is None:
@@ -210,7 +228,7 @@ def _check_video(path: Path, fps: float) -> None:
 
 
 def _remove_frames(folder: Path, count: int) -> None:
-    """Remove what a longer path left in its folder: frames numbered `count` and up."""
+    """Remove the frames numbered `count` and up, which an earlier, longer path left in the folder."""
     for file in folder.iterdir():
         if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= count:
             file.unlink()

@@ -1,7 +1,7 @@
-"""Compiling ahead of time: fill Warp's kernel cache with all that training and rendering with some settings need.
+"""Ahead-of-time compilation: fill Warp's kernel cache with the kernels that training and rendering need.
 
-First the catalogue's kernels, several at a time. Then a tiny training, an evaluation and a rendering really run: they
-compile whatever the catalogue lacks, so that it can cost time but leave nothing out.
+First the kernels of the catalogue are compiled, several at a time. Then a short training, an evaluation and a rendering
+run on a tiny scene and compile any kernel that the catalogue lacks. A gap in the catalogue thus costs time only.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.kernels.catalogue import thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads
-from nexwarp.kernels.ssim import LANES
+from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
@@ -33,16 +33,21 @@ ITERATIONS = 8
 
 
 class Build(NamedTuple):
-    """A kernel, and how many threads a block it is launched with: on CUDA it is compiled for that number."""
+    """A kernel to compile.
+
+    Attributes:
+        kernel: the kernel.
+        block_dim: threads per block of its launches; CUDA binaries depend on it.
+    """
 
     kernel: wp.Kernel
     block_dim: int
 
 
 def needed(config: Config, device: torch.device) -> list[Build]:
-    """Return the catalogue's kernels that settings need on a device."""
+    """Return the catalogue's kernels that training and rendering with these settings need on a device."""
     textured, cpu = config.max_hits > 0, device.type == "cpu"
-    alone = thread_kernels(
+    threads = thread_kernels(
         wp.float32,
         wp.float32 if cpu else wp.float16,
         TILE_SIZE,
@@ -50,31 +55,31 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         features=(config.texture.features,) * textured,
         clamps=(config.clamp_texture,) * textured,
         low_passes=(config.low_pass,),
-        ssim_lanes=(LANES if cpu else 1,),
+        ssim_lengths=(SIMD_WIDTH if cpu else 1,),
         cpu=cpu,
-        fixed=config.deterministic,
+        fixed_point=config.deterministic,
     )
     low_passes = (config.low_pass,)
     hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
     if config.densify.floaters or config.footprints:
-        hits.add(max(config.max_hits, 1))  # which a look for them tells by, and one at the end for footprints
-    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed=fixed)
-    return [*(Build(kernel, 256) for kernel in alone), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
+        hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
+    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
+    return [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
 
 
 def compile_all(builds: Iterable[Build], device: torch.device, done: Callable[[], None] | None = None) -> None:
     """Compile kernels, or load them from the cache, in as many threads as kernels may use.
 
-    Threads as in `wp.force_load`, which cannot tell how far it is. The compilers work without the GIL, but NVRTC parses
-    one program at a time: two threads save a third of the time on a CPU, and a tenth on CUDA.
+    Unlike `wp.force_load`, it reports its progress. The compilers release the GIL, but NVRTC parses one program at a
+    time: two threads save a third of the time on a CPU, and a tenth on CUDA.
 
     Args:
-        builds: what to compile.
-        device: where it will run.
-        done: called, in this thread, when one more is there.
+        builds: the kernels to compile.
+        device: the device to compile for.
+        done: called in this thread after each kernel.
     """
     name = "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
-    wp.synchronize_device(name)  # makes the device's context, which threads must not race for
+    wp.synchronize_device(name)  # creates the device's context, which the threads must not create concurrently
 
     def load(build: Build) -> None:
         wp.load_module(build.kernel.module, device=name, block_dim=build.block_dim)
@@ -86,10 +91,10 @@ def compile_all(builds: Iterable[Build], device: torch.device, done: Callable[[]
 
 
 def rehearse(config: Config, device: torch.device) -> None:
-    """Train for a few steps, evaluate and render, with these settings on a tiny scene; seeds the generators as a run.
+    """Train for a few steps, evaluate and render on a tiny scene with these settings; seed the generators like a run.
 
-    The steps go through every SH degree, both photo sizes, rounds of density control and steps after the last one, in
-    the order of a real run; and looks for floaters.
+    The steps cover every SH degree, both photo sizes, rounds of density control and steps after the last round, in the
+    order of a full run. The detection of floaters runs too.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
@@ -104,13 +109,13 @@ def rehearse(config: Config, device: torch.device) -> None:
 
 
 def tiny(config: Config) -> Config:
-    """Shorten a run to `ITERATIONS`, and shrink what no kernel is compiled for."""
-    step = REFERENCE_ITERATIONS // ITERATIONS  # iterations of a full run that stand for one of these
+    """Return settings for `ITERATIONS` steps, with the sizes reduced that no kernel depends on."""
+    step = REFERENCE_ITERATIONS // ITERATIONS  # iterations of a full run per iteration of this one
     return dataclasses.replace(
         config,
         iterations=ITERATIONS,
         max_surfels=POINTS,
-        sh_every=2 * step,  # 0 1 1 2 2 3 3 3
+        sh_every=2 * step,  # SH degrees of the steps: 0 1 1 2 2 3 3 3
         coarse=0.5,
         texture=dataclasses.replace(config.texture, table_size=2**10),
         densify=dataclasses.replace(config.densify, start=0, every=3, stop=ITERATIONS * step),
@@ -118,7 +123,7 @@ def tiny(config: Config) -> Config:
 
 
 def tiny_scene() -> Scene:
-    """Make two photos of noise, one of them for testing, and points before them."""
+    """Make a scene of one photo of noise, for training and testing, and random points in front of its camera."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(POINTS, 3, generator=generator) * 2 - 1
     photo = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8)
@@ -139,6 +144,6 @@ def tiny_scene() -> Scene:
 
 
 def cached_binaries() -> set[Path]:
-    """Return what lies compiled in Warp's cache."""
-    wp.init()  # finds out where the cache is
+    """Return the compiled kernels in Warp's cache."""
+    wp.init()  # sets the folder of the cache
     return {path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in BINARIES}

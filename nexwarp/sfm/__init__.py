@@ -1,4 +1,4 @@
-"""Structure from motion: bare photos to a COLMAP scene, with pycolmap, on the CPU."""
+"""Structure from motion with pycolmap on the CPU: from photos to a COLMAP scene."""
 
 from nexwarp.sfm.options import SfmOptions
 from nexwarp.sfm.pipeline import reconstruct

@@ -16,22 +16,22 @@ EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two core
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """How photos are turned into cameras and points."""
+    """Settings of structure from motion."""
 
     cameras: Cameras = "auto"
-    """Photos that share a camera: of one size, lens and EXIF focal length (auto), all, of a folder, or none (image)."""
+    """Photos that share a camera: equal size, lens and EXIF focal length (auto), all, of a folder, or none (image)."""
     camera_model: CameraModel = "auto"
     """COLMAP's lens model of the photos; auto is opencv for a camera of 5 photos or more, else simple_radial."""
     matching: Matching = "auto"
     """Compare every pair (exhaustive) or neighbours by name (sequential); auto is exhaustive up to 150 photos."""
     overlap: Annotated[int, tyro.conf.arg(metavar="N")] = 10
-    """In sequential matching, successors that a photo is compared with, next to those 2, 4, 8, ... further on."""
+    """Successors that a photo is compared with in sequential matching, in addition to those at 2, 4, 8, ... photos."""
     max_features: Annotated[int, tyro.conf.arg(metavar="N")] = 8192
-    """SIFT features a photo; fewer are quicker, more make more points."""
+    """SIFT features per photo; fewer are faster, more give more points."""
     max_image_size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 3200
-    """Longer side at which features are searched; larger photos are reduced for that alone."""
+    """Longer side for feature extraction; larger photos are reduced for this step only."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
-    """CPU threads; with 1 the same photos give the same scene, bit for bit."""
+    """CPU threads; with 1 thread the same photos give the same scene, bit for bit."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Random seed."""
 

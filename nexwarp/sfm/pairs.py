@@ -1,26 +1,28 @@
-"""Which photos are compared, and which of them turn out to hang together."""
+"""Choice of the pairs of photos to match, and connected components of the matched pairs."""
 
 from collections.abc import Iterable
 from itertools import combinations
 
-TILE = 16  # photos: those of two tiles are compared together, so that their features stay in memory
+TILE = 16  # photos; the pairs of two tiles are matched together, so that their features stay in memory
 
 
 def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
-    """Every pair (i, j) of `count` photos, i < j, tile by tile."""
+    """Return all pairs (i, j), i < j, of `count` photos, ordered by tiles."""
     return sorted(combinations(range(count), 2), key=lambda pair: (pair[0] // TILE, pair[1] // TILE, *pair))
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of `count` photos in a row: the next `overlap` ones, and those powers of two further on.
+    """Return pairs (i, j), i < j, of `count` photos in sequence.
 
-    Offsets go round, from the last photos to the first: who walks around a thing ends where the walk began.
+    Each photo is paired with its next `overlap` successors and with the successors at offsets 2, 4, 8, ...,
+    2^(overlap - 1). The first `overlap` offsets wrap around from the last photo to the first, since a capture around an
+    object ends where it began.
     """
     offsets = {*range(1, overlap + 1), *(2**k for k in range(overlap) if 2**k < count)}
     pairs = set()
     for i in range(count):
         for offset in offsets:
-            # Far neighbours need not go round: those are found from the other side.
+            # Only the first `overlap` offsets wrap around.
             if i + offset < count or offset <= overlap:
                 j = (i + offset) % count
                 if i != j:
@@ -29,7 +31,7 @@ def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def components(nodes: Iterable[str], edges: Iterable[tuple[str, str]]) -> list[set[str]]:
-    """Groups of nodes that edges join, largest first."""
+    """Return the connected components of a graph, largest first."""
     group = {node: {node} for node in nodes}
     for one, other in edges:
         if group[one] is not group[other]:

@@ -1,4 +1,4 @@
-"""Which photos there are, whether they can be read, and which of them share a camera."""
+"""The photos of a reconstruction: listing, decoding, EXIF, and grouping by camera."""
 
 import re
 import struct
@@ -12,23 +12,23 @@ from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.sfm.options import SfmOptions
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # what both PIL and pycolmap 4.2 decode
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # formats that both PIL and pycolmap 4.2 decode
 CONVERTIBLE = (".heic", ".heif", ".webp", ".avif", ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 MIN_PHOTOS = 3
-MANY = 5  # photos that carry the eight parameters of OPENCV
+MANY = 5  # photos of one camera that determine the eight parameters of OPENCV
 MAKE, MODEL = 271, 272  # EXIF tags
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A photo that can be read.
+class InputPhoto:
+    """A photo before reconstruction, without a pose.
 
     Attributes:
-        name: path below the photos' folder, "/" between its parts.
-        size: width and height in pixels, EXIF orientation not applied.
-        device: make and model of the camera as in EXIF, empty where absent.
-        focal: focal length in pixels from EXIF; None where absent.
+        name: path below the photos' folder, with "/" as separator.
+        size: width and height in pixels; EXIF orientation is not applied.
+        device: make and model of the camera from EXIF, empty if absent.
+        focal: focal length in pixels from EXIF; None if absent.
     """
 
     name: str
@@ -38,11 +38,11 @@ class Photo:
 
 
 def list_photos(folder: Path) -> list[str]:
-    """Names of the photos below `folder`, hidden files apart, in the order people number them (IMG_9 before IMG_10).
+    """Names of the photos below `folder`, without hidden files, in numeric order (IMG_9 before IMG_10).
 
     Raises:
         FileNotFoundError: no such folder.
-        ValueError: fewer than 3 photos in it.
+        ValueError: it has fewer than 3 photos.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder, expected one with photos")
@@ -58,19 +58,24 @@ def list_photos(folder: Path) -> list[str]:
     return names
 
 
-def _natural(name: str) -> list:
-    """Sort key in which numbers count as numbers; the name itself decides between 01 and 1."""
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort key that compares digits as numbers; the name itself decides between 01 and 1."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name)] + [(-1, name)]
 
 
-def read_photos(folder: Path, names: Sequence[str], done: Callable[[int], None]) -> list[Photo]:
-    """Decode every photo once, so that a damaged one is named before hours of work, and read its EXIF.
+def read_photos(folder: Path, names: Sequence[str], done: Callable[[int], None]) -> list[InputPhoto]:
+    """Decode every photo, so that a damaged one is reported before the reconstruction, and read its EXIF.
+
+    Args:
+        folder: folder of the photos.
+        names: their names below it.
+        done: called with the number of photos that were read.
 
     Raises:
         ValueError: a photo cannot be decoded.
     """
-    photos = []
-    with ThreadPoolExecutor() as pool:  # decoding frees the GIL
+    photos: list[InputPhoto] = []
+    with ThreadPoolExecutor() as pool:  # decoding releases the GIL
         jobs = [pool.submit(_read_photo, folder, name) for name in names]
         try:
             for count, job in enumerate(jobs, start=1):
@@ -82,7 +87,7 @@ def read_photos(folder: Path, names: Sequence[str], done: Callable[[int], None])
     return photos
 
 
-def _read_photo(folder: Path, name: str) -> Photo:
+def _read_photo(folder: Path, name: str) -> InputPhoto:
     pycolmap = pycolmap_module()
     path = folder / name
     height, width = read_image(path).shape[:2]
@@ -93,7 +98,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
     if (camera.width, camera.height) != (width, height):
         raise ValueError(f"{path}: expected {width}x{height}, pycolmap reads {camera.width}x{camera.height}")
     focal = camera.focal_length if camera.has_prior_focal_length else None
-    return Photo(name, (width, height), _device(path), focal)
+    return InputPhoto(name, (width, height), _device(path), focal)
 
 
 def _device(path: Path) -> tuple[str, str]:
@@ -103,23 +108,28 @@ def _device(path: Path) -> tuple[str, str]:
         with Image.open(path) as image:
             exif = image.getexif()
             return str(exif.get(MAKE, "")), str(exif.get(MODEL, ""))
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error):  # damaged EXIF says nothing
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error):  # damaged EXIF counts as absent
         return "", ""
 
 
-def camera_groups(folder: Path, photos: Sequence[Photo], cameras: str) -> list[list[Photo]]:
-    """Split photos into those that share a camera.
+def camera_groups(folder: Path, photos: Sequence[InputPhoto], cameras: str) -> list[list[InputPhoto]]:
+    """Group photos that share a camera.
+
+    Args:
+        folder: folder of the photos, for messages.
+        photos: the photos.
+        cameras: `SfmOptions.cameras`.
 
     Raises:
-        ValueError: photos that shall share a camera differ in size.
+        ValueError: photos of one group differ in size.
     """
-    keys = {
+    keys: dict[str, Callable[[InputPhoto], object]] = {
         "auto": lambda p: (p.size, p.device, p.focal and round(p.focal)),
         "single": lambda p: (),
         "folder": lambda p: p.name.rpartition("/")[0],
         "image": lambda p: p.name,
     }
-    groups: dict[object, list[Photo]] = {}
+    groups: dict[object, list[InputPhoto]] = {}
     for photo in photos:
         groups.setdefault(keys[cameras](photo), []).append(photo)
     for group in groups.values():
@@ -132,8 +142,8 @@ def camera_groups(folder: Path, photos: Sequence[Photo], cameras: str) -> list[l
     return list(groups.values())
 
 
-def camera_model(group: Sequence[Photo], options: SfmOptions) -> str:
-    """COLMAP's name of the camera model of photos that share one."""
+def camera_model(group: Sequence[InputPhoto], options: SfmOptions) -> str:
+    """COLMAP's name of the camera model for photos that share a camera."""
     if options.camera_model != "auto":
         return options.camera_model.upper()
     return "OPENCV" if len(group) >= MANY else "SIMPLE_RADIAL"

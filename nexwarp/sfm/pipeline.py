@@ -1,4 +1,4 @@
-"""Photos to a scene, stage by stage."""
+"""The stages of structure from motion, from photos to a scene."""
 
 import dataclasses
 import os
@@ -10,54 +10,57 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING
 
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.io.json_files import write_json
 from nexwarp.sfm.colmap_scene import move_scene
 from nexwarp.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.sfm.pairs import exhaustive_pairs, sequential_pairs
-from nexwarp.sfm.photos import Photo, camera_groups, camera_model, list_photos, read_photos
-from nexwarp.sfm.report import Overlaps, SfmReport, advise, left_out
+from nexwarp.sfm.photos import InputPhoto, camera_groups, camera_model, list_photos, read_photos
+from nexwarp.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out
 from nexwarp.sfm.work import Count, open_database, quiet, run_stage
 
+if TYPE_CHECKING:
+    import pycolmap
+
 REPORT_FILE = "sfm.json"
-JPEG_QUALITY = 95  # of undistorted photos; those in other formats stay lossless
-MATCH_BLOCK = 16  # pairs between two looks at an interruption
-MIN_MODEL = 3  # photos
+JPEG_QUALITY = 95  # of undistorted JPEG photos; other formats are lossless
+MATCH_BLOCK = 16  # pairs between two checks for an interruption
+MIN_MODEL = 3  # photos of a model
 
 Observer = Callable[[str, int, int], None]
 
 
 def reconstruct(
-    photos: str | os.PathLike,
-    scene: str | os.PathLike,
+    photos: str | os.PathLike[str],
+    scene: str | os.PathLike[str],
     options: SfmOptions | None = None,
     *,
     overwrite: bool = False,
     observe: Observer = lambda stage, done, total: None,
 ) -> SfmReport:
-    """Find cameras and points of photos, and write a COLMAP scene that `load_scene` reads.
+    """Estimate the cameras and points of photos, and write a COLMAP scene for `load_scene`.
 
-    The scene holds images/ (undistorted, names as given), sparse/0 (PINHOLE cameras) and sfm.json (the report and the
-    options). It is made in a temporary folder beside `scene` and renamed at the end; nothing stays after a failure or
-    an interruption.
+    The scene holds images/ (undistorted, with the given names), sparse/0 (PINHOLE cameras) and sfm.json (the report and
+    the options). It is written to a temporary folder beside `scene` and renamed at the end; a failure or interruption
+    leaves no files.
 
     Args:
-        photos: folder of the photos; subfolders count, hidden files do not.
-        scene: folder to write; must not exist, or be empty.
-        options: settings; the defaults when None.
-        overwrite: replace `scene` when it is one that this function wrote.
-        observe: called with a stage's name, what is done and of how many, now and then.
+        photos: folder of the photos, searched with its subfolders; hidden files are ignored.
+        scene: folder to write; must be empty or absent.
+        options: settings; None is the defaults.
+        overwrite: replace `scene` if this function wrote it.
+        observe: called repeatedly with the stage's name, the number of finished items and their total.
 
     Returns:
-        What became of the photos.
+        The report.
 
     Raises:
         FileNotFoundError: no folder `photos`.
         FileExistsError: `scene` exists and may not be replaced.
-        ValueError: an option out of range, too few photos, one that cannot be decoded, sizes that differ within a
-            camera, or no model could be made of them; then the message says what to do.
+        ValueError: an option out of range, fewer than 3 photos, a photo that cannot be decoded, photos of one camera
+            that differ in size, or no model was found; then the message gives advice.
     """
     photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
     options.check()
@@ -80,7 +83,7 @@ def reconstruct(
 
 @dataclass
 class _Work:
-    """The stages, with what they hand on to each other: COLMAP's database in a temporary folder."""
+    """The stages; they share COLMAP's database in a temporary folder."""
 
     photos: Path
     folder: Path
@@ -141,32 +144,33 @@ class _Work:
         self.observe(title, total, total)
         self.seconds[title] = time.perf_counter() - start
 
-    def _import(self, groups: Sequence[Sequence[Photo]]) -> None:
-        """Enter photos and cameras in the database, in one order always: the mapper's result depends on it."""
-        pycolmap = pycolmap_module()
-        with open_database(self.database):  # makes it
+    def _import(self, groups: Sequence[Sequence[InputPhoto]]) -> None:
+        """Enter photos and cameras in the database, in a fixed order, since the mapper's result depends on it."""
+        with open_database(self.database):  # creates the file
             pass
         for group in groups:
-            reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = camera_model(group, self.options)
-            names = [photo.name for photo in group]
-            run_stage(
-                "features",
-                lambda _, names=names, reader=reader: pycolmap.import_images(
-                    self.database, self.photos, pycolmap.CameraMode.SINGLE, names, reader
-                ),
-                lambda: None,
-            )
+            self._import_group(group)
         by_name = {photo.name: group for group in groups for photo in group}
         with open_database(self.database) as database:
             camera_of = {image.camera_id: by_name[image.name] for image in database.read_all_images()}
             for camera in database.read_all_cameras():
                 focals = [photo.focal for photo in camera_of[camera.camera_id] if photo.focal]
-                if focals:  # COLMAP looks at the first photo alone
+                if focals:  # COLMAP uses the first photo only
                     for index in camera.focal_length_idxs():
                         camera.params[index] = median(focals)
                 camera.has_prior_focal_length = bool(focals)
                 database.update_camera(camera)
+
+    def _import_group(self, group: Sequence[InputPhoto]) -> None:
+        pycolmap = pycolmap_module()
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = camera_model(group, self.options)
+        names = [photo.name for photo in group]
+        run_stage(
+            "features",
+            lambda _: pycolmap.import_images(self.database, self.photos, pycolmap.CameraMode.SINGLE, names, reader),
+            lambda: None,
+        )
 
     def _extract(self, names: Sequence[str], done: Callable[[int], None]) -> None:
         pycolmap = pycolmap_module()
@@ -198,7 +202,7 @@ class _Work:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.block_size = MATCH_BLOCK
         pairing.match_list_path = self.folder / "pairs.txt"
-        # COLMAP splits the list at spaces, which names may hold.
+        # COLMAP splits the lines of this file at spaces, so photos are renamed to numbers without spaces.
         Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in pairs))
         self._rename({name: str(index) for index, name in enumerate(names)})
         with open_database(self.database) as database:
@@ -226,15 +230,15 @@ class _Work:
         with open_database(self.database) as database:
             images = {image.image_id: image.name for image in database.read_all_images()}
             features = {name: database.num_keypoints_for_image(index) for index, name in images.items()}
-            inliers = {}
+            inliers: dict[tuple[str, str], int] = {}
             for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
                 if count:
                     one, other = pycolmap.pair_id_to_image_pair(pair)
                     inliers[images[one], images[other]] = count
         return Overlaps(features, inliers, pairs, sequential)
 
-    def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list[Any]:
-        """All models, the one to keep first."""
+    def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list["pycolmap.Reconstruction"]:
+        """Return all models, largest first."""
         pycolmap = pycolmap_module()
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = self.threads
@@ -273,8 +277,8 @@ class _Work:
             )
         return models
 
-    def _undistort(self, model: Any, done: Callable[[int], None]) -> list[tuple[int, int]]:
-        """Write the scene; return the sizes of its photos."""
+    def _undistort(self, model: "pycolmap.Reconstruction", done: Callable[[int], None]) -> list[tuple[int, int]]:
+        """Write the scene; return the distinct sizes of its photos."""
         pycolmap = pycolmap_module()
         chosen, output = self.folder / "model", self.folder / "undistorted"
         chosen.mkdir()
@@ -294,30 +298,30 @@ class _Work:
         return move_scene(output, self.folder / "scene")
 
 
-def _names(model: Any) -> list[str]:
+def _names(model: "pycolmap.Reconstruction") -> list[str]:
     return [model.image(index).name for index in model.reg_image_ids()]
 
 
-def _cameras(model: Any, photos: dict[str, Photo]) -> list[dict[str, Any]]:
-    """Describe the cameras of a model before undistortion."""
+def _cameras(model: "pycolmap.Reconstruction", photos: dict[str, InputPhoto]) -> list[EstimatedCamera]:
+    """The cameras of a model before undistortion, by ascending id."""
     names: dict[int, list[str]] = {}
     for index in model.reg_image_ids():
         names.setdefault(model.image(index).camera_id, []).append(model.image(index).name)
     return [
-        {
-            "model": model.camera(index).model.name,
-            "params": [float(value) for value in model.camera(index).params],
-            "width": model.camera(index).width,
-            "height": model.camera(index).height,
-            "photos": len(members),
-            "exif_focal": any(photos[name].focal for name in members),
-        }
+        EstimatedCamera(
+            model=model.camera(index).model.name,
+            params=[float(value) for value in model.camera(index).params],
+            width=model.camera(index).width,
+            height=model.camera(index).height,
+            photos=len(members),
+            exif_focal=any(photos[name].focal for name in members),
+        )
         for index, members in sorted(names.items())
     ]
 
 
 def _check_target(photos: Path, scene: Path, overwrite: bool) -> None:
-    """Refuse to write where that would harm something, before any work."""
+    """Raise FileExistsError or ValueError if `scene` may not be written, before any work."""
     source, target = photos.resolve(), scene.resolve()
     if source.is_relative_to(target) or target.is_relative_to(source):
         raise ValueError(f"{scene}: expected a scene folder apart from the photos in {photos}")
@@ -333,7 +337,7 @@ def _check_target(photos: Path, scene: Path, overwrite: bool) -> None:
 
 @contextmanager
 def _parents(scene: Path) -> Iterator[None]:
-    """Make the folders above `scene`; take those away again that stay empty because of an error."""
+    """Create the folders above `scene`; after an error, remove those of them that are empty."""
     missing = [folder for folder in scene.absolute().parents if not folder.exists()]
     scene.absolute().parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -342,13 +346,13 @@ def _parents(scene: Path) -> Iterator[None]:
         for folder in missing:
             try:
                 folder.rmdir()
-            except OSError:  # not empty: somebody else uses it
+            except OSError:  # not empty
                 break
         raise
 
 
 def _publish(made: Path, scene: Path, aside: Path) -> None:
-    """Rename `made` to `scene`; an old scene goes to `aside`, and back if that fails."""
+    """Rename `made` to `scene`. An existing scene is moved to `aside`, and moved back if that fails."""
     if not scene.exists():
         made.rename(scene)
         return

@@ -1,25 +1,24 @@
-"""What became of the photos, and what to do when too few of them got a camera."""
+"""The report of a reconstruction: registered photos, reasons for the others, advice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from nexwarp.sfm.pairs import components
 
 FEW_FEATURES = 500  # a photo
-GOOD_SHARE = 0.9  # of the photos: below, the report says what to do
-LISTED = 8
+GOOD_SHARE = 0.9  # share of registered photos below which the report gives advice
+LISTED = 8  # entries of a list in the report
 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """What features and matches say about the photos.
+    """Features and matches of the photos.
 
     Attributes:
         features: number of features of each photo, by name.
-        inliers: number of matches of a pair that agree with one camera motion, by names; pairs without are left out.
-        pairs: number of pairs compared.
-        sequential: only neighbours were compared.
+        inliers: number of geometrically verified matches of a pair, by names; only pairs with at least one.
+        pairs: number of compared pairs.
+        sequential: whether only neighbours were compared.
     """
 
     features: dict[str, int]
@@ -29,25 +28,45 @@ class Overlaps:
 
 
 @dataclass(frozen=True)
-class SfmReport:
-    """A finished reconstruction.
+class EstimatedCamera:
+    """A camera of the photos before undistortion.
 
     Attributes:
-        photos: number of photos given.
-        registered: names of those that got a camera, in the scene's order.
-        left_out: reason why each other photo has none, by name.
+        model: COLMAP's name of its model.
+        params: parameters in COLMAP's order, pixels.
+        width: width of its photos, pixels.
+        height: height of its photos, pixels.
+        photos: number of registered photos that share it.
+        exif_focal: whether EXIF gave its initial focal length.
+    """
+
+    model: str
+    params: list[float]
+    width: int
+    height: int
+    photos: int
+    exif_focal: bool
+
+
+@dataclass(frozen=True)
+class SfmReport:
+    """The result of a reconstruction.
+
+    Attributes:
+        photos: number of given photos.
+        registered: names of the photos with an estimated pose, in the scene's order.
+        left_out: name -> reason, for each photo without a pose.
         points: number of 3D points.
-        mean_track_length: photos that see a point.
-        mean_reprojection_error: over the points, in pixels of the photos as given.
-        models: number of photos of each model found, largest first; the first is the one kept.
-        cameras: each camera of the photos as given: its model, parameters, number of photos, and whether EXIF gave the
-            focal length to start from.
-        sizes: widths and heights of the undistorted photos.
-        pairs: number of pairs compared.
-        matched_pairs: number of them that overlap.
+        mean_track_length: mean number of photos that see a point.
+        mean_reprojection_error: mean over the points, in pixels of the given photos.
+        models: number of photos of each model that was found, largest first; the scene is the first one.
+        cameras: the cameras of the photos before undistortion.
+        sizes: distinct widths and heights of the undistorted photos.
+        pairs: number of compared pairs.
+        matched_pairs: number of compared pairs that overlap.
         matching: "exhaustive" or "sequential".
-        seconds: of wall clock, by stage.
-        advice: what to do to get more photos registered; empty when all is well.
+        seconds: wall-clock time of each stage.
+        advice: how to get more photos registered; empty if 90 % or more are registered.
     """
 
     photos: int
@@ -57,7 +76,7 @@ class SfmReport:
     mean_track_length: float
     mean_reprojection_error: float
     models: list[int]
-    cameras: list[dict[str, Any]]
+    cameras: list[EstimatedCamera]
     sizes: list[tuple[int, int]]
     pairs: int
     matched_pairs: int
@@ -66,7 +85,7 @@ class SfmReport:
     advice: list[str]
 
     def rows(self) -> dict[str, str]:
-        """Lines of a table."""
+        """The figures as rows of a table: name -> text."""
         rows = {
             "registered": f"{len(self.registered)} of {self.photos} photos",
             "points": f"{self.points:,}",
@@ -76,9 +95,9 @@ class SfmReport:
             "undistorted photos": ", ".join(f"{width}x{height}" for width, height in self.sizes[:LISTED]),
         }
         for index, camera in enumerate(self.cameras[:LISTED]):
-            prior = "EXIF prior" if camera["exif_focal"] else "no EXIF focal length"
-            values = " ".join(f"{value:.5g}" for value in camera["params"])
-            rows[f"camera {index + 1}"] = f"{camera['model']} {values}, {camera['photos']} photos, {prior}"
+            prior = "EXIF prior" if camera.exif_focal else "no EXIF focal length"
+            values = " ".join(f"{value:.5g}" for value in camera.params)
+            rows[f"camera {index + 1}"] = f"{camera.model} {values}, {camera.photos} photos, {prior}"
         if len(self.cameras) > LISTED:
             rows["more cameras"] = str(len(self.cameras) - LISTED)
         if len(self.models) > 1:
@@ -87,7 +106,7 @@ class SfmReport:
         return rows
 
     def lines(self) -> list[str]:
-        """Which photos were left out and what to do about it, a sentence each."""
+        """The photos that were left out and the advice, one line each."""
         names = list(self.left_out)
         lines = [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
         if len(names) > LISTED:
@@ -96,14 +115,18 @@ class SfmReport:
 
 
 def left_out(overlaps: Overlaps, registered: Sequence[str], models: Sequence[Sequence[str]]) -> dict[str, str]:
-    """Say of every photo that is not registered why.
+    """Give the reason for each photo that is not registered.
 
     Args:
-        overlaps: of all photos.
-        registered: names in the model that is kept.
-        models: names in each model found.
+        overlaps: features and matches of all photos.
+        registered: names of the photos in the model that becomes the scene.
+        models: names of the photos in each model.
+
+    Returns:
+        Name -> reason.
     """
-    kept, reasons = set(registered), {}
+    kept = set(registered)
+    reasons: dict[str, str] = {}
     for name, count in overlaps.features.items():
         if name in kept:
             continue
@@ -124,7 +147,15 @@ def left_out(overlaps: Overlaps, registered: Sequence[str], models: Sequence[Seq
 
 
 def advise(overlaps: Overlaps, registered: int) -> list[str]:
-    """What to do to get more photos registered, most promising first; nothing when nearly all are."""
+    """Advice on how to get more photos registered, most promising first.
+
+    Args:
+        overlaps: features and matches of all photos.
+        registered: number of registered photos.
+
+    Returns:
+        Sentences; none if 90 % or more of the photos are registered.
+    """
     count = len(overlaps.features)
     if registered >= GOOD_SHARE * count:
         return []

@@ -19,7 +19,7 @@ CHECKPOINT_VERSION = 1
 CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
 
 
-def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, Any]) -> None:
+def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, object]) -> None:
     """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all.
 
     The one before stays, as `run/checkpoint.old`. A kill or a power cut at any moment leaves at least one whole.
@@ -106,6 +106,6 @@ def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, A
         raise CheckpointError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
 
 
-def _digest(record: Mapping[str, Any]) -> str:
+def _digest(record: Mapping[str, object]) -> str:
     """Checksum of what JSON makes of a record, whatever the order of its keys."""
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()

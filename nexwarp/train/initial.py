@@ -1,8 +1,6 @@
 """What a run starts from: surfels on points of the cloud, and a texture as fine as the photos."""
 
-import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +8,7 @@ import torch
 from nexwarp.data import Scene, initial_points
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import TextureShape
 from nexwarp.train.config import Config
 
 INITIAL_OPACITY = 0.1
@@ -70,23 +69,29 @@ def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
     )
 
 
-def texture_shape(scene: Scene, config: Config) -> dict[str, Any]:
+def texture_shape(scene: Scene, config: Config) -> TextureShape:
     """Arguments of `NeuralTexture`, with resolutions that follow the scene when the config leaves them open.
 
     The finest level's cells are as small as the pixels of nearly all training views at the points they see (95th
     percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing. The table is as
     large as the photos can fill: with more numbers than pixels, it learns each photo by heart.
     """
-    shape = dataclasses.asdict(config.texture)
-    if shape["sh_degree"] is None:
-        shape["sh_degree"] = config.sh_degree
-    if shape["table_size"] is None:
-        shape["table_size"] = _table_size(scene, shape["levels"] * shape["features"])
-    if shape["max_resolution"] is None:
-        shape["max_resolution"] = _pixel_resolution(scene)
-    if shape["min_resolution"] is None:
-        shape["min_resolution"] = min(64.0 / scene.scale, shape["max_resolution"] / 4)
-    return shape
+    asked = config.texture
+    finest = _pixel_resolution(scene) if asked.max_resolution is None else asked.max_resolution
+    coarsest = min(64.0 / scene.scale, finest / 4) if asked.min_resolution is None else asked.min_resolution
+    entries = _table_size(scene, asked.levels * asked.features) if asked.table_size is None else asked.table_size
+    return {
+        "levels": asked.levels,
+        "table_size": entries,
+        "features": asked.features,
+        "min_resolution": coarsest,
+        "max_resolution": finest,
+        "width": asked.width,
+        "hidden_layers": asked.hidden_layers,
+        "sh_degree": config.sh_degree if asked.sh_degree is None else asked.sh_degree,
+        "residual": asked.residual,
+        "down_weighting": asked.down_weighting,
+    }
 
 
 def cells_unit(scene: Scene, config: Config) -> float:

@@ -80,11 +80,10 @@ def training_losses(
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
     """
     factors, has_slots = loss_weights, weights.shape[-1] > 0
+    _check_masks(image, mask=mask, empty=empty)
     if mask is not None:
-        check_tensors({"mask": (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
         image, textured, weights = _masked(image, textured, weights, target, mask)
     if empty is not None:
-        check_tensors({"empty": (empty, image.shape[:2])}, dtype=torch.bool, device=image.device)
         _, textured, weights = _masked(image, textured, weights, target, ~empty)
     # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
     all_count = weights.shape[-1] <= factors.alpha_hits
@@ -105,11 +104,17 @@ def training_losses(
         "texture": texture_term,
         "alpha": alpha_term,
         "opacity": factors.opacity * opacity_loss(opacities) if factors.opacity > 0.0 else None,
-        "grid": None,
     }
     if factors.grid > 0.0 and grid is not None and resolutions is not None:
         terms["grid"] = factors.grid * grid_loss(grid, resolutions)
     return {name: term for name, term in terms.items() if term is not None}
+
+
+def _check_masks(image: torch.Tensor, **masks: torch.Tensor | None) -> None:
+    """Raise TypeError or ValueError unless each mask that is there is bool, of the image's size and on its device."""
+    for name, mask in masks.items():
+        if mask is not None:
+            check_tensors({name: (mask, image.shape[:2])}, dtype=torch.bool, device=image.device)
 
 
 def _computed(term: torch.Tensor | None) -> torch.Tensor:

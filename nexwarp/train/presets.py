@@ -1,7 +1,8 @@
 """The presets, and settings read back from a run's config.json."""
 
 import dataclasses
-from typing import Any, get_args, get_origin, get_type_hints
+from collections.abc import Mapping
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.train.config import LARGEST_NUMBER, Config, LearningRates, TextureConfig
@@ -9,7 +10,7 @@ from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
 
 # The demo is small enough for two CPU cores: a short run, so its steps are larger.
-DEMO_SETTINGS: dict[str, Any] = {
+DEMO_SETTINGS: dict[str, object] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
@@ -32,8 +33,11 @@ DEMO_SETTINGS: dict[str, Any] = {
 PARTS = ("losses", "rates", "texture", "densify")
 
 
-def _part(base: Any, data: Any, where: str) -> Any:
-    """A part of the settings."""
+Part = TypeVar("Part", LossWeights, LearningRates, TextureConfig, DensifyConfig)
+
+
+def _part(base: Part, data: Mapping[str, object], where: str) -> Part:
+    """A part of the settings: those of `base`, changed by what `data` holds."""
     return dataclasses.replace(base, **_checked(type(base), _tuples(data), where))
 
 
@@ -41,11 +45,11 @@ class KindError(ValueError):
     """A setting's value is not of its type."""
 
 
-def _tuples(data: dict[str, Any]) -> dict[str, Any]:
+def _tuples(data: Mapping[str, object]) -> dict[str, object]:
     return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
 
 
-def _checked(cls: type, data: dict[str, Any], where: str) -> dict[str, Any]:
+def _checked(cls: type, data: dict[str, object], where: str) -> dict[str, Any]:
     """Return settings whose values have their fields' types; numbers are finite."""
     types = get_type_hints(cls)
     for name, value in data.items():
@@ -55,14 +59,14 @@ def _checked(cls: type, data: dict[str, Any], where: str) -> dict[str, Any]:
     return data
 
 
-def _fits(value: Any, kind: Any) -> bool:
+def _fits(value: object, kind: object) -> bool:
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
         return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_fits, value, kinds))
     if get_args(kind):  # a union
         return any(_fits(value, one) for one in get_args(kind))
     if isinstance(value, bool) or kind not in (int, float):
-        return isinstance(value, kind)
+        return isinstance(kind, type) and isinstance(value, kind)
     if not isinstance(value, int if kind is int else (int, float)):
         return False
     return abs(value) <= LARGEST_NUMBER
@@ -101,7 +105,7 @@ def preset(name: str) -> Config:
     return PRESETS[name]
 
 
-def config_from_dict(data: dict[str, Any]) -> Config:
+def config_from_dict(data: Mapping[str, Any]) -> Config:
     """Rebuild a config from `Config.as_dict`; ValueError names an unknown key.
 
     Settings that an older version did not write are those of the preset that the run started from.

@@ -2,17 +2,15 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import get_args, get_origin, get_type_hints
 
-from nexwarp.train.config import (
-    LARGEST_NUMBER,
-    Config,
-)
+from nexwarp.io.json_files import Json
+from nexwarp.train.config import LARGEST_NUMBER, Config
 
 
-def with_settings(config: Config, settings: dict[str, Any]) -> Config:
+def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
     """Return a config with some settings replaced.
 
     Args:
@@ -22,7 +20,7 @@ def with_settings(config: Config, settings: dict[str, Any]) -> Config:
     Raises:
         ValueError: there is no setting of that name, or its value is of another type or out of range.
     """
-    changes: dict[str, dict[str, Any]] = {}
+    changes: dict[str, dict[str, object]] = {}
     for name, value in settings.items():
         part, key = _find_setting(config, name)
         hints = get_type_hints(type(getattr(config, part) if part else config))
@@ -33,16 +31,16 @@ def with_settings(config: Config, settings: dict[str, Any]) -> Config:
             whole[part] = dataclasses.replace(getattr(config, part), **values)
         except ValueError as error:  # which names the setting without the part
             raise ValueError(f"{part}.{error}") from None
-    return dataclasses.replace(config, **whole)
+    return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # _typed has checked them
 
 
-def setting(config: Config, name: str) -> Any:
+def setting(config: Config, name: str) -> object:
     """Return the value of a setting, named as `with_settings` names it; ValueError when there is none."""
     part, key = _find_setting(config, name)
     return getattr(getattr(config, part) if part else config, key)
 
 
-def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
+def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
     """Read settings as a person types them.
 
     Args:
@@ -54,7 +52,7 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
     Raises:
         ValueError: no KEY=VALUE, or a KEY twice.
     """
-    settings: dict[str, Any] = {}
+    settings: dict[str, Json] = {}
     for text in texts:
         name, equals, value = (x.strip() for x in text.partition("="))
         if not (name and equals and value):
@@ -81,13 +79,14 @@ def _find_setting(config: Config, name: str) -> tuple[str, str]:
     raise ValueError(f"{name}: expected a setting, such as {', '.join(close or known[1:5])}")
 
 
-def _typed(name: str, value: Any, annotation: Any) -> Any:
+def _typed(name: str, value: object, annotation: object) -> object:
     """Return a value as its annotation has it: int where float is meant and list for tuple will do."""
     options = [annotation] if annotation in (int, float, bool, str) else _alternatives(annotation)
     for option in options:
-        if option is float and type(value) in (int, float) and abs(value) <= LARGEST_NUMBER:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
+        if option is float and number and isinstance(value, (int, float)):
             return float(value)
-        if option is int and type(value) is int and abs(value) <= LARGEST_NUMBER:
+        if option is int and number and isinstance(value, int):
             return value
         if option in (bool, str, type(None)) and type(value) is option:
             return value
@@ -97,13 +96,19 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
     raise ValueError(f"{name}: expected {expected}, got {json.dumps(value, default=repr)[:60]}")
 
 
-def _alternatives(annotation: Any) -> tuple[Any, ...]:
+def _alternatives(annotation: object) -> tuple[object, ...]:
     """Members of a union; anything else alone."""
     return (annotation,) if get_origin(annotation) is tuple else get_args(annotation)
 
 
-def _described(kind: Any) -> str:
+def _described(kind: object) -> str:
     if get_origin(kind) is tuple:
         return f"a list of {len(get_args(kind))} numbers"
-    names = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+    names: dict[object, str] = {
+        int: "an integer",
+        float: "a number",
+        bool: "true or false",
+        str: "text",
+        type(None): "null",
+    }
     return names[kind]

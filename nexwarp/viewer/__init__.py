@@ -1,4 +1,4 @@
-"""The viewer: a trained scene, or one in training, in the browser (extra `viewer`)."""
+"""The viewer: shows a model in the browser, during or after training (extra `viewer`)."""
 
 from nexwarp.viewer.server import check_server
 from nexwarp.viewer.viewer import Viewer

@@ -1,10 +1,9 @@
-"""Camera paths: keyframes, the smooth way between them, and nerfstudio's JSON for `nexwarp render --path`."""
+"""Camera paths: keyframes, their interpolation, and nerfstudio's JSON for `nexwarp render --path`."""
 
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ MAX_FRAMES = 20_000
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A camera of a path.
+    """A camera that a path passes through.
 
     Attributes:
         pose: (4, 4) float64 camera to world, x right, y down, z forward.
@@ -27,10 +26,10 @@ class Keyframe:
 
 
 def interpolate(keyframes: Sequence[Keyframe], count: int, closed: bool = False) -> list[Keyframe]:
-    """Return `count` cameras on a smooth path through the keyframes, the same time from each to the next.
+    """Return `count` cameras on a smooth path through the keyframes, with equal time between neighbours.
 
-    An open path starts at the first and ends at the last keyframe. A closed one goes on to the first again, which is
-    not repeated at the end. Positions and angles of view go along cubic splines, rotations along a rotation spline.
+    An open path starts at the first and ends at the last keyframe. A closed path returns to the first keyframe without
+    repeating it at the end. Positions and fields of view follow cubic splines, rotations follow a rotation spline.
 
     Raises:
         ValueError: fewer than two keyframes, or `count` < 2.
@@ -43,11 +42,11 @@ def interpolate(keyframes: Sequence[Keyframe], count: int, closed: bool = False)
         raise ValueError(f"keyframes: expected at least two, got {n}")
     if count < 2:
         raise ValueError(f"count: expected at least 2, got {count}")
-    # A closed path's keyframes go round once more at each end, so that the splines pass the seam as any keyframe.
+    # A closed path repeats all keyframes at each end, so that the splines are smooth at the seam.
     order = np.arange(-n, 2 * n + 1) if closed else np.arange(n)
     times = np.linspace(0, n, count, endpoint=False) if closed else np.linspace(0, n - 1, count)
     poses = np.stack([keyframes[i % n].pose for i in order])
-    # Positions and log of the focal length share a spline; a focal length stays positive that way.
+    # Interpolating log tan(fov / 2) keeps the focal length positive.
     zooms = [math.log(math.tan(keyframes[i % n].fov / 2.0)) for i in order]
     smooth = CubicSpline(order, np.column_stack([poses[:, :3, 3], zooms]))(times)
     rotations = RotationSpline(order, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
@@ -62,18 +61,18 @@ def interpolate(keyframes: Sequence[Keyframe], count: int, closed: bool = False)
 def path_json(
     keyframes: Sequence[Keyframe], width: int, height: int, fps: float, seconds: float, closed: bool = False
 ) -> bytes:
-    """Write a path through keyframes as nerfstudio's camera-path JSON, one camera a frame.
+    """Return a path through keyframes as nerfstudio's camera-path JSON in UTF-8, one camera for each frame.
 
     Args:
         keyframes: at least two.
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
+        width: width of the frames, pixels.
+        height: height of the frames, pixels.
         fps: frames a second.
-        seconds: length of the video.
+        seconds: duration of the video.
         closed: return to the first keyframe.
 
     Raises:
-        ValueError: too few keyframes, sizes or times that are not positive, more than 20,000 frames.
+        ValueError: fewer than two keyframes, a size or time that is not positive, or more than 20,000 frames.
     """
     for name, value in (("width", width), ("height", height), ("fps", fps), ("seconds", seconds)):
         if not (math.isfinite(value) and value > 0):
@@ -81,7 +80,7 @@ def path_json(
     count = max(round(fps * seconds), 2)
     if count > MAX_FRAMES:
         raise ValueError(f"seconds: expected at most {MAX_FRAMES:,} frames, got {count:,} ({seconds:g} s at {fps:g})")
-    data: dict[str, Any] = {"render_width": width, "render_height": height, "fps": fps, "seconds": seconds}
+    data: dict[str, object] = {"render_width": width, "render_height": height, "fps": fps, "seconds": seconds}
     data["camera_path"] = [
         {
             "camera_to_world": (frame.pose @ OPENGL).ravel().tolist(),

@@ -1,9 +1,8 @@
-"""What the viewer shows of a rendering: every buffer as a picture, and a legend that says how to read it."""
+"""Display modes of the viewer: each shows one buffer of a rendering as a picture, with a legend."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,32 +18,33 @@ MODES = {
     "image": "The picture: plain + textured + background.",
     "plain": "Blended colours of the surfels themselves, without the K textured hits and without background.",
     "textured": "Sum over the K heaviest hits of weight * texture colour.",
-    "ids": "Which surfel the hit is, one colour each.",
+    "ids": "Index of the hit's surfel, one colour for each surfel.",
     "depth": "z-depth of the hit, in units of the scene; colours span the 2nd to 98th percentile of this view.",
     "weights": "Blending weight of the hit.",
-    "normal": "Normal of the hit's surfel, turned towards the camera; world x, y, z as red, green, blue.",
-    "alpha": "1 - transmittance left behind the last surfel.",
-    "hit count": f"How many of a pixel's {MAX_HITS} heaviest hits weigh at least 2 %.",
+    "normal": "Normal of the hit's surfel, facing the camera; world x, y, z as red, green, blue.",
+    "alpha": "1 - transmittance after the last surfel.",
+    "hit count": f"Number of hits with a weight of at least 2 %, among the {MAX_HITS} heaviest of each pixel.",
 }
 TEXTURED = ("image", "textured")
 """Modes that need the neural texture."""
 BY_SLOT = ("ids", "depth", "weights", "normal")
 """Modes that show one of the K hits."""
-COUNTED = 0.02  # a hit's weight from which "hit count" counts it; nearly all pixels have more than 8 in all
+COUNTED = 0.02  # smallest weight that "hit count" counts; nearly all pixels have more than 8 hits in total
 QUANTILE_SAMPLES = 100_000
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a client asks to see; a value out of its range is taken to the nearest end.
+    """Display settings of one client.
 
     Attributes:
         mode: a key of `MODES`.
         max_hits: K, 0 to 8.
         sh_degree: 0 to 3.
-        slot: which hit to show in the modes of `BY_SLOT`, 1 (heaviest) to 8.
-        as_trained: weight the texture's levels as at the photos' resolution where the picture's is finer.
-        photo_exposure: show colours at the exposure of the photos around, not at the mean one.
+        slot: rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8.
+        as_trained: where the picture's resolution is finer than the photos', weight the texture's levels as at the
+            photos' resolution.
+        photo_exposure: use the exposure of the nearby photos instead of the mean exposure.
     """
 
     mode: str = "image"
@@ -54,29 +54,52 @@ class Settings:
     as_trained: bool = True
     photo_exposure: bool = True
 
-    def changed(self, **values: Any) -> "Settings":
-        """Return these settings with other values, which may be anything; ValueError for what cannot be meant."""
-        if values.get("mode", self.mode) not in MODES:
-            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {values['mode']!r}")
-        ranges = {"max_hits": (0, MAX_HITS), "sh_degree": (0, 3), "slot": (1, MAX_HITS)}
-        for name in ranges.keys() & values.keys():
-            low, high = ranges[name]
-            if isinstance(values[name], bool) or not isinstance(values[name], int):
-                raise ValueError(f"{name}: expected an integer, got {values[name]!r}")
-            values[name] = min(max(values[name], low), high)
-        for name in {"as_trained", "photo_exposure"} & values.keys():
-            if not isinstance(values[name], bool):
-                raise ValueError(f"{name}: expected True or False, got {values[name]!r}")
-        return replace(self, **values)
+    def changed(self, **values: object) -> "Settings":
+        """Return these settings with other values; an integer out of range is clamped.
+
+        Raises:
+            ValueError: a value of the wrong type, or an unknown mode.
+            TypeError: an unknown name.
+        """
+        current: dict[str, object] = dict(vars(self))
+        unknown = sorted(values.keys() - current.keys())
+        if unknown:
+            raise TypeError(f"{unknown[0]}: expected one of {', '.join(current)}")
+        merged = current | values
+        mode = merged["mode"]
+        if not isinstance(mode, str) or mode not in MODES:
+            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+        return Settings(
+            mode=mode,
+            max_hits=_clamped(merged, "max_hits", 0, MAX_HITS),
+            sh_degree=_clamped(merged, "sh_degree", 0, 3),
+            slot=_clamped(merged, "slot", 1, MAX_HITS),
+            as_trained=_switch(merged, "as_trained"),
+            photo_exposure=_switch(merged, "photo_exposure"),
+        )
+
+
+def _clamped(values: Mapping[str, object], name: str, low: int, high: int) -> int:
+    value = values[name]
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{name}: expected an integer, got {value!r}")
+    return min(max(value, low), high)
+
+
+def _switch(values: Mapping[str, object], name: str) -> bool:
+    value = values[name]
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected True or False, got {value!r}")
+    return value
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What is shown.
+    """A drawn view.
 
     Attributes:
         pixels: (H, W, 3) uint8.
-        span: values at the two ends of the colours; None where colours stand for no number.
+        span: values at the two ends of the colour scale; None without a colour scale.
     """
 
     pixels: np.ndarray
@@ -90,14 +113,17 @@ def draw(
     settings: Settings,
     stale: Callable[[], bool] = lambda: False,
 ) -> Picture | None:
-    """Render one view the way the settings say.
+    """Render one view in the mode of the settings.
 
     Args:
-        model: what to show.
-        bands: cameras of the picture's bands of rows from top to bottom, or of the whole.
-        settings: what to show of it; its K and SH degree replace those of the model's options, the degree up to
-            that of the options.
-        stale: asked before each band but the first; True gives the picture up, and returns None.
+        model: the model to render.
+        bands: cameras of the bands of rows of the picture, from top to bottom.
+        settings: display settings. Their K replaces that of the model's options; their SH degree limits that of the
+            options.
+        stale: called before each band but the first; True cancels the picture.
+
+    Returns:
+        The picture, or None if it was cancelled.
     """
     hits = settings.max_hits
     if settings.mode in BY_SLOT:
@@ -123,7 +149,7 @@ def draw(
 
 
 def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
-    """What a mode shows: (H, W, 3) colours, or (H, W) numbers, NaN where there is nothing to tell."""
+    """The buffer of a mode: (H, W, 3) colours, or (H, W) numbers that are NaN in pixels without a hit."""
     mode, slot = settings.mode, settings.slot - 1
     if mode in ("image", "plain", "textured"):
         return getattr(out, mode)
@@ -148,7 +174,7 @@ def _where_any(there: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 
 def _colours(values: torch.Tensor, mode: str) -> tuple[torch.Tensor, tuple[float, float] | None]:
-    """(H, W, 3) colours in [0, 1], black where there is nothing to tell; and the span of a scale."""
+    """(H, W, 3) colours in [0, 1], black where values are NaN; and the span of the colour scale, if there is one."""
     if values.ndim == 3:
         return values, None
     span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
@@ -158,13 +184,14 @@ def _colours(values: torch.Tensor, mode: str) -> tuple[torch.Tensor, tuple[float
 
 
 def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
-    """(N, 3) unit normals in the world frame, on the side that `position` is on."""
+    """(N, 3) unit normals in the world frame that face `position`."""
     normals = surfels.normals
     behind = ((surfels.means - position) * normals).sum(dim=-1, keepdim=True) > 0
     return torch.where(behind, -normals, normals)
 
 
 def _span(depths: torch.Tensor) -> tuple[float, float]:
+    """The 2nd and 98th percentile of depths (n,), from a sample of at most twice `QUANTILE_SAMPLES`."""
     if depths.numel() == 0:
         return 0.0, 1.0
     some = depths[:: max(depths.numel() // QUANTILE_SAMPLES, 1)]
@@ -173,14 +200,14 @@ def _span(depths: torch.Tensor) -> tuple[float, float]:
 
 
 def _scale(values: torch.Tensor, low: float, high: float) -> torch.Tensor:
-    """Colours (..., 3) of values: viridis, from dark violet at `low` to yellow at `high`."""
+    """Viridis colours (..., 3) of values, from dark violet at `low` to yellow at `high`."""
     table = viridis().to(values.device)
     steps = ((values - low) / (high - low) * (len(table) - 1)).nan_to_num().round()
     return table[steps.clamp(0, len(table) - 1).long()]
 
 
 def _id_colours(ids: torch.Tensor) -> torch.Tensor:
-    """Colours (..., 3) that tell integers apart: three multiplicative hashes, none too dark to see."""
+    """Colours (..., 3) of integers by three multiplicative hashes, each channel at least 0.2."""
     factors = ids.new_tensor([2654435761, 2246822519, 3266489917])
     hashes = ((ids[..., None] + 1) * factors) % 2**32 // 2**16 % 256
     return 0.2 + 0.8 * hashes.float() / 255.0

@@ -1,43 +1,44 @@
-"""How large a picture may be to come in time, and how much of a training's time may go into pictures."""
+"""Choice of a picture's size from its predicted cost, and the share of training time spent on pictures."""
 
 import math
 
-STEP = math.sqrt(0.5)
+STEP = math.sqrt(0.5)  # ratio of neighbouring scales
 SMALLEST = 32  # pixels along the shorter side
-MOVING_SECONDS = 0.08
-TRAINING_SECONDS = 0.4
-BAND_SECONDS = 0.2
+MOVING_SECONDS = 0.08  # target time of a picture while the camera moves
+TRAINING_SECONDS = 0.4  # largest time of a picture between two steps of a training
+BAND_SECONDS = 0.2  # target time of a band of rows
 MOST_PIXELS = 3840 * 2160
-LONGEST_WAIT = 1.0
-STILL_AFTER = 0.2
+LONGEST_WAIT = 1.0  # seconds of one picture that `Share` counts at most
+STILL_AFTER = 0.2  # seconds without a change after which a picture is refined
 
 
 class Pace:
-    """Learns what a pixel costs, for each kind of picture, and sizes the next one by it.
+    """Estimates the time of a pixel for each kind of picture, and chooses the scale of the next picture from it.
 
-    A cheaper measurement is believed at once, a dearer one by a third: the first picture of its kind also compiles.
+    A lower measurement replaces the estimate. A higher one moves it by a third of the difference, since the first
+    picture of a kind includes compilation.
     """
 
     def __init__(self) -> None:
         self.seconds_per_pixel: dict[object, float] = {}
 
     def observe(self, kind: object, pixels: int, seconds: float) -> None:
-        """Take note of one picture."""
+        """Update the estimate with one picture."""
         new, old = seconds / max(pixels, 1), self.seconds_per_pixel.get(kind)
         self.seconds_per_pixel[kind] = new if old is None or new < old else old + (new - old) / 3.0
 
     def seconds(self, kind: object, pixels: float) -> float:
-        """Predicted time of a picture; 0 for a kind not seen yet."""
+        """Predicted time of a picture in seconds; 0 for a kind that was never drawn."""
         return self.seconds_per_pixel.get(kind, 0.0) * pixels
 
     def bands(self, kind: object, pixels: float) -> int:
-        """How many parts to draw a picture in, so that each leaves room to look whether it is still wanted."""
+        """Number of bands of a picture, each of about `BAND_SECONDS`; a picture can be cancelled between two bands."""
         return max(math.ceil(self.seconds(kind, pixels) / BAND_SECONDS), 1)
 
     def scale(self, kind: object, width: int, height: int, limit: float) -> float:
-        """Largest scale 1, 0.71, 0.5, ... of a window at which a picture takes at most `limit` seconds.
+        """Largest scale of 1, 0.71, 0.5, ... at which a picture of a window should take at most `limit` seconds.
 
-        An unknown kind starts at a quarter. Never so small that the shorter side falls below `SMALLEST`.
+        The scale is 0.25 for a kind that was never drawn. The shorter side has at least `SMALLEST` pixels.
         """
         floor = min(SMALLEST / max(min(width, height), 1), 1.0)
         if kind not in self.seconds_per_pixel:
@@ -49,22 +50,22 @@ class Pace:
 
 
 class Share:
-    """Keeps the time spent on pictures at a share of all time: each is followed by a pause in proportion."""
+    """Limits the time spent on pictures to a share of all time, by a pause after each picture in proportion to it."""
 
     def __init__(self, share: float) -> None:
         self.share = share
         self.free_at = -math.inf
 
     def set(self, percent: float) -> None:
-        """Set the share in percent, from 1 to 90; ValueError for what is no number."""
+        """Set the share in percent, clamped to 1 to 90; ValueError unless it is finite."""
         if not math.isfinite(percent):
             raise ValueError(f"share: expected a number, got {percent}")
         self.share = min(max(percent / 100.0, 0.01), 0.9)
 
     def due(self, now: float) -> bool:
-        """Whether there is time for a picture at `now`, in seconds."""
+        """Whether a picture may start at `now`, in seconds."""
         return now >= self.free_at
 
     def spend(self, now: float, seconds: float) -> None:
-        """Account for a picture that ended at `now`."""
+        """Count a picture of this duration that ended at `now`."""
         self.free_at = now + seconds * (1.0 - self.share) / self.share

@@ -1,9 +1,9 @@
-"""The panel beside the picture: one for each client, its values taken to what can be meant."""
+"""The control panel of one client; values out of range are clamped."""
 
 import html
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.viewer.modes import BY_SLOT, MODES, Picture, Settings, viridis
@@ -18,16 +18,31 @@ HELP = """\
 
 **W A S D** fly · **Q E** down, up · **arrows** turn
 
-**Click a frustum** to stand where its photo was taken"""
+**Click a frustum** to go to the camera of its photo"""
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Control(Protocol[T_co]):
+    """A control of viser with a value."""
+
+    @property
+    def value(self) -> T_co:
+        """The present value."""
+
+
+class _Settable(Protocol[T]):
+    value: T
 
 
 class Actions(Protocol):
-    """What a panel asks its client's session to do."""
+    """The session's actions that a panel calls."""
 
     settings: Settings
 
-    def change(self, **values: Any) -> None:
-        """Change what is shown."""
+    def change(self, **values: object) -> None:
+        """Change display settings; ValueError for an invalid value."""
 
     def look(self, degrees: float) -> None:
         """Set the vertical field of view."""
@@ -36,25 +51,25 @@ class Actions(Protocol):
         """Go to a camera of the scene."""
 
     def reset(self) -> None:
-        """Go to where the client started."""
+        """Go to the initial view."""
 
     def show_cameras(self, visible: bool, size: float) -> None:
         """Show or hide the frustums."""
 
     def take_screenshot(self, height: int) -> None:
-        """Render the present view at a height and send it as a PNG file."""
+        """Render the current view at a height in pixels and send it as a PNG file."""
 
     def add_keyframe(self) -> None:
-        """Add the present view to the path."""
+        """Append the current view to the path."""
 
     def remove_keyframe(self) -> None:
         """Remove the path's last keyframe."""
 
     def play(self, seconds: float, closed: bool) -> None:
-        """Move along the path, or stop doing so."""
+        """Start or stop moving along the path."""
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
-        """Write the path."""
+        """Save the path as a file."""
 
 
 class Panel:
@@ -63,14 +78,14 @@ class Panel:
     def __init__(
         self, gui: "viser.GuiApi", actions: Actions, cameras: Sequence[str], fov: float, size: tuple[int, int]
     ) -> None:
-        """Make the controls.
+        """Add the controls.
 
         Args:
-            gui: of the client.
-            actions: what they do.
+            gui: the client's GUI.
+            actions: called by the controls.
             cameras: names of the scene's cameras.
-            fov: field of view to start with, degrees.
-            size: width and height that path videos start with.
+            fov: initial vertical field of view, degrees.
+            size: initial width and height of path videos, pixels.
         """
         self.gui, self.actions = gui, actions
         tabs = gui.add_tab_group(order=10.0)
@@ -88,58 +103,83 @@ class Panel:
         self.mode = gui.add_dropdown("Show", tuple(MODES), initial_value=settings.mode)
         self.legend = gui.add_html("")
         self.slot = gui.add_slider(
-            "Hit", 1, MAX_HITS, 1, settings.slot, hint="Which of a pixel's hits to show; 1 is the heaviest"
+            "Hit", 1, MAX_HITS, 1, settings.slot, hint="Rank of the hit that is shown; 1 has the largest weight"
         )
         self.max_hits = gui.add_slider(
-            "K", 0, MAX_HITS, 1, settings.max_hits, hint="How many hits a pixel takes from the neural texture"
+            "K", 0, MAX_HITS, 1, settings.max_hits, hint="Number of hits per pixel that use the neural texture"
         )
         self.sh_degree = gui.add_slider(
-            "SH degree", 0, 3, 1, settings.sh_degree, hint="How much colours may change with the direction of view"
+            "SH degree",
+            0,
+            3,
+            1,
+            settings.sh_degree,
+            hint="Degree of the spherical harmonics; 0: no dependence on direction",
         )
         self.as_trained = gui.add_checkbox(
             "Photo detail",
             settings.as_trained,
-            hint="Where pixels are finer than the photos', leave out texture detail that no photo has shown",
+            hint="Leave out texture detail that is finer than the resolution of the photos",
         )
         self.photo_exposure = gui.add_checkbox(
             "Photo exposure",
             settings.photo_exposure,
-            hint="Brightness and white balance of the photos around, which differ from place to place; off: their mean",
+            hint="On: brightness and white balance of the nearby photos. Off: the mean of all photos",
         )
         self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, _within(round(fov), FOV_DEGREES), hint="Vertical")
         self.status = gui.add_html("")
-        for name in ("mode", "slot", "max_hits", "sh_degree", "as_trained", "photo_exposure"):
-            self._on(getattr(self, name), lambda value, name=name: self._change(**{name: value}))
+        self._controls: dict[str, Control[object]] = {
+            "mode": self.mode,
+            "slot": self.slot,
+            "max_hits": self.max_hits,
+            "sh_degree": self.sh_degree,
+            "as_trained": self.as_trained,
+            "photo_exposure": self.photo_exposure,
+        }
+        self._on(self.mode, lambda value: self._change("mode", value))
+        self._on(self.slot, lambda value: self._change("slot", value))
+        self._on(self.max_hits, lambda value: self._change("max_hits", value))
+        self._on(self.sh_degree, lambda value: self._change("sh_degree", value))
+        self._on(self.as_trained, lambda value: self._change("as_trained", value))
+        self._on(self.photo_exposure, lambda value: self._change("photo_exposure", value))
         self._on(self.fov, lambda value: self.actions.look(_within(value, FOV_DEGREES)))
         self.show(None, None)
 
     def _cameras(self, names: Sequence[str]) -> None:
+        from viser import Icon
+
         gui = self.gui
-        reset = gui.add_button("Back to the start", icon="home")
+        reset = gui.add_button("Back to the start", icon=Icon.HOME)
         reset.on_click(lambda _: self.actions.reset())
         if not names:
-            gui.add_markdown("This run holds no cameras.")
+            gui.add_markdown("This run has no cameras.")
             return
-        jump = gui.add_dropdown("Go to", tuple(names), hint="Stand where a photo was taken")
+        jump = gui.add_dropdown("Go to", tuple(names), hint="Go to the camera of a photo")
         self._on(jump, self.actions.jump)
-        again = gui.add_button("Go there", icon="camera")
+        again = gui.add_button("Go there", icon=Icon.CAMERA)
         again.on_click(lambda _: self.actions.jump(jump.value))
         visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
         size = gui.add_slider("Size", 0.1, 4.0, 0.1, 1.0, hint="Of the frustums")
-        for handle in (visible, size):
-            self._on(handle, lambda _: self.actions.show_cameras(bool(visible.value), _within(size.value, (0.1, 4.0))))
+
+        def show_cameras(_: object) -> None:
+            self.actions.show_cameras(bool(visible.value), _within(size.value, (0.1, 4.0)))
+
+        self._on(visible, show_cameras)
+        self._on(size, show_cameras)
 
     def _record(self, size: tuple[int, int]) -> None:
+        from viser import Icon
+
         gui = self.gui
-        gui.add_markdown("**Screenshot** of what is shown, as PNG")
+        gui.add_markdown("**Screenshot** of the current view, as PNG")
         height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
-        shot = gui.add_button("Save screenshot", icon="photo", hint="The width follows the window")
+        shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
         shot.on_click(lambda _: self.actions.take_screenshot(int(_within(height.value, SCREENSHOT_HEIGHTS))))
         gui.add_divider()
         gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
         self.keyframes = gui.add_html("")
-        gui.add_button("Add this view", icon="plus").on_click(lambda _: self.actions.add_keyframe())
-        gui.add_button("Remove the last", icon="backspace", color="gray").on_click(
+        gui.add_button("Add this view", icon=Icon.PLUS).on_click(lambda _: self.actions.add_keyframe())
+        gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray").on_click(
             lambda _: self.actions.remove_keyframe()
         )
         seconds = gui.add_number("Seconds", 6.0, min=0.1, max=600.0, step=0.1)
@@ -147,9 +187,9 @@ class Panel:
         width = gui.add_number("Width", size[0], min=16, max=8192, step=2)
         rows = gui.add_number("Height ", size[1], min=16, max=8192, step=2)
         closed = gui.add_checkbox("Closed", False, hint="Return to the first view")
-        self.play = gui.add_button("Play", icon="player-play", color="gray")
+        self.play = gui.add_button("Play", icon=Icon.PLAYER_PLAY, color="gray")
         self.play.on_click(lambda _: self.actions.play(_within(seconds.value, (0.1, 600.0)), bool(closed.value)))
-        save = gui.add_button("Save path", icon="download")
+        save = gui.add_button("Save path", icon=Icon.DOWNLOAD)
         save.on_click(
             lambda _: self.actions.save_path(
                 int(_within(width.value, (16, 8192))),
@@ -163,12 +203,17 @@ class Panel:
         self.count_keyframes(0)
 
     def count_keyframes(self, count: int) -> None:
-        """Tell how many views the path has."""
+        """Show the number of views of the path."""
         text = {0: "no views yet: add two or more", 1: "1 view; add another"}.get(count, f"{count} views")
         self.keyframes.content = _note(text)
 
     def show(self, picture: Picture | None, status: str | None) -> None:
-        """Tell how to read a picture, and how it was made; only what has changed is sent."""
+        """Show the legend of a picture and a status line; only changed controls are sent.
+
+        Args:
+            picture: the picture that is shown; None before the first one.
+            status: the status line; None keeps the present one.
+        """
         settings = self.actions.settings
         text = f'<div style="padding:0 0.8em 0.2em;font-size:0.85em;opacity:0.8">{html.escape(MODES[settings.mode])}'
         if picture is not None and picture.span is not None:
@@ -183,18 +228,23 @@ class Panel:
             _set(self.status, "content", _note(status))
         _set(self.slot, "visible", settings.mode in BY_SLOT)
 
-    def _change(self, **values: Any) -> None:
+    def _change(self, name: str, value: object) -> None:
         try:
-            self.actions.change(**values)
-        except ValueError:  # nothing that the panel offers
+            self.actions.change(**{name: value})
+        except ValueError:  # a value that the panel does not offer
             return
-        for name in values:  # a value out of range comes back as what it was taken to
-            _set(getattr(self, name), "value", getattr(self.actions.settings, name))
+        # The control shows the clamped value.
+        _set(self._controls[name], "value", getattr(self.actions.settings, name))
         self.show(None, None)
 
     @staticmethod
-    def _on(handle: Any, act: Callable[[Any], None]) -> None:
-        handle.on_update(lambda event: act(event.target.value))
+    def _on(control: "viser.GuiInputHandle[T]", act: Callable[[T], None]) -> None:
+        control.on_update(lambda event: act(event.target.value))
+
+
+def set_value(control: Control[T], value: T) -> None:
+    """Set the value of a control; mypy takes the property of viser's stubs for read-only."""
+    cast(_Settable[T], control).value = value
 
 
 def _gradient() -> str:
@@ -207,11 +257,12 @@ def _note(text: str) -> str:
     return f'<div style="padding:0 0.8em;font-size:0.85em;opacity:0.8">{html.escape(text)}</div>'
 
 
-def _set(handle: Any, name: str, value: Any) -> None:
+def _set(handle: object, name: str, value: object) -> None:
+    """Set a property of a control if that changes it."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
 
 
 def _within(value: float, ends: tuple[float, float]) -> float:
-    """Take a number to the nearest end of a range; what is no number, to the first."""
+    """Clamp a number to a range; NaN and infinity become its lower end."""
     return min(max(value, ends[0]), ends[1]) if math.isfinite(value) else ends[0]

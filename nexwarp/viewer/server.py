@@ -1,4 +1,4 @@
-"""The web server: viser, on one address and no other, for pages of its own and messages that it asked for."""
+"""The web server: viser on exactly one address, which accepts only its own pages and the messages of the viewer."""
 
 import contextlib
 import errno
@@ -7,14 +7,15 @@ import io
 import logging
 import socket
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     import viser
+    import viser.infra
 
 LOOPBACK = {"127.0.0.1", "::1", "localhost"}
-# Everything that the panels and the canvas send; viser's client can send more (uploads, public tunnels).
+# Messages of the panels and the canvas. viser's client knows others, such as uploads and public tunnels.
 ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"}
 log = logging.getLogger(__name__)
 
@@ -23,22 +24,22 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     """Start viser on exactly this address.
 
     Args:
-        host: name or address of an interface of this machine. On a loopback one, only pages that this server sent
-            itself may connect: any other page that is open in a browser could reach it too.
-        port: 1 to 65535, or 0 for any that is free.
+        host: name or address of an interface of this machine. On a loopback address only pages of this server may
+            connect, since any page that is open in a browser can reach it.
+        port: 1 to 65535, or 0 for any free port.
 
     Raises:
-        ValueError: viser is not installed, or nothing can listen there, with the reason.
+        ValueError: viser is not installed, or the address cannot be used; the message gives the reason.
     """
     check_server(host, port)
     import viser
 
-    # A page that breaks off or sends rubbish is its own affair: no traceback.
+    # Broken connections and invalid messages are errors of the page: they are not logged.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab may close at any time
-    with contextlib.redirect_stdout(io.StringIO()):  # its banner
+    warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab was closed
+    with contextlib.redirect_stdout(io.StringIO()):  # drops its banner
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    if port and server.get_port() != port:  # taken since the check; viser moves on to the next
+    if port and server.get_port() != port:  # the port was taken after the check; viser chose the next one
         server.stop()
         raise _in_use(host, port)
     _guard(server, host)
@@ -46,7 +47,7 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
 
 
 def check_server(host: str, port: int) -> None:
-    """Raise ValueError unless `start_server` can be expected to succeed; viser would try other ports, and for ever."""
+    """Raise ValueError if viser is missing or the address cannot be used; viser itself would try other ports."""
     if importlib.util.find_spec("viser") is None:
         raise ValueError("the viewer needs the package viser, found none; pip install 'nexwarp[viewer]'")
     if not 0 <= port <= 65535:
@@ -71,12 +72,12 @@ def _in_use(host: str, port: int) -> ValueError:
 
 
 def may_connect(host: str, origin: str | None, asked: str | None) -> bool:
-    """Whether a page may talk to a server that listens on `host`.
+    """Whether a page may connect to the server.
 
     Args:
-        host: what the server listens on; anybody may connect unless it is loopback.
-        origin: of the page, such as "http://127.0.0.1:8080"; programs that are no browser send none.
-        asked: the address that it connects to, "127.0.0.1:8080".
+        host: address that the server listens on; any page may connect unless it is a loopback address.
+        origin: origin of the page, such as "http://127.0.0.1:8080"; None for programs other than browsers.
+        asked: host and port that the page connects to, such as "127.0.0.1:8080".
     """
     if host not in LOOPBACK or origin is None:
         return True
@@ -85,14 +86,15 @@ def may_connect(host: str, origin: str | None, asked: str | None) -> bool:
 
 
 def _guard(server: "viser.ViserServer", host: str) -> None:
-    """Refuse foreign pages, drop every message that no part of the viewer sends, and survive broken ones."""
+    """Refuse pages of other servers, drop messages that the viewer does not use, and ignore invalid ones."""
     websockets = server._websock_server
     server.get_event_loop().set_exception_handler(lambda _loop, context: log.debug("dropped: %s", context))
     _accept_only(websockets)
 
-    async def admit(connection: Any) -> None:
+    async def admit(connection: "viser.infra.WebsockClientConnection") -> None:
         _accept_only(connection)
         socket = websockets._live_connections[connection.client_id]
+        assert socket.request is not None  # set by the handshake
         headers = socket.request.headers
         if not may_connect(host, headers.get("Origin"), headers.get("Host")):
             await socket.close(1008, "the page is from another server")
@@ -100,13 +102,14 @@ def _guard(server: "viser.ViserServer", host: str) -> None:
     websockets.on_client_connect(admit)
 
 
-def _accept_only(handler: Any) -> None:
-    """Make a viser message handler ignore all but `ACCEPTED`; of updates, all that is no value."""
+def _accept_only(handler: "viser.infra.WebsockMessageHandler") -> None:
+    """Make a viser message handler ignore all messages but `ACCEPTED`, and updates of properties but the value."""
     handle = handler._handle_incoming_message
 
-    async def accept(client_id: Any, message: Any) -> None:
+    async def accept(client_id: "viser.infra.ClientId", message: "viser.infra.Message") -> None:
         name = type(message).__name__
-        if name in ACCEPTED and (name != "GuiUpdateMessage" or set(message.updates) == {"value"}):
+        if name in ACCEPTED and (name != "GuiUpdateMessage" or set(getattr(message, "updates", ())) == {"value"}):
             await handle(client_id, message)
 
-    handler._handle_incoming_message = accept
+    # viser has no public way to filter messages.
+    handler._handle_incoming_message = accept  # type: ignore[method-assign]

@@ -1,9 +1,10 @@
-"""One browser tab: what it looks at, what it asks for and what it has been shown."""
+"""One browser tab: its view, its settings, its camera path and the state of its picture."""
 
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from nexwarp.camera import Camera
 from nexwarp.viewer.camera_path import Keyframe, interpolate, path_json
 from nexwarp.viewer.modes import Settings
-from nexwarp.viewer.panel import Panel
+from nexwarp.viewer.panel import Panel, set_value
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 
 if TYPE_CHECKING:
     import viser
 
-FRUSTUM_SIZE = 0.16  # browser units; the cameras lie within 3
+FRUSTUM_SIZE = 0.16  # browser units; all cameras lie within 3 of the origin
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 PATH_COLOUR = (230, 70, 120)
 PLAY_FPS = 20
@@ -25,7 +26,7 @@ MOST_FRUSTUMS = 500
 
 
 class Session:
-    """The state of a client; its methods are called by viser's threads, its picture is drawn by another."""
+    """The state of a client. viser's threads call its methods; another thread draws its pictures."""
 
     def __init__(
         self,
@@ -37,16 +38,16 @@ class Session:
         wake: Callable[[], None],
         save: Callable[[bytes], str] | None,
     ) -> None:
-        """Make the panel and the frustums of a client.
+        """Add the panel and the frustums of a client.
 
         Args:
-            client: that has connected.
+            client: the connected client.
             world: the browser's frame.
-            cameras: the scene's, by name, "train/..." or "test/...".
-            settings: to start with.
-            home: where it starts.
-            wake: called when there is something new to draw.
-            save: writes a camera path into the run and tells where; None only sends it to the browser.
+            cameras: the scene's cameras by name, "train/..." or "test/...".
+            settings: initial display settings.
+            home: initial view.
+            wake: called when a new picture is needed.
+            save: writes a camera path into the run and returns the file's name; None only sends it to the browser.
         """
         self.client, self.world, self.cameras, self.home = client, world, cameras, home
         self.settings, self.wake, self.save = settings, wake, save
@@ -60,20 +61,20 @@ class Session:
         self.playing = threading.Event()
         self.frustums: dict[str, viser.CameraFrustumHandle] = {}
         self.frustum_shape = (True, 1.0)
-        size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs want even ones
+        size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs need even sizes
         self.panel = Panel(client.gui, self, list(cameras), float(np.rad2deg(home.fov)), size)
         self._add_frustums()
         client.camera.on_update(self.moved)
         self.look_from(client.camera)
 
-    # What the browser tells
+    # Messages of the browser
 
     async def moved(self, camera: "viser.CameraHandle") -> None:
-        """Follow the browser's camera."""
+        """Take over the browser's camera."""
         self.look_from(camera)
 
     def look_from(self, camera: "viser.CameraHandle") -> None:
-        """Take over a camera; one that cannot be meant is ignored."""
+        """Take over a camera; an invalid one is ignored."""
         try:
             here = Viewpoint.of(
                 camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height, self.world
@@ -84,8 +85,8 @@ class Session:
         self._changed()
         self._hide_near()
 
-    def change(self, **values: Any) -> None:
-        """Change what is shown."""
+    def change(self, **values: object) -> None:
+        """Change display settings; ValueError for an invalid value."""
         settings = self.settings.changed(**values)
         if settings != self.settings:
             self.settings = settings
@@ -96,7 +97,7 @@ class Session:
         self.changed_at = time.perf_counter()
         self.wake()
 
-    # Where it stands
+    # The view
 
     def look(self, degrees: float) -> None:
         """Set the vertical field of view."""
@@ -109,11 +110,16 @@ class Session:
             self.go(camera_to_world(camera), vertical_fov(camera))
 
     def reset(self) -> None:
-        """Go to where the client started."""
+        """Go to the initial view."""
         self.go(self.home.pose, self.home.fov)
 
     def go(self, pose: np.ndarray, fov: float) -> None:
-        """Stand at a (4, 4) camera-to-world pose of the scene's frame, to turn about what lies before it."""
+        """Move to a (4, 4) camera-to-world pose in the scene's frame, and orbit a point in front of it.
+
+        Args:
+            pose: (4, 4) float64, x right, y down, z forward.
+            fov: vertical field of view, radians.
+        """
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         position, forward = self.world.to_browser(pose[:3, 3]), pose[:3, 2]
         distance = max(float((self.world.to_browser(self.world.focus) - position) @ forward), 0.5)
@@ -124,9 +130,9 @@ class Session:
                 camera.wxyz = np.array([w, x, y, z])
                 camera.look_at = position + forward * distance
                 camera.fov = fov
-        except ValueError:  # the browser's last camera was none
+        except ValueError:  # the browser had sent an invalid camera
             return
-        self.panel.fov.value = round(float(np.rad2deg(fov)))
+        set_value(self.panel.fov, float(round(float(np.rad2deg(fov)))))
 
     # Frustums
 
@@ -152,11 +158,14 @@ class Session:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            frustum.on_click(lambda _, name=name: self.jump(name))
+            frustum.on_click(partial(self._clicked, name))
             self.frustums[name] = frustum
 
+    def _clicked(self, name: str, _: object) -> None:
+        self.jump(name)
+
     def show_thumbnail(self, name: str, pixels: np.ndarray) -> None:
-        """Put an (h, w, 3) uint8 picture on a frustum."""
+        """Show an (h, w, 3) uint8 picture on the frustum of a camera."""
         if name in self.frustums:
             self.frustums[name].image = pixels
 
@@ -170,7 +179,7 @@ class Session:
         self._hide_near()
 
     def _hide_near(self) -> None:
-        """Hide frustums that the eye is inside of: they would only be in the way."""
+        """Hide the frustums around the browser's camera, which would cover the view."""
         if self.viewpoint is None:
             return
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
@@ -183,12 +192,12 @@ class Session:
     # Screenshot and path
 
     def take_screenshot(self, height: int) -> None:
-        """Ask for a picture of this height."""
+        """Request a picture of this height in pixels."""
         self.screenshots.append(height)
         self.wake()
 
     def add_keyframe(self) -> None:
-        """Add the present view to the path."""
+        """Append the current view to the path."""
         if self.viewpoint is not None:
             self.keyframes.append(Keyframe(self.viewpoint.pose, self.viewpoint.fov))
             self._show_path()
@@ -224,7 +233,12 @@ class Session:
             )
 
     def play(self, seconds: float, closed: bool) -> None:
-        """Move along the path, once; stop when it is on its way."""
+        """Move along the path once; if that is in progress, stop it.
+
+        Args:
+            seconds: duration.
+            closed: return to the first view.
+        """
         if self.playing.is_set():
             self.playing.clear()
             return
@@ -235,7 +249,7 @@ class Session:
             return
         self.playing.set()
         self.panel.play.label = "Stop"
-        self.client.scene.remove_by_name("/path")  # would be in the way
+        self.client.scene.remove_by_name("/path")  # the line would cover the view
         start = time.perf_counter()
         for i, key in enumerate(way):
             self.go(key.pose, key.fov)
@@ -247,7 +261,15 @@ class Session:
         self._show_path()
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
-        """Send the path to the browser as a file, and keep it in the run."""
+        """Send the path to the browser as a file, and write it into the run.
+
+        Args:
+            width: width of the frames, pixels.
+            height: height of the frames, pixels.
+            fps: frames a second.
+            seconds: duration of the video.
+            closed: return to the first view.
+        """
         if len(self.keyframes) < 2:
             self.tell("Add at least two views first", "")
             return
@@ -261,5 +283,5 @@ class Session:
         self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
 
     def tell(self, title: str, text: str) -> None:
-        """Show a note in the browser."""
+        """Show a notification in the browser."""
         self.client.add_notification(title, text, auto_close_seconds=10.0)

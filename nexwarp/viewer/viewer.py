@@ -1,4 +1,4 @@
-"""The viewer: draws for every browser that looks, by itself or between the steps of a training."""
+"""The viewer: draws pictures for all connected browsers, on its own or between the steps of a training."""
 
 import contextlib
 import io
@@ -16,6 +16,7 @@ from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
+from nexwarp.viewer.panel import set_value
 from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
@@ -24,13 +25,13 @@ if TYPE_CHECKING:
     import viser
 
 THUMBNAIL = 96  # pixels along the longer side
-SHARE = 0.2
-TELL_SECONDS = 0.5
-DEFAULT_FOV = 0.9
+SHARE = 0.2  # of a training's time for pictures, at the start
+TELL_SECONDS = 0.5  # between two updates of the status line
+DEFAULT_FOV = 0.9  # radians
 
 
 class Viewer:
-    """A web page that shows a model; pictures are drawn on the thread that calls `show` or `between_steps`."""
+    """A web page that shows a model. Pictures are drawn on the thread that calls `show` or `between_steps`."""
 
     def __init__(
         self,
@@ -45,21 +46,22 @@ class Viewer:
         total: int | None = None,
         save_path: Callable[[bytes], str] | None = None,
     ) -> None:
-        """Start to listen.
+        """Start the server.
 
         Args:
-            model: gives the model as it is when a picture is drawn.
+            model: returns the current model; called for each picture.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
             near: near depth of the viewer's cameras, world units.
-            title: shown above the panel.
+            title: text above the panel.
             host: interface to listen on.
-            port: to listen on; 0 takes any that is free.
-            photos: gives (H, W, 3) uint8 photos by "set/name", for thumbnails; None draws those.
-            total: iterations of a training to watch; None for a finished model.
-            save_path: writes a camera path, JSON in UTF-8, into the run and tells where it is.
+            port: port to listen on; 0 is any free port.
+            photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails; None renders the
+                thumbnails.
+            total: number of iterations of the training that is shown; None for a finished model.
+            save_path: writes a camera path, JSON in UTF-8, into the run and returns the file's name.
 
         Raises:
-            ValueError: the package viser is missing, or nothing can listen at that address.
+            ValueError: the package viser is missing, or the address cannot be used.
         """
         self.model, self.near, self.title, self.total = model, near, title, total
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
@@ -86,27 +88,30 @@ class Viewer:
         self.close()
 
     def close(self) -> None:
-        """Let all browsers go and stop to listen."""
+        """Disconnect all browsers and stop the server."""
         for session in list(self.sessions.values()):
             session.closed.set()
-        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+        with contextlib.redirect_stdout(io.StringIO()):  # drops its message
             self.server.stop()
 
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Draw for whoever looks, until `stop()` or Ctrl-C."""
-        if not self.pace.seconds_per_pixel:  # what the first picture compiles or loads is there when somebody comes
+        """Draw pictures for the connected browsers until `stop()` returns True or Ctrl-C."""
+        if not self.pace.seconds_per_pixel:  # compiles the kernels before a browser connects
             for _ in range(2):
                 self._picture(self.home, pacing.SMALLEST / min(self.home.width, self.home.height), self._settings())
         while not stop():
             self._draw_or_wait()
 
     def between_steps(self, step: int, describe: Callable[[], str], stop: Callable[[], bool] = lambda: False) -> None:
-        """Draw what is due while a training goes on; at no cost while nobody looks. Return late while it is paused.
+        """Draw pictures between two steps of a training; call it after each step.
+
+        It costs nothing without connected browsers. While the training is paused, it returns only when the training is
+        resumed or `stop()` returns True.
 
         Args:
-            step: iterations done.
-            describe: a line on how it goes; asked now and then, while somebody looks.
-            stop: whether to return although paused.
+            step: number of finished iterations.
+            describe: returns a status line; called from time to time while a browser is connected.
+            stop: ends a pause.
         """
         self.step = step
         if not self.sessions and not self.paused:
@@ -123,14 +128,19 @@ class Viewer:
                 self._draw_or_wait()
 
     def finish(self, text: str, model: Callable[[], Model]) -> None:
-        """Say that the training is over, and show another model from now on, as the constructor takes it."""
+        """End the training's display and show another model from now on.
+
+        Args:
+            text: status line, such as a summary of the training.
+            model: returns the current model, as in the constructor.
+        """
         self.model = model
         for session in list(self.sessions.values()):
-            session.drawn_version = -1  # what it shows is of the other one
+            session.drawn_version = -1  # its picture shows the previous model
         self._news.set()
         self.paused = False
-        self.status.content = f"{text}"
-        self.progress.value = 100.0
+        self.status.content = text
+        set_value(self.progress, 100.0)
         for handle in (self.pause, self.share_slider):
             handle.visible = False
 
@@ -142,7 +152,7 @@ class Viewer:
             self._news.wait(0.05 if self.sessions else 0.5)
 
     def _draw_next(self, longest: float | None) -> bool:
-        """Draw one picture, for the client that has waited most; `longest` limits its seconds. False: none is due."""
+        """Draw one picture, for the client that has waited longest; False if none is due. `longest` is in seconds."""
         for session in sorted(list(self.sessions.values()), key=lambda s: s.drawn_at):
             try:
                 if session.screenshots:
@@ -152,13 +162,13 @@ class Viewer:
                 if scale:
                     self._draw(session, scale)
                     return True
-            except (RuntimeError, ValueError) as error:  # out of memory, for one: the other clients go on
+            except (RuntimeError, ValueError) as error:  # for example out of memory; the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
                 session.tell("This picture could not be drawn", " ".join(str(error).split())[:300])
         return False
 
     def _due(self, session: Session, longest: float | None, now: float) -> float:
-        """Scale of the picture that a client is to get now; 0 for none."""
+        """Scale of the next picture of a client; 0 if none is due."""
         here = session.viewpoint
         if here is None:
             return 0.0
@@ -176,8 +186,9 @@ class Viewer:
         return min(2.0 * session.drawn_scale, finest) if still > pacing.STILL_AFTER else 0.0
 
     def _draw(self, session: Session, scale: float) -> None:
-        # Taken first: what changes while it is drawn makes it stale.
+        # Read before drawing: a later change makes the picture stale.
         version, settings, here = session.version, session.settings, session.viewpoint
+        assert here is not None  # `_due` returns 0 without a viewpoint
         session.drawn_at = time.perf_counter()
         start = time.perf_counter()
         picture = self._picture(here, scale, settings, lambda: session.version != version or session.closed.is_set())
@@ -194,13 +205,13 @@ class Viewer:
     def _picture(
         self, here: Viewpoint, scale: float, settings: Settings, stale: Callable[[], bool] = lambda: False
     ) -> Picture | None:
-        """A picture; None when it was given up because it had become stale."""
+        """Draw a picture; None if it became stale and was cancelled."""
         model = self.model()
         kind, pixels = _kind(settings), here.width * here.height * scale**2
         limit = self.focal_limit if settings.as_trained else math.inf
         bands = here.bands(scale, self.near, model.surfels.means, self.pace.bands(kind, pixels), limit)
         if model.device.type == "cuda":
-            torch.cuda.synchronize(model.device)  # what training has queued is not the picture's cost
+            torch.cuda.synchronize(model.device)  # excludes the queued work of the training from the measured time
         start = time.perf_counter()
         picture = draw(model, bands, settings, stale)
         if picture is not None:
@@ -214,13 +225,14 @@ class Viewer:
         if here is None:
             return
         picture = self._picture(here, height / here.height, settings)
+        assert picture is not None  # never stale
         file = io.BytesIO()
         Image.fromarray(picture.pixels).save(file, format="PNG")
         name = f"{self.title}_{settings.mode}.png".replace(" ", "_")
         session.client.send_file_download(name, file.getvalue(), save_immediately=True)
 
     def _draw_thumbnail(self) -> bool:
-        """Draw one thumbnail, once somebody looks; False when all are there."""
+        """Draw one thumbnail if a browser is connected; False if there is none left to draw."""
         if self.photos is not None or not self.sessions:
             return False
         name = next((name for name in self.cameras if name not in self.thumbnails), None)
@@ -241,7 +253,7 @@ class Viewer:
     # The page
 
     def _home(self) -> Viewpoint:
-        """Where clients start: at the first camera, or back from the middle of the surfels."""
+        """The initial view: the first camera, or a view of the surfels' middle if there are no cameras."""
         first = next(iter(self.cameras.values()), None)
         if first is not None:
             return Viewpoint(camera_to_world(first), vertical_fov(first), first.width, first.height)
@@ -265,25 +277,30 @@ class Viewer:
         server.on_client_connect(self._welcome)
 
     def _add_training(self) -> None:
+        from viser import Icon
+
         gui = self.server.gui
         with gui.add_folder("Training", order=0.0):
             self.progress = gui.add_progress_bar(0.0)
             self.status = gui.add_markdown("starting")
-            self.pause = gui.add_button("Pause", icon="player-pause")
+            self.pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
             self.share_slider = gui.add_slider(
                 "Time for pictures",
                 5,
                 80,
                 5,
                 int(100 * SHARE),
-                hint="Percent, while somebody looks",
+                hint="Percent of the training's time, while a browser is connected",
             )
         self.pause.on_click(lambda _: self._toggle_pause())
         self.share_slider.on_update(lambda event: self.share.set(float(event.target.value)))
 
     def _toggle_pause(self) -> None:
+        from viser import Icon
+
         self.paused = not self.paused
-        self.pause.label, self.pause.icon = ("Resume", "player-play") if self.paused else ("Pause", "player-pause")
+        self.pause.label = "Resume" if self.paused else "Pause"
+        self.pause.icon = Icon.PLAYER_PLAY if self.paused else Icon.PLAYER_PAUSE
         self._news.set()
 
     def _tell(self, step: int, describe: Callable[[], str], now: float, force: bool = False) -> None:
@@ -292,7 +309,7 @@ class Viewer:
         how = "paused" if self.paused else "training"
         if self._told is not None and not self.paused and now > self._told[0]:
             how = f"{(step - self._told[1]) / (now - self._told[0]):.1f} it/s"
-        self.progress.value = 100.0 * step / max(self.total or 1, 1)
+        set_value(self.progress, 100.0 * step / max(self.total or 1, 1))
         self.status.content = f"**{step:,}** of {self.total:,} · {how}  \n{describe()}"
         self._told = (now, step)
 
@@ -301,7 +318,7 @@ class Viewer:
             self.thumbnails = {name: _thumbnail(photo()) for name, photo in self.photos.items()}
         session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set, self.save_path)
         with self._lock:
-            if client.client_id not in self.server.get_clients():  # gone already
+            if client.client_id not in self.server.get_clients():  # it has disconnected
                 return
             self.sessions[client.client_id] = session
             for name, pixels in self.thumbnails.items():
@@ -309,7 +326,7 @@ class Viewer:
         self._news.set()
 
     def _settings(self) -> Settings:
-        """What clients see first: the picture, as it was trained."""
+        """Initial settings of a client: the model's own K."""
         return Settings(max_hits=self.model().options.max_hits)
 
     def _goodbye(self, client: "viser.ClientHandle") -> None:
@@ -320,12 +337,12 @@ class Viewer:
 
 
 def _kind(settings: Settings) -> tuple[bool, int]:
-    """What the cost of a pixel depends on."""
+    """Kind of a picture for `Pace`: the settings that decide the cost of a pixel."""
     return settings.mode in TEXTURED, MAX_HITS if settings.mode == "hit count" else settings.max_hits
 
 
 def _thumbnail(photo: torch.Tensor) -> np.ndarray:
-    """(h, w, 3) uint8, at most `THUMBNAIL` pixels a side."""
+    """Reduce a photo (H, W, 3) uint8 to at most `THUMBNAIL` pixels a side."""
     from PIL import Image
 
     image = Image.fromarray(photo.numpy())

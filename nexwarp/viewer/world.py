@@ -1,31 +1,35 @@
-"""From the scene's frame to the browser's and back, and what a browser's camera sees."""
+"""The browser's coordinate frame, and cameras for the view of a browser."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.camera import Camera
 from nexwarp.cameras.paths import focus
 
-# The browser flies two units a second: with the cameras three units around, a scene is crossed in three seconds.
+# The browser moves two units a second, so that it crosses a scene of this radius in three seconds.
 RADIUS = 3.0
 MAX_SIDE = 8192
-BAND_ROWS = 16  # a tile's
+BAND_ROWS = 16  # rows of a tile
+
+FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class World:
-    """The browser's frame: the scene's, moved and scaled so that its cameras lie within `RADIUS` of the origin.
+    """The browser's frame: the scene's frame, translated and scaled so that all cameras lie within `RADIUS`.
 
     Attributes:
-        centre: (3,) float64, scene position of the origin.
-        unit: scene units a browser unit.
-        up: (3,) float64 unit vector, up in the scene.
-        focus: (3,) float64, scene position that the first camera turns about.
+        centre: (3,) float64, scene position of the browser's origin.
+        unit: scene units of one browser unit.
+        up: (3,) float64 unit vector, up direction in the scene's frame.
+        focus: (3,) float64, scene position that the first camera orbits.
     """
 
     centre: np.ndarray
@@ -35,7 +39,7 @@ class World:
 
     @staticmethod
     def around(cameras: Sequence[Camera], means: torch.Tensor) -> "World":
-        """Choose a frame for cameras, or, without any, for the (N, 3) means of the surfels."""
+        """Choose a frame for the cameras of a scene; without cameras, for the (N, 3) means of its surfels."""
         points = means.detach().double().cpu().numpy()
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         if not cameras:
@@ -57,23 +61,23 @@ class World:
         return World(centre, float(radius) / RADIUS or 1.0, up, target)
 
     def to_browser(self, points: np.ndarray) -> np.ndarray:
-        """Browser positions (..., 3) of scene positions."""
+        """Convert scene positions (..., 3) to browser positions."""
         return (points - self.centre) / self.unit
 
     def to_scene(self, points: np.ndarray) -> np.ndarray:
-        """Scene positions (..., 3) of browser positions."""
+        """Convert browser positions (..., 3) to scene positions."""
         return points * self.unit + self.centre
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """What a browser's canvas shows.
+    """The camera of a browser's canvas.
 
     Attributes:
         pose: (4, 4) float64 camera to world in the scene's frame, x right, y down, z forward.
         fov: vertical field of view, radians.
-        width: of the canvas, pixels.
-        height: of the canvas, pixels.
+        width: width of the canvas, pixels.
+        height: height of the canvas, pixels.
     """
 
     pose: np.ndarray
@@ -82,10 +86,20 @@ class Viewpoint:
     height: int
 
     @staticmethod
-    def of(
-        wxyz: Sequence[float], position: Sequence[float], fov: float, width: int, height: int, world: World
-    ) -> "Viewpoint":
-        """Check what a browser sent; ValueError unless it is a camera."""
+    def of(wxyz: FloatVector, position: FloatVector, fov: float, width: int, height: int, world: World) -> "Viewpoint":
+        """Convert a browser's camera, after a check of its values.
+
+        Args:
+            wxyz: (4,) rotation as a quaternion, camera to world.
+            position: (3,) in browser units.
+            fov: vertical field of view, radians.
+            width: width of the canvas, pixels.
+            height: height of the canvas, pixels.
+            world: the browser's frame.
+
+        Raises:
+            ValueError: values that are not finite or do not describe a camera.
+        """
         values = np.array([*wxyz, *position, fov, width, height], dtype=np.float64)
         if values.shape != (10,) or not np.isfinite(values).all():
             raise ValueError(f"camera: expected 10 finite numbers, got {values.tolist()}")
@@ -101,44 +115,48 @@ class Viewpoint:
     def bands(
         self, scale: float, near: float, like: torch.Tensor, count: int = 1, focal_limit: float = math.inf
     ) -> list[Camera]:
-        """Cameras of a picture `scale` times the canvas, in at most `count` bands of rows from top to bottom.
+        """Cameras of a picture with `scale` times the canvas's size, as bands of rows from top to bottom.
 
         Args:
-            scale: of the canvas.
-            near: near depth, world units.
-            like: a tensor of the dtype and on the device to use.
-            count: how many bands; each but the last is a multiple of 16 rows high.
-            focal_limit: of `Camera.focal`, pixels: textures look as they do at that resolution.
+            scale: of the picture, relative to the canvas.
+            near: near depth of the cameras, world units.
+            like: a tensor with the dtype and device of the cameras.
+            count: largest number of bands; the height of each but the last is a multiple of 16 rows.
+            focal_limit: upper limit of `Camera.focal`, pixels. It limits the detail of the texture to that of a
+                picture with this focal length.
         """
         width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
         focal = 0.5 * height / math.tan(0.5 * self.fov)
         viewmat = torch.from_numpy(np.linalg.inv(self.pose)).to(like)
         rows = -(-height // (BAND_ROWS * count)) * BAND_ROWS
-        cameras = []
+        cameras: list[Camera] = []
         for top in range(0, height, rows):
             K = like.new_tensor([[focal, 0, width / 2], [0, focal, height / 2 - top], [0, 0, 1]])
-            camera = _Band(viewmat, K, width, min(rows, height - top), near)
-            object.__setattr__(camera, "focal_limit", focal_limit)
-            cameras.append(camera)
+            cameras.append(LimitedCamera(viewmat, K, width, min(rows, height - top), near, focal_limit=focal_limit))
         return cameras
 
 
-class _Band(Camera):
-    """A camera that tells the texture of no finer pixels than those it has learned from."""
+@dataclass(frozen=True)
+class LimitedCamera(Camera):
+    """A camera with an upper limit on the focal length by which the texture's levels are weighted.
 
-    focal_limit = math.inf
+    Attributes:
+        focal_limit: the limit in pixels.
+    """
+
+    focal_limit: float = math.inf
 
     @property
     def focal(self) -> float:
-        """Focal length that the texture's levels are weighted by, pixels."""
-        return min((self.fx * self.fy) ** 0.5, self.focal_limit)
+        """Focal length for the weights of the texture's levels (paper Eq. 4), pixels."""
+        return min(super().focal, self.focal_limit)
 
 
 def camera_to_world(camera: Camera) -> np.ndarray:
-    """(4, 4) float64 pose of a camera."""
+    """(4, 4) float64 camera-to-world pose of a camera."""
     return np.linalg.inv(camera.viewmat.detach().double().cpu().numpy())
 
 
 def vertical_fov(camera: Camera) -> float:
-    """Field of view in radians of a picture as high as the camera's, the principal point in its middle."""
+    """Vertical field of view in radians for the camera's focal length and height, with a centred principal point."""
     return 2.0 * math.atan(0.5 * camera.height / camera.fy)

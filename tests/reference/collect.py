@@ -1,4 +1,4 @@
-"""The collection pass (paper Sec. 3.2): blend the plain colours, keep the K heaviest hits of each pixel."""
+"""The collection pass (paper Sec. 4.2): blend the plain colours, keep the K heaviest hits of each pixel."""
 
 from dataclasses import dataclass
 
@@ -28,6 +28,23 @@ class Hits:
     depths: torch.Tensor
     weights: torch.Tensor
     alpha: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Walk:
+    """All pixels P against all surfels N, sorted front to back by the depth of their centres.
+
+    Attributes:
+        order: (N,) int64, surfels front to back; the columns of the others.
+        t: (P, N) z-depth of the hit.
+        alphas: (P, N), 0 where there is no hit or the pixel is opaque already.
+        before: (P, N) transmittance in front of the hit.
+    """
+
+    order: torch.Tensor
+    t: torch.Tensor
+    alphas: torch.Tensor
+    before: torch.Tensor
 
 
 def rotations(quats: torch.Tensor) -> torch.Tensor:
@@ -124,26 +141,11 @@ def collect(
         max_hits: K.
         low_pass: let no surfel be smaller on screen than a Gaussian of standard deviation sqrt(1/2) pixel.
     """
-    rotation = viewmat[:3, :3]
-    centers = means @ rotation.T + viewmat[:3, 3]
-    axes = rotation @ rotations(quats)
-    pixels = pixel_centers(width, height, means)
-
-    # The hit (Eq. 1).
-    u, v, t, meets = intersect(centers, axes, scales, camera_rays(pixels, fx, fy, cx, cy))
-    exponent = power(u, gammas[:, 0]) + power(v, gammas[:, 1])
-    if low_pass:
-        t, exponent, meets = widen(centers, pixels, fx, fy, cx, cy, near, t, exponent, meets)
-    alphas = (opacities * torch.exp(-exponent / 2)).clamp_max(ALPHA_MAX)
-    counts = meets & (alphas >= ALPHA_MIN) & (t > near)
-    alphas = torch.where(counts, alphas, 0.0)
-
-    # Front to back: transmittance before each hit, up to and including the hit that makes the pixel opaque.
-    order = torch.sort(centers[:, 2].detach().float(), stable=True).indices
-    alphas, t = alphas[:, order], t[:, order]
-    before = transmittance_before(alphas)
-    alphas = torch.where(before >= TRANSMITTANCE_MIN, alphas, 0.0)
-    weights = alphas * before
+    walked = walk(
+        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, low_pass
+    )  # fmt: skip
+    order, t, alphas = walked.order, walked.t, walked.alphas
+    weights = alphas * walked.before
     alpha = 1 - torch.prod(1 - alphas, dim=-1)
 
     # The buffer: a stable sort of hits that are already front to back lets the nearer one win a tie.
@@ -166,6 +168,44 @@ def collect(
         weights=slots(weights.gather(-1, heaviest), 0.0),
         alpha=alpha.reshape(height, width),
     )
+
+
+def walk(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    viewmat: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: bool,
+) -> Walk:
+    """Meet every pixel's ray with every surfel; arguments as of `collect`."""
+    rotation = viewmat[:3, :3]
+    centers = means @ rotation.T + viewmat[:3, 3]
+    axes = rotation @ rotations(quats)
+    pixels = pixel_centers(width, height, means)
+
+    # The hit (paper Eq. 3).
+    u, v, t, meets = intersect(centers, axes, scales, camera_rays(pixels, fx, fy, cx, cy))
+    exponent = power(u, gammas[:, 0]) + power(v, gammas[:, 1])
+    if low_pass:
+        t, exponent, meets = widen(centers, pixels, fx, fy, cx, cy, near, t, exponent, meets)
+    alphas = (opacities * torch.exp(-exponent / 2)).clamp_max(ALPHA_MAX)
+    counts = meets & (alphas >= ALPHA_MIN) & (t > near)
+    alphas = torch.where(counts, alphas, 0.0)
+
+    # Front to back: transmittance before each hit, up to and including the hit that makes the pixel opaque.
+    order = torch.sort(centers[:, 2].detach().float(), stable=True).indices
+    alphas, t = alphas[:, order], t[:, order]
+    before = transmittance_before(alphas)
+    return Walk(order, t, torch.where(before >= TRANSMITTANCE_MIN, alphas, 0.0), before)
 
 
 def transmittance_before(alphas: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""An unbounded multiresolution hash grid, down-weighted by distance (paper Eq. 2 and supplement)."""
+"""An unbounded multiresolution hash grid, down-weighted by distance (paper Eq. 2, Eq. 4 and supplement)."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Both passes (paper Sec. 3.2): collect the hits, texture the K heaviest, put the image together."""
+"""Both passes (paper Sec. 4.2): collect the hits, texture the K heaviest, put the image together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

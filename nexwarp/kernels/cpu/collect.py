@@ -1,7 +1,8 @@
-"""Collection pass for CPUs: a thread walks with a row of pixels of a tile, whose lanes are those of SIMD registers.
+"""SIMD form of `collect` and `collect_backward`, for CPUs (paper Sec. 4.2).
 
-The same as `collect`, line by line, with vectors for what pixels differ in and masks for which of them something holds;
-a test compares the two. What misses the whole row is culled before any of it.
+A thread is a strip: `width` neighbouring pixels of one row of a tile. Read, written, differentiated and frozen is what
+the two kernels read, write, differentiate and freeze, line by line, with SIMD vectors for what pixels differ in and
+masks for the pixels of which something holds; a test compares the forms. What misses the whole strip is culled first.
 """
 
 import functools
@@ -9,73 +10,76 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.simd import lane_functions, slot_functions
+from nexwarp.kernels.native.simd import simd_functions
+from nexwarp.kernels.native.simd.slots import slot_functions
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import overflowed, surfel_at, walk
+from nexwarp.kernels.walk import surfel_at, walk
 
 
-def row_lanes(tile_size: int) -> int:
-    """Pixels that a thread takes: as many as AVX-512 has lanes for float32, where tiles are that wide."""
+def strip_width(tile_size: int) -> int:
+    """Pixels of a strip: as many float32 as an AVX-512 register holds, where tiles are that wide."""
     return 16 if tile_size % 16 == 0 else 8
 
 
 @functools.cache
-def row_functions(real: type, tile_size: int) -> SimpleNamespace:
-    """Which row of pixels a thread has, and where its rays go; `rows` is the number of rows of a tile."""
+def strip_functions(real: type, tile_size: int) -> SimpleNamespace:
+    """Make the functions that tell a thread its strip and its rays; `strips` is the number of strips of a tile."""
     t = types(real)
     vec2, vec4, HALF = t.vec2, t.vec4, t.HALF
-    lanes = row_lanes(tile_size)
-    lane = lane_functions(real, lanes).lane
-    rows = tile_size * tile_size // lanes
-    across = tile_size // lanes
+    width = strip_width(tile_size)
+    reals = simd_functions(real, width).reals
+    strips = tile_size * tile_size // width
+    across = tile_size // width
     # Half of the distance between the outer pixel centres, and a little.
-    HALF_ROW, SLIVER = wp.constant(real(lanes / 2 - 0.49)), wp.constant(real(0.01))
+    HALF_STRIP, SLIVER = wp.constant(real(width / 2 - 0.49)), wp.constant(real(0.01))
 
     @wp.func
-    def row_of(thread: int, tile_columns: int):
+    def strip_of(thread: int, tile_columns: int):
         """First pixel, (column, row)."""
-        tile = thread // rows
-        local = thread % rows
+        tile = thread // strips
+        local = thread % strips
         return wp.vec2i(
-            (tile % tile_columns) * tile_size + (local % across) * lanes,
+            (tile % tile_columns) * tile_size + (local % across) * width,
             (tile // tile_columns) * tile_size + local // across,
         )
 
     @wp.func
     def rays_of(xy: wp.vec2i, intrinsics: vec4):
-        """Directions of the row's pixels: x of each, the y of all; z is 1."""
-        dx = lane()
-        for l in range(wp.static(lanes)):
+        """Directions of the strip's pixels: x of each, the y of all; z is 1."""
+        dx = reals()
+        for l in range(wp.static(width)):
             dx[l] = (real(float(xy[0] + l)) + HALF - intrinsics[2]) / intrinsics[0]
         return dx, (real(float(xy[1])) + HALF - intrinsics[3]) / intrinsics[1]
 
     @wp.func
     def middle_of(xy: wp.vec2i, y: real, intrinsics: vec4):
-        """Direction through the middle of the row."""
-        return vec2((real(float(xy[0] + wp.static(lanes // 2))) - intrinsics[2]) / intrinsics[0], y)
+        """Direction through the middle of the strip."""
+        return vec2((real(float(xy[0] + wp.static(width // 2))) - intrinsics[2]) / intrinsics[0], y)
 
     @wp.func
-    def half_row(intrinsics: vec4):
-        return vec2(HALF_ROW / intrinsics[0], SLIVER / intrinsics[1])
+    def half_strip(intrinsics: vec4):
+        return vec2(HALF_STRIP / intrinsics[0], SLIVER / intrinsics[1])
 
-    return SimpleNamespace(row_of=row_of, rays_of=rays_of, middle_of=middle_of, half_row=half_row, rows=rows)
+    return SimpleNamespace(
+        strip_of=strip_of, rays_of=rays_of, middle_of=middle_of, half_strip=half_strip, strips=strips
+    )
 
 
 @functools.cache
-def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
+def collect_simd_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
     """Make the forward kernel."""
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     intrinsics_of = frame_functions(real).intrinsics_of
-    lanes = row_lanes(tile_size)
-    h = hit_functions(real, low_pass, lanes)
-    f = lane_functions(real, lanes)
-    lane, word, integer = f.lane, f.word, f.integer
-    s = slot_functions(real, lanes, max(max_hits, 1))
-    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
-    view = row_functions(real, tile_size)
-    rows = view.rows
+    width = strip_width(tile_size)
+    h = hit_functions(real, low_pass, width)
+    f = simd_functions(real, width)
+    reals, integers, integer = f.reals, f.integers, f.integer
+    s = slot_functions(real, width, max(max_hits, 1))
+    reals_by_slot, integers_by_slot = s.reals_by_slot, s.integers_by_slot
+    view = strip_functions(real, tile_size)
+    strips = view.strips
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     # The loop over pixels is not unrolled, that would be most of the kernel's code. Its arguments are copies, so that
@@ -84,17 +88,17 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
     def write(
         xy: wp.vec2i,
         size: wp.vec2i,
-        red: lane,
-        green: lane,
-        blue: lane,
-        transmittance: lane,
-        stop: word,
-        buffer_red: lanes_by_slot,
-        buffer_green: lanes_by_slot,
-        buffer_blue: lanes_by_slot,
-        buffer_weights: lanes_by_slot,
-        buffer_ids: words_by_slot,
-        buffer_depths: lanes_by_slot,
+        red: reals,
+        green: reals,
+        blue: reals,
+        transmittance: reals,
+        stop: integers,
+        buffer_red: reals_by_slot,
+        buffer_green: reals_by_slot,
+        buffer_blue: reals_by_slot,
+        buffer_weights: reals_by_slot,
+        buffer_ids: integers_by_slot,
+        buffer_depths: reals_by_slot,
         plain: wp.array(dtype=vec3),
         base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
@@ -103,7 +107,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         alphas: wp.array(dtype=real),
         stops: wp.array(dtype=wp.int32),
     ):
-        for l in range(wp.min(lanes, size[0] - xy[0])):
+        for l in range(wp.min(width, size[0] - xy[0])):
             p = xy[1] * size[0] + xy[0] + l
             plain[p] = vec3(red[l], green[l], blue[l])
             kept = vec3()
@@ -121,7 +125,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         grid_stride=False,
         module="unique",
     )
-    def collect_rows(
+    def collect_simd(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
@@ -145,33 +149,32 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         stops: wp.array(dtype=wp.int32),
     ):
         thread = first + wp.tid()
-        xy = view.row_of(thread, tile_columns)
+        xy = view.strip_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
         intrinsics = intrinsics_of(Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
         dx, y = view.rays_of(xy, intrinsics)
-        alive = word()
-        for l in range(wp.static(lanes)):
+        alive = integers()
+        for l in range(wp.static(width)):
             if xy[0] + l < size[0]:
                 alive[l] = integer(-1)
         middle = view.middle_of(xy, y, intrinsics)
-        half = view.half_row(intrinsics)
-        one = lane(ONE)
-        transmittance = lane(ONE)
-        red = lane()
-        green = lane()
-        blue = lane()
-        buffer_ids = words_by_slot(integer(-1))
-        buffer_weights = lanes_by_slot()
-        buffer_depths = lanes_by_slot()
-        buffer_red = lanes_by_slot()
-        buffer_green = lanes_by_slot()
-        buffer_blue = lanes_by_slot()
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(thread // rows, tile_offsets, ends, overflow)
-        stop = word(integer(bounds[0]))
-        for k in range(bounds[0], bounds[1]):
+        half = view.half_strip(intrinsics)
+        one = reals(ONE)
+        transmittance = reals(ONE)
+        red = reals()
+        green = reals()
+        blue = reals()
+        buffer_ids = integers_by_slot(integer(-1))
+        buffer_weights = reals_by_slot()
+        buffer_depths = reals_by_slot()
+        buffer_red = reals_by_slot()
+        buffer_green = reals_by_slot()
+        buffer_blue = reals_by_slot()
+        start, end, overflow = walk(thread // strips, tile_offsets, ends, surfel_ids)
+        stop = integers(integer(start))
+        for k in range(start, end):
             i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
@@ -184,36 +187,36 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
                 continue
             u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
             alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
-            seen = f.both(f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False)), alive)
+            seen = f.both(f.both(f.above(alpha, reals(ALPHA_MIN), True), f.above(depth, reals(near), False)), alive)
             if not f.any_of(seen):
                 continue
-            alpha = f.pick(seen, alpha, lane())
+            alpha = f.pick(seen, alpha, reals())
             out_weight = f.times(alpha, transmittance)
             transmittance = f.times(transmittance, one - alpha)
-            stop = f.pick_words(seen, word(integer(k + 1)), stop)
+            stop = f.pick_integers(seen, integers(integer(k + 1)), stop)
             # Pixels without a hit insert the weight 0, which displaces nothing and adds nothing.
-            displaced = word()
-            out_id = word(integer(i))
+            displaced = integers()
+            out_id = integers(integer(i))
             out_depth = depth
-            out_red = lane(rc[0])
-            out_green = lane(rc[1])
-            out_blue = lane(rc[2])
+            out_red = reals(rc[0])
+            out_green = reals(rc[1])
+            out_blue = reals(rc[2])
             for j in range(wp.static(max_hits)):
-                w_ = s.lane_at(buffer_weights, j)
+                w_ = s.reals_at(buffer_weights, j)
                 displaced = f.either(displaced, f.below(w_, out_weight))
-                i_ = s.word_at(buffer_ids, j)
-                d_ = s.lane_at(buffer_depths, j)
-                r_ = s.lane_at(buffer_red, j)
-                g_ = s.lane_at(buffer_green, j)
-                b_ = s.lane_at(buffer_blue, j)
-                buffer_weights = s.with_lane(buffer_weights, j, f.pick(displaced, out_weight, w_))
-                buffer_ids = s.with_word(buffer_ids, j, f.pick_words(displaced, out_id, i_))
-                buffer_depths = s.with_lane(buffer_depths, j, f.pick(displaced, out_depth, d_))
-                buffer_red = s.with_lane(buffer_red, j, f.pick(displaced, out_red, r_))
-                buffer_green = s.with_lane(buffer_green, j, f.pick(displaced, out_green, g_))
-                buffer_blue = s.with_lane(buffer_blue, j, f.pick(displaced, out_blue, b_))
+                i_ = s.integers_at(buffer_ids, j)
+                d_ = s.reals_at(buffer_depths, j)
+                r_ = s.reals_at(buffer_red, j)
+                g_ = s.reals_at(buffer_green, j)
+                b_ = s.reals_at(buffer_blue, j)
+                buffer_weights = s.with_reals(buffer_weights, j, f.pick(displaced, out_weight, w_))
+                buffer_ids = s.with_integers(buffer_ids, j, f.pick_integers(displaced, out_id, i_))
+                buffer_depths = s.with_reals(buffer_depths, j, f.pick(displaced, out_depth, d_))
+                buffer_red = s.with_reals(buffer_red, j, f.pick(displaced, out_red, r_))
+                buffer_green = s.with_reals(buffer_green, j, f.pick(displaced, out_green, g_))
+                buffer_blue = s.with_reals(buffer_blue, j, f.pick(displaced, out_blue, b_))
                 out_weight = f.pick(displaced, w_, out_weight)
-                out_id = f.pick_words(displaced, i_, out_id)
+                out_id = f.pick_integers(displaced, i_, out_id)
                 out_depth = f.pick(displaced, d_, out_depth)
                 out_red = f.pick(displaced, r_, out_red)
                 out_green = f.pick(displaced, g_, out_green)
@@ -221,7 +224,7 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             red += f.times(out_red, out_weight)
             green += f.times(out_green, out_weight)
             blue += f.times(out_blue, out_weight)
-            alive = f.both(alive, f.above(transmittance, lane(TRANSMITTANCE_MIN), True))
+            alive = f.both(alive, f.above(transmittance, reals(TRANSMITTANCE_MIN), True))
             if not f.any_of(alive):
                 break
         write(
@@ -247,26 +250,26 @@ def collect_rows_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
             stops,
         )
 
-    return collect_rows
+    return collect_simd
 
 
 @functools.cache
-def collect_rows_backward_kernel(
-    real: type, max_hits: int, low_pass: bool, tile_size: int, watch: bool = False
+def collect_simd_backward_kernel(
+    real: type, max_hits: int, low_pass: bool, tile_size: int, with_errors: bool = False
 ) -> wp.Kernel:
-    """Make the backward kernel; with `watch` it also adds up weight * error a row of gradients."""
+    """Make the backward kernel; with `with_errors` it also adds up weight * error a gradient slot."""
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     intrinsics_of = frame_functions(real).intrinsics_of
-    lanes = row_lanes(tile_size)
-    h = hit_functions(real, low_pass, lanes)
+    width = strip_width(tile_size)
+    h = hit_functions(real, low_pass, width)
     hit_dot = h.hit_dot
-    f = lane_functions(real, lanes)
-    lane, word, integer, inner = f.lane, f.word, f.integer, f.inner
-    s = slot_functions(real, lanes, max(max_hits, 1))
-    lanes_by_slot, words_by_slot = s.lanes_by_slot, s.words_by_slot
-    view = row_functions(real, tile_size)
-    rows_a_tile = view.rows
+    f = simd_functions(real, width)
+    reals, integers, integer, inner = f.reals, f.integers, f.integer, f.inner
+    s = slot_functions(real, width, max(max_hits, 1))
+    reals_by_slot, integers_by_slot = s.reals_by_slot, s.integers_by_slot
+    view = strip_functions(real, tile_size)
+    strips = view.strips
     ALPHA_MIN, ONE = t.ALPHA_MIN, t.ONE
 
     # Apart from the walk for the reasons that `write` is.
@@ -287,21 +290,21 @@ def collect_rows_backward_kernel(
         grad_alphas: wp.array(dtype=real),
         errors: wp.array(dtype=real),
     ):
-        stop = word()
+        stop = integers()
         last = int(0)
-        grad_red = lane()
-        grad_green = lane()
-        grad_blue = lane()
-        base_red = lane()
-        base_green = lane()
-        base_blue = lane()
-        grad_alpha_sum = lane()
-        rest = lane()
-        error = lane()
-        slots = words_by_slot(integer(-1))
-        gw = lanes_by_slot()
-        gd = lanes_by_slot()
-        for l in range(wp.min(lanes, size[0] - xy[0])):
+        grad_red = reals()
+        grad_green = reals()
+        grad_blue = reals()
+        base_red = reals()
+        base_green = reals()
+        base_blue = reals()
+        grad_alpha_sum = reals()
+        rest = reals()
+        error = reals()
+        buffered_ids = integers_by_slot(integer(-1))
+        gw = reals_by_slot()
+        gd = reals_by_slot()
+        for l in range(wp.min(width, size[0] - xy[0])):
             p = xy[1] * size[0] + xy[0] + l
             stop[l] = integer(stops[p])
             last = wp.max(last, stops[p])
@@ -316,12 +319,12 @@ def collect_rows_backward_kernel(
             grad_alpha_sum[l] = grad_alphas[p]
             total = wp.dot(gn, plain[p]) + wp.dot(gb, base[p]) + grad_alphas[p] * alphas[p]
             for j in range(wp.static(max_hits)):
-                slots[j, l] = integer(ids[p, j])
+                buffered_ids[j, l] = integer(ids[p, j])
                 gw[j, l] = grad_weights[p, j]
                 gd[j, l] = grad_depths[p, j]
                 total += grad_weights[p, j] * weights[p, j]
             rest[l] = total
-            if wp.static(watch):
+            if wp.static(with_errors):
                 error[l] = errors[p]
         return (
             stop,
@@ -335,7 +338,7 @@ def collect_rows_backward_kernel(
             grad_alpha_sum,
             rest,
             error,
-            slots,
+            buffered_ids,
             gw,
             gd,
         )
@@ -345,7 +348,7 @@ def collect_rows_backward_kernel(
         grid_stride=False,
         module="unique",
     )
-    def collect_rows_backward(
+    def collect_simd_backward(
         first: wp.int32,
         records: wp.array2d(dtype=vec4),
         centers: wp.array(dtype=vec3),
@@ -359,7 +362,7 @@ def collect_rows_backward_kernel(
         Ks: wp.array(dtype=mat33),
         near: real,
         reaches: wp.array(dtype=vec2),
-        rows: wp.array(dtype=wp.int32),
+        gradient_slots: wp.array(dtype=wp.int32),
         plain: wp.array(dtype=vec3),
         base: wp.array(dtype=vec3),
         ids: wp.array2d(dtype=wp.int32),
@@ -378,7 +381,7 @@ def collect_rows_backward_kernel(
         error_sums: wp.array(dtype=real),
     ):
         thread = first + wp.tid()
-        xy = view.row_of(thread, tile_columns)
+        xy = view.strip_of(thread, tile_columns)
         if xy[0] >= size[0] or xy[1] >= size[1]:
             return
         intrinsics = intrinsics_of(Ks)
@@ -396,7 +399,7 @@ def collect_rows_backward_kernel(
             grad_alpha_sum,
             rest,
             error,
-            slots,
+            buffered_ids,
             gw,
             gd,
         ) = read(
@@ -416,12 +419,11 @@ def collect_rows_backward_kernel(
             errors,
         )
         middle = view.middle_of(xy, y, intrinsics)
-        half = view.half_row(intrinsics)
-        one = lane(ONE)
-        transmittance = lane(ONE)
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(thread // rows_a_tile, tile_offsets, ends, overflow)
-        for k in range(bounds[0], wp.min(bounds[1], last)):
+        half = view.half_strip(intrinsics)
+        one = reals(ONE)
+        transmittance = reals(ONE)
+        start, end, overflow = walk(thread // strips, tile_offsets, ends, surfel_ids)
+        for k in range(start, wp.min(end, last)):
             i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
@@ -434,19 +436,19 @@ def collect_rows_backward_kernel(
                 continue
             u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
             alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
-            seen = f.both(f.above(alpha, lane(ALPHA_MIN), True), f.above(depth, lane(near), False))
-            seen = f.both(seen, f.below_words(word(integer(k)), stop))
+            seen = f.both(f.above(alpha, reals(ALPHA_MIN), True), f.above(depth, reals(near), False))
+            seen = f.both(seen, f.less_integers(integers(integer(k)), stop))
             if not f.any_of(seen):
                 continue
-            alpha = f.pick(seen, alpha, lane())
+            alpha = f.pick(seen, alpha, reals())
             weight = f.times(alpha, transmittance)
             q = grad_alpha_sum
-            gt = lane()
-            buffered = word()
+            gt = reals()
+            buffered = integers()
             for j in range(wp.static(max_hits)):
-                same = f.equal_words(s.word_at(slots, j), word(integer(i)))
-                q += f.pick(same, s.lane_at(gw, j), lane())
-                gt = f.pick(same, s.lane_at(gd, j), gt)
+                same = f.equal_integers(s.integers_at(buffered_ids, j), integers(integer(i)))
+                q += f.pick(same, s.reals_at(gw, j), reals())
+                gt = f.pick(same, s.reals_at(gd, j), gt)
                 buffered = f.either(buffered, same)
             red_ = f.pick(buffered, base_red, grad_red)
             green_ = f.pick(buffered, base_green, grad_green)
@@ -455,7 +457,7 @@ def collect_rows_backward_kernel(
             rest -= f.times(q, weight)
             grad_alpha = f.times(transmittance, q) - f.over(rest, one - alpha)
             transmittance = f.times(transmittance, one - alpha)
-            # Lanes without a hit are differentiated along, by 0.
+            # Pixels without a hit are differentiated along, by 0.
             g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
                 ra,
                 rb,
@@ -466,20 +468,20 @@ def collect_rows_backward_kernel(
                 y,
                 focal,
                 near,
-                f.pick(seen, grad_alpha, lane()),
-                f.pick(seen, gt, lane()),
+                f.pick(seen, grad_alpha, reals()),
+                f.pick(seen, gt, reals()),
             )
-            row = int(i)
-            if k < rows.shape[0]:
-                row = rows[k]
-            wp.atomic_add(grad_records, row, 0, g0)
-            wp.atomic_add(grad_records, row, 1, g1)
-            wp.atomic_add(grad_records, row, 2, g2)
+            slot = int(i)
+            if k < gradient_slots.shape[0]:
+                slot = gradient_slots[k]
+            wp.atomic_add(grad_records, slot, 0, g0)
+            wp.atomic_add(grad_records, slot, 1, g1)
+            wp.atomic_add(grad_records, slot, 2, g2)
             colors = vec4(inner(red_, weight), inner(green_, weight), inner(blue_, weight), gm)
-            wp.atomic_add(grad_records, row, 3, colors)
+            wp.atomic_add(grad_records, slot, 3, colors)
             if wp.static(low_pass):
-                wp.atomic_add(grad_centers, row, gc)
-            if wp.static(watch):
-                wp.atomic_add(error_sums, row, inner(weight, error))
+                wp.atomic_add(grad_centers, slot, gc)
+            if wp.static(with_errors):
+                wp.atomic_add(error_sums, slot, inner(weight, error))
 
-    return collect_rows_backward
+    return collect_simd_backward

@@ -49,7 +49,7 @@ _PUT = (
 _RECORD = f"""
     {GATHER_RECORD}
     {_PUT}
-    wp::int64* target = &wp::index(records, row, 0);
+    wp::int64* target = &wp::index(records, slot, 0);
 #if defined(__CUDA_ARCH__)
     const int lane = threadIdx.x & 31;
     EXCHANGES
@@ -62,7 +62,7 @@ _RECORD = f"""
 
 _VECTOR = f"""
     {_PUT}
-    wp::int64* target = &wp::index(sums, row, 0);
+    wp::int64* target = &wp::index(sums, slot, 0);
     for (int k = 0; k < LENGTH; ++k) put(target + 2 * k, VALUE);
 """
 
@@ -79,15 +79,15 @@ _UNITS = f"""
 
 
 @functools.cache
-def fixed_record_sum(real: type) -> wp.Function:
-    """Make a function that adds the sum over all lanes of four vec4 to the 16 pairs of records[row]."""
+def fixed_point_record_sum(real: type) -> wp.Function:
+    """Make a function that adds the sum over all lanes of four vec4 to the 16 pairs of records[slot]."""
     vec4 = wp.types.vector(length=4, dtype=real)
     name = "float" if real is wp.float32 else "double"
 
     @wp.func_native(_RECORD.replace("EXCHANGES", EXCHANGES).replace("REAL", name))
     def add_record(
         records: wp.array2d(dtype=wp.int64),
-        row: wp.int32,
+        slot: wp.int32,
         a: vec4,
         b: vec4,
         c: vec4,
@@ -99,19 +99,19 @@ def fixed_record_sum(real: type) -> wp.Function:
 
 
 @functools.cache
-def fixed_add(dtype: type) -> wp.Function:
-    """Make a function that adds a scalar or a vector to the pairs of sums[row]."""
+def fixed_point_add(dtype: type) -> wp.Function:
+    """Make a function that adds a scalar or a vector to the pairs of sums[slot]."""
     length = 0 if dtype in (wp.float32, wp.float64) else dtype._length_
     text = _VECTOR.replace("LENGTH", str(max(length, 1))).replace("VALUE", "x.c[k]" if length else "x")
 
     @wp.func_native(text)
-    def add_value(sums: wp.array2d(dtype=wp.int64), row: wp.int32, x: dtype, bad: wp.array(dtype=wp.int32)): ...
+    def add_value(sums: wp.array2d(dtype=wp.int64), slot: wp.int32, x: dtype, bad: wp.array(dtype=wp.int32)): ...
 
     return add_value
 
 
 @functools.cache
-def fixed_units(real: type) -> wp.Function:
+def fixed_point_units(real: type) -> wp.Function:
     """Make a function that adds a scalar times a scale, rounded, to sums[row, column]."""
 
     @wp.func_native(_UNITS)

@@ -1,8 +1,8 @@
-"""Sums and votes over the 32 lanes of a CUDA warp; on a CPU a warp is one thread.
+"""Votes, exchanges and sums across a CUDA warp: 32 threads that run together. On a CPU a warp is one thread.
 
-Walks use them to cull for all pixels of a warp at once, backward passes to add up what neighbouring pixels give to one
-surfel before any atomic.
-All lanes of a warp must reach these calls together.
+A lane is a thread's index in its warp, as in CUDA. All lanes of a warp must reach a call together.
+Walks use these to cull for all pixels of a warp at once, and backward passes to add up what neighbouring pixels give to
+one surfel before any atomic.
 """
 
 import functools
@@ -25,7 +25,7 @@ _LANE = """
 #endif
 """
 
-_WIDTH = """
+_SIZE = """
 #if defined(__CUDA_ARCH__)
     return 32;
 #else
@@ -86,7 +86,7 @@ GATHER_RECORD = """
 
 _ADD_RECORD = """
     GATHER
-    REAL* target = reinterpret_cast<REAL*>(&wp::index(records, row, 0));
+    REAL* target = reinterpret_cast<REAL*>(&wp::index(records, slot, 0));
 #if defined(__CUDA_ARCH__)
     const int lane = threadIdx.x & 31;
     EXCHANGES
@@ -117,20 +117,20 @@ _SUM_VECTOR = """
 
 
 @wp.func_native(_ANY)
-def any_lane(x: wp.int32) -> wp.int32:
+def any_in_warp(x: wp.int32) -> wp.int32:
     """Return nonzero in all lanes when x is nonzero in any."""
     ...
 
 
 @wp.func_native(_LANE)
-def lane() -> wp.int32:
+def lane_index() -> wp.int32:
     """Return the index of this lane, 0 to 31."""
     ...
 
 
-@wp.func_native(_WIDTH)
-def lanes() -> wp.int32:
-    """Return how many lanes a warp has."""
+@wp.func_native(_SIZE)
+def warp_size() -> wp.int32:
+    """Return the number of threads of a warp."""
     ...
 
 
@@ -141,25 +141,25 @@ def ballot(x: wp.int32) -> wp.int32:
 
 
 @wp.func_native(_FIRST)
-def first_lane(mask: wp.int32) -> wp.int32:
+def lowest_lane(mask: wp.int32) -> wp.int32:
     """Return the lowest lane of a ballot that is not empty."""
     ...
 
 
 @wp.func_native(_FROM_LANE)
 def from_lane(x: wp.int32, source: wp.int32) -> wp.int32:
-    """Return x as the lane `source` has it."""
+    """Return the value that x has in the lane `source`."""
     ...
 
 
 @wp.func_native(_MAX)
-def lane_max(x: wp.int32) -> wp.int32:
+def warp_max(x: wp.int32) -> wp.int32:
     """Return the largest x of all lanes."""
     ...
 
 
 @functools.cache
-def lane_sum(dtype: type) -> wp.Function:
+def warp_sum(dtype: type) -> wp.Function:
     """Make a function that returns, in lane 0, the sum of x (a scalar or vector type) over all lanes."""
     length = 0 if dtype in (wp.float32, wp.float64) else dtype._length_
 
@@ -170,12 +170,12 @@ def lane_sum(dtype: type) -> wp.Function:
 
 
 @functools.cache
-def record_sum(real: type) -> wp.Function:
-    """Make a function that adds the sum over all lanes of four vec4 to the four of records[row]."""
+def warp_record_sum(real: type) -> wp.Function:
+    """Make a function that adds the sum over all lanes of four vec4 to the four of records[slot]."""
     vec4 = wp.types.vector(length=4, dtype=real)
     name = "float" if real is wp.float32 else "double"
 
     @wp.func_native(_ADD_RECORD.replace("GATHER", GATHER_RECORD).replace("EXCHANGES", EXCHANGES).replace("REAL", name))
-    def add_record(records: wp.array2d(dtype=vec4), row: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4): ...
+    def add_record(records: wp.array2d(dtype=vec4), slot: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4): ...
 
     return add_record

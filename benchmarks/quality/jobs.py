@@ -1,0 +1,143 @@
+"""The trainings that each table of the quality benchmark is made of, and which of them share their first iterations."""
+
+import dataclasses
+import json
+from collections.abc import Hashable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from benchmarks.quality.rows import CHANGES, DEFAULT, DEMOS, HITS, NO_TEXTURE, PAPER, PEER, REMOVALS, Row
+from nexwarp.train.config import Config
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
+
+SCENES = ("fox", "saharov", "kitchen25")
+DEMO = "demo"  # the built-in scene
+TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames", "demo")
+CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One training.
+
+    Attributes:
+        scene: folder below the data, or `DEMO`.
+        variant: "" or one of `benchmarks.quality.scenes.VARIANTS`.
+        row: name of a `Row`.
+        size: budget of primitives.
+        seed: of all random choices.
+        iterations: training steps.
+        downscale: factor by which photos are reduced.
+    """
+
+    scene: str
+    variant: str
+    row: str
+    size: int
+    seed: int
+    iterations: int
+    downscale: int = 1
+
+
+@dataclass(frozen=True)
+class JobGroup:
+    """Jobs whose first iterations are the same.
+
+    Attributes:
+        jobs: one job or more.
+        iterations: how many iterations they share; 0 for a single job.
+    """
+
+    jobs: tuple[TrainingJob, ...]
+    iterations: int
+
+
+def table_jobs(
+    table: str, scenes: Iterable[str], seeds: Iterable[int], iterations: int, size: int
+) -> Iterator[TrainingJob]:
+    """Yield the jobs of a table.
+
+    Args:
+        table: one of `TABLES`.
+        scenes: names of scenes; `curve`, `arc` and `frames` are of fox alone, `demo` of the built-in scene.
+        seeds: of each row.
+        iterations: of each training; `demo` has its own.
+        size: budget of primitives; `curve` and `demo` have their own.
+
+    Raises:
+        ValueError: `table` is unknown.
+    """
+    sizes: tuple[int, ...] = (size,)
+    variants: tuple[str, ...] = ("",)
+    if table == "peers":
+        rows, sizes = (DEFAULT, PEER), (size, size // 4)
+    elif table == "curve":
+        rows, sizes, scenes = (DEFAULT, PEER), CURVE, ("fox",)
+    elif table == "paper":
+        rows = (DEFAULT, PAPER)
+    elif table == "ablation":
+        rows = (DEFAULT, *REMOVALS)
+    elif table == "hits":
+        rows = (DEFAULT, NO_TEXTURE, *HITS)
+    elif table == "changes":
+        rows = (DEFAULT, *CHANGES)
+    elif table == "arc":
+        rows, variants, scenes = (DEFAULT, PAPER), ("arc",), ("fox",)
+    elif table == "frames":
+        rows, variants, scenes = (DEFAULT,), ("", "x100", "moved"), ("fox",)
+    elif table == "demo":
+        rows, variants, scenes = DEMOS, ("arc",), (DEMO,)
+        sizes, iterations = (DEMO_SETTINGS["max_surfels"],), DEMO_SETTINGS["iterations"]
+    else:
+        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
+    seeds = tuple(seeds)
+    for scene in scenes:
+        for count in sizes:
+            for variant in variants:
+                for row in rows:
+                    for seed in seeds:
+                        yield TrainingJob(scene, variant, row.name, count, seed, iterations)
+
+
+def config_of(job: TrainingJob, row: Row) -> Config:
+    """Return the settings of a training of nexwarp; `row.preset` must not be None."""
+    assert row.preset is not None
+    config = with_settings(preset(row.preset), row.settings)
+    return dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
+
+
+def group_jobs(jobs: Iterable[TrainingJob], rows: Mapping[str, Row]) -> list[JobGroup]:
+    """Group jobs that share their first iterations, in the order of each group's first job.
+
+    They share them where their settings differ only in K (2 or more), in the removal of floaters, or in how a model is
+    finished. Other jobs come alone.
+
+    Args:
+        jobs: different ones.
+        rows: rows by name.
+    """
+    groups: dict[Hashable, tuple[list[TrainingJob], int]] = {}
+    for job in jobs:
+        key, shared = _shared_start(job, rows[job.row])
+        groups.setdefault(key, ([], shared))[0].append(job)
+    return [JobGroup(tuple(found), shared if len(found) > 1 else 0) for found, shared in groups.values()]
+
+
+def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
+    """Return a key that is equal for jobs with the same first iterations, and how many those are."""
+    if row.preset is None:
+        return job, 0
+    config = config_of(job, row)
+    first_search = config.scaled(config.densify.stop)  # for floaters
+    shared = min(config.settled - 1, first_search - 1, job.iterations)
+    if shared <= 0:
+        return job, 0
+    alike = dataclasses.replace(
+        config,
+        max_hits=min(config.max_hits, 2),
+        densify=dataclasses.replace(config.densify, floaters=False),
+        metering=False,
+        footprints=False,
+        smooth_sh=0.0,
+    )
+    return (dataclasses.replace(job, row=""), json.dumps(alike.as_dict())), shared

@@ -1,0 +1,67 @@
+"""The ways of training that the quality benchmark compares; the names are those in kept results."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from nexwarp.train.presets import DEMO_SETTINGS
+
+GSPLAT = "gsplat MCMC"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of training, a row of the tables.
+
+    Attributes:
+        name: as the tables print it.
+        preset: of nexwarp; None trains gsplat.
+        settings: changes of the preset, by the names of `--set`.
+    """
+
+    name: str
+    preset: str | None = "default"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+PAPER = Row("paper", "paper")
+DEFAULT = Row("default")
+PEER = Row(GSPLAT, None)
+NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
+# The ablations of the paper (its section "Ablations").
+REMOVALS = (
+    NO_TEXTURE,
+    Row("no gamma", settings={"rates.gammas": 0.0}),
+    Row("no higher SH of surfels", settings={"sh_degree": 0, "texture.sh_degree": 3}),
+    Row("no down-weighting", settings={"texture.down_weighting": False}),
+)
+HITS = (
+    *(Row(f"K = {k}", settings={"max_hits": k}) for k in (1, 3, 4)),
+    Row("K = 4 from the start", settings={"max_hits": 4, "more_hits_from": 0}),
+)
+# Each undoes one change of the default preset against the paper.
+CHANGES = (
+    Row("replacing texture", settings={"texture.residual": False}),
+    Row("no footprints", settings={"footprints": False}),
+    Row("no SH smoothing", settings={"smooth_sh": 0.0}),
+    Row("no exposures", settings={"exposures": False}),
+    Row("no metering", settings={"metering": False}),
+    Row("no vignetting", settings={"vignetting": False}),
+    Row("no border steps", settings={"border": 0.0}),
+    Row("no depth loss", settings={"losses.depth": 0.0}),
+    Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
+    Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),
+    Row("no filter of points", settings={"filter_points": False}),
+    Row("random rotations", settings={"orient_points": False}),
+    Row("clamped image", settings={"clamp_image": True}),
+    Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
+    Row("floaters left", settings={"densify.floaters": False}),
+    Row("no depth jitter", settings={"depth_jitter": 0.0}),
+    Row("paper's table", settings={"texture.table_size": 2**20}),
+    Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),
+    Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
+)
+# `nexwarp train demo`, and the paper's preset with a run as short: with the demo's rates, without our additions.
+_SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
+_AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_SETTINGS["rates.mlp"][0],) * 2}
+DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
+ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES, *DEMOS)}

@@ -1,0 +1,241 @@
+"""One training of the quality benchmark: train, render the test views, compare them with their photos."""
+
+import gc
+import hashlib
+import json
+import os
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.metrics import quarter_psnr, train_psnr, zoom_psnr
+from benchmarks.quality.results import METRICS
+from benchmarks.quality.rows import Row
+from benchmarks.quality.scenes import scene_of
+from benchmarks.timing import ROOT
+from nexwarp.camera import Camera
+from nexwarp.data import Scene, View
+from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.config import Config
+from nexwarp.train.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class SharedStart:
+    """The first iterations that several jobs have in common.
+
+    Attributes:
+        rows: of the jobs.
+        iterations: how many.
+        folder: holds the checkpoint.
+    """
+
+    rows: tuple[str, ...]
+    iterations: int
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Renderings of the test views after a training, (H, W, 3) uint8 on the CPU, and the facts of its result."""
+
+    renderings: list[tuple[View, torch.Tensor]]
+    facts: dict[str, Any]
+
+
+def train_shared_start(jobs: Sequence[TrainingJob], data: Path, row: Row, iterations: int, folder: Path) -> SharedStart:
+    """Train the first iterations that several jobs have in common.
+
+    Args:
+        jobs: one or more.
+        data: folder of the scenes.
+        row: of the first job.
+        iterations: how many.
+        folder: made for the checkpoint.
+    """
+    trainer = Trainer(scene_of(jobs[0], data), config_of(jobs[0], row), _device())
+    trainer.run(until=iterations)
+    folder.mkdir()
+    trainer.save(folder)
+    return SharedStart(tuple(job.row for job in jobs), iterations, folder)
+
+
+def run_job(
+    job: TrainingJob,
+    data: Path,
+    row: Row,
+    pictures: Path | None = None,
+    models: Path | None = None,
+    start: SharedStart | None = None,
+) -> dict[str, Any]:
+    """Train, render the test views and compare them with their photos.
+
+    Args:
+        job: what to train.
+        data: folder of the scenes.
+        row: the job's.
+        pictures: folder for photo, rendering and error of each test view.
+        models: folder to keep the model in.
+        start: where to continue from.
+
+    Returns:
+        A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
+        `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
+        of GPU memory (torch's); of nexwarp `config`, a digest of its settings, `removed_last`, the floaters that the
+        last search removed, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its
+        shared start, if any; the metrics by view; device, date and commit.
+    """
+    device = _device()
+    scene = scene_of(job, data)
+    if device.type == "cuda":
+        gc.collect()  # arrays of the training before it in this process
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    if row.preset is None:
+        trained = _train_gsplat(job, scene, device)
+    else:
+        trained = _train_nexwarp(job, row, scene, device, models, start)
+    peak = {}
+    if device.type == "cuda":
+        peak["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
+    views = _compare(job, trained, pictures)
+    return {
+        **asdict(job),
+        "settings": row.settings,
+        **{key: _mean(v[key] for v in views.values()) for key in METRICS},
+        **trained.facts,
+        **peak,
+        "views": views,
+        "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
+        "date": time.strftime("%Y-%m-%d"),
+        "commit": _commit(),
+    }
+
+
+def file_name(job: TrainingJob) -> str:
+    """Return the name of a job's files."""
+    reduced = f"-downscale{job.downscale}" if job.downscale > 1 else ""
+    return f"{job.scene}{job.variant}-{job.row}-{job.size}-{job.seed}{reduced}".replace(" ", "_")
+
+
+def config_name(config: Config) -> str:
+    """Return a digest of settings, whatever the seed."""
+    settings = {name: value for name, value in config.as_dict().items() if name != "seed"}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _compare(job: TrainingJob, trained: Trained, pictures: Path | None) -> dict[str, dict[str, float | None]]:
+    """Return the metrics of each test view, and save its pictures."""
+    views = {}
+    for view, image in trained.renderings:
+        photo = to_uint8(view.image)
+        figures = {name: metric(image, photo, view.mask) for name, metric in METRIC_FUNCTIONS.items()}
+        views[view.name] = figures
+        if pictures is not None:
+            strip = [photo, image, error_map(image, photo)]
+            captions = ["photo", f"{job.row}, {figures['psnr']:.2f} dB", "error (0 to 0.25)"]
+            file = pictures / f"{file_name(job)}-{Path(view.name).stem}.png"
+            save_png(file, side_by_side(strip, captions=captions))
+    return views
+
+
+def _train_nexwarp(
+    job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None, start: SharedStart | None
+) -> Trained:
+    begin = time.perf_counter()
+    trainer = Trainer(scene, config_of(job, row), device)
+    shared = {}
+    if start is not None:
+        _restore(trainer, start.folder)
+        shared = {"together": {"rows": start.rows, "iterations": start.iterations}}
+    before = trainer.seconds  # of the shared start
+    # The last search for floaters is part of the last iteration.
+    trainer.run(until=trainer.config.iterations - 1)
+    count = len(trainer.surfels)
+    trainer.run()
+    model = trainer.finish()
+    seconds = before + time.perf_counter() - begin
+
+    def image(camera: Camera) -> torch.Tensor:
+        return model.render(camera).image
+
+    with tempfile.TemporaryDirectory() as temporary:
+        file = model.save(Path(temporary) if models is None else models / file_name(job))
+        megabytes = file.stat().st_size / 1e6
+    facts = {
+        "primitives": len(trainer.surfels),
+        "removed_last": count - len(trainer.surfels),
+        "megabytes": megabytes,
+        "seconds": seconds,
+        "config": config_name(trainer.config),
+        "train_psnr": train_psnr(scene, image),
+        "zoom_psnr": zoom_psnr(scene, image),
+        "quarter_psnr": quarter_psnr(scene, image),
+        **shared,
+    }
+    with torch.no_grad():
+        return Trained([(view, to_uint8(image(view.camera)).cpu()) for view in scene.test], facts)
+
+
+def _restore(trainer: Trainer, folder: Path) -> None:
+    """Continue from a checkpoint of other settings, as if it had been made with the trainer's own."""
+    tensors, state = load_checkpoint(folder)
+    with tempfile.TemporaryDirectory() as own:
+        save_checkpoint(Path(own), tensors, state | {"config": trainer.config.as_dict()})
+        trainer.restore(Path(own))
+
+
+def _train_gsplat(job: TrainingJob, scene: Scene, device: torch.device) -> Trained:
+    from benchmarks import peer_gsplat
+
+    begin = time.perf_counter()
+    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device)
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    seconds = time.perf_counter() - begin
+
+    def image(camera: Camera) -> torch.Tensor:
+        return gaussians.render(camera.to(device))[0]
+
+    with torch.no_grad():
+        renderings = [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
+    facts = {
+        "primitives": len(gaussians.splats["means"]),
+        "megabytes": gaussians.megabytes,
+        "seconds": seconds,
+        "quarter_psnr": quarter_psnr(scene, image),
+    }
+    return Trained(renderings, facts)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [x for x in values if x is not None]
+    return statistics.fmean(known) if known else None
+
+
+@lru_cache
+def _commit() -> str:
+    """Return the commit of this checkout; NEXWARP_COMMIT names it where the files come without their history."""
+    if name := os.environ.get("NEXWARP_COMMIT"):
+        return name
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

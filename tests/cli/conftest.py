@@ -1,0 +1,39 @@
+"""A scene, a finished run of it, and a check of what the command line refuses."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from nexwarp.cli import main as cli
+from nexwarp.data import write_demo
+from nexwarp.train import presets
+from tests.cli.support import FLAGS, SMALL
+
+
+@pytest.fixture(scope="module")
+def small_preset(one_torch_thread: None, few_looks: None) -> Iterator[None]:
+    """A small default preset: the command line has no flags for the texture's shape."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(presets.PRESETS, "default", SMALL)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=48, height=36, views=10, points=200)
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    run = tmp_path_factory.mktemp("runs") / "nested" / "tiny"
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 0
+    return run
+
+
+@pytest.fixture
+def finished(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to be worked on."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))

@@ -1,0 +1,55 @@
+"""Settings of a small run, and what the command line leaves and says."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nexwarp.cli import main as cli
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+
+SMALL = Config(
+    texture=TextureConfig(levels=4, table_size=2**10, width=16),
+    densify=DensifyConfig(every=3),  # so that 20 iterations have rounds
+)
+
+
+FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
+RUN_FILES = {
+    "config.json",
+    "model.safetensors",
+    "cameras.json",
+    "metrics.json",
+    "metrics.jsonl",
+    "renders",
+    "checkpoint",
+}
+RUN_FILES |= {"checkpoint.old"}  # where there was more than one
+
+
+def read(run: Path, name: str) -> Any:
+    return json.loads((run / name).read_text())
+
+
+def picture(file: Path) -> torch.Tensor:
+    with Image.open(file) as image:
+        return torch.from_numpy(np.array(image))
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
+    """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
+    capsys.readouterr()
+    assert cli.main(arguments) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1 and err.endswith("\n"), err
+    missing = [word for word in words if word not in err]
+    assert not missing, f"{missing} not in {err!r}"

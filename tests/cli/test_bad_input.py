@@ -1,0 +1,203 @@
+"""What the command line cannot use is one line that names it, and nothing is written."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nexwarp.cli import main as cli
+from tests.cli.support import refused
+from tests.test_scene import make_scene
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+
+@pytest.fixture
+def refuses(tmp_path, capsys) -> Callable[..., None]:
+    """Train, expecting a refusal that leaves no run folder, not even its parent."""
+
+    def check(path: Path | str, flags: list[str], *words: str) -> None:
+        run = tmp_path / "runs" / "new"
+        refused(capsys, ["train", str(path), "--run", str(run), "--device", "cpu", *flags], *words)
+        assert not run.parent.exists()
+
+    return check
+
+
+def test_missing_folder(tmp_path, refuses):
+    refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a scene")
+
+
+def test_folder_without_a_model(tmp_path, refuses):
+    (tmp_path / "empty").mkdir()
+    refuses(
+        tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "expected a COLMAP model", "transforms.json"
+    )
+
+
+def test_no_images_folder(tmp_path, refuses):
+    folder = make_scene(tmp_path / "scene")
+    shutil.rmtree(folder / "images")
+    refuses(folder, [], "images", str(folder))
+    refuses(folder, ["--images", "images_4"], "images_4", str(folder))
+
+
+def test_no_registered_images(tmp_path, refuses):
+    folder = make_scene(tmp_path / "scene", names=[])
+    refuses(folder, [], str(folder), "no registered images")
+
+
+def test_absent_photo(tmp_path, refuses):
+    folder = make_scene(tmp_path / "scene")
+    (folder / "images" / "03.png").unlink()
+    refuses(folder, [], str(folder / "images" / "03.png"), "not found", "the COLMAP model names it")
+
+
+def test_truncated_photo(tmp_path, refuses):
+    folder = make_scene(tmp_path / "scene")
+    photo = folder / "images" / "03.png"
+    photo.write_bytes(photo.read_bytes()[:2000])
+    refuses(folder, [], f"{photo}: expected a complete image file")
+    photo.write_text("no image")
+    refuses(folder, [], f"{photo}: expected a complete image file, could not decode it: no format is known\n")
+    refuses(photo, [], f"{photo}: expected the folder of a scene, got a file; give {photo.parent}")
+
+
+def test_lens_that_is_no_number(tmp_path, refuses):
+    params = (40.0, 40.0, 24.0, 18.0, float("nan"), 0.0, 0.0, 0.0)
+    folder = make_scene(tmp_path / "scene", model="OPENCV", params=params)
+    refuses(folder, [], "00.png", "OPENCV", "expected finite parameters")
+
+
+def test_zero_points(tmp_path, refuses):
+    folder = make_scene(tmp_path / "scene", points=np.zeros((0, 3)))
+    refuses(folder, [], str(folder), "no 3D points", "expected at least one")
+
+
+@pytest.mark.parametrize("budget", ["15", "0", "-3"])
+def test_budget_below_the_minimum(scene, refuses, budget):
+    refuses(scene, ["--max-surfels", budget], "max_surfels", "expected at least 16", f"got {budget}")
+
+
+def test_unknown_preset(scene, refuses):
+    refuses(scene, ["--preset", "papr"], "preset", "expected one of default, paper", "'papr'")
+
+
+@pytest.mark.parametrize("hits", ["9", "-1"])
+def test_too_many_hits(scene, refuses, hits):
+    refuses(scene, ["--max-hits", hits], "max-hits", "expected 0 to 8", f"got {hits}")
+
+
+@pytest.mark.parametrize(("factor", "expected"), [("0", "at least 1"), ("-2", "at least 1"), ("37", "at most")])
+def test_impossible_downscale(scene, refuses, factor, expected):
+    refuses(scene, ["--downscale", factor], "downscale", f"expected {expected}", f"got {factor}")
+
+
+def test_no_iterations(scene, refuses):
+    refuses(scene, ["--iterations", "0"], "iterations", "expected at least 1", "got 0")
+
+
+def test_unknown_device(scene, refuses):
+    refuses(scene, ["--device", "gpu"], "--device", "expected cuda or cpu", "'gpu'")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_no_cuda_when_asked_for(scene, finished, refuses, capsys):
+    refuses(scene, ["--device", "cuda"], "--device", "cuda", "no CUDA device", "--device cpu")
+    for command in ("eval", "render"):
+        refused(capsys, [command, str(finished), "--device", "cuda"], "--device", "no CUDA device")
+
+
+def test_nothing_to_resume(scene, refuses, tmp_path):
+    refuses(scene, ["--resume"], str(tmp_path / "runs" / "new"), "expected a run to resume")
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"scene": {}}', '{"scene": {"path": "x"}, "config": {"a": 1}}', "\x00"])
+@pytest.mark.parametrize("command", ["eval", "info"])
+def test_damaged_config(command, content, finished, capsys):
+    (finished / "config.json").write_text(content)
+    refused(capsys, [command, str(finished)], str(finished / "config.json"), "expected the settings of a nexwarp run")
+
+
+def test_damaged_files_of_a_run(finished, capsys):
+    (finished / "metrics.json").write_text("{")
+    refused(capsys, ["info", str(finished)], str(finished / "metrics.json"))
+    (finished / "cameras.json").write_text("{}")
+    refused(capsys, ["render", str(finished), "--device", "cpu"], "cameras", "expected at least one")
+    (finished / "cameras.json").unlink()
+    refused(capsys, ["render", str(finished), "--device", "cpu"], "cameras.json", "expected the run's cameras")
+    (finished / "model.safetensors").write_bytes(b"nonsense")
+    for command in ("render", "info"):
+        refused(capsys, [command, str(finished)], "model.safetensors", "expected a safetensors file")
+
+
+def test_negative_frames(finished, capsys):
+    refused(capsys, ["render", str(finished), "--frames", "-1"], "--frames", "expected at least 0", "got -1")
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["expected one of {train, eval", "see nexwarp --help"]),
+        (["fly"], ["unrecognized options: fly", "see nexwarp --help"]),
+        (["train"], ["missing from nexwarp train: scene folder of a colmap", "see nexwarp train --help"]),
+        (["train", "x", "--iterations", "many"], ["--iterations: expected an integer, got 'many'; see nexwarp train"]),
+        (["train", "x", "--port", "8o80"], ["--port: expected an integer, got '8o80'; see nexwarp train --help"]),
+        (["render", "x", "--scale", "big"], ["--scale: expected a number, got 'big'; see nexwarp render --help"]),
+        (["render", "x", "--fps", "3O"], ["--fps: expected a number, got '3o'; see nexwarp render --help"]),
+        (["train", "x", "--colour", "red"], ["unrecognized options: --colour, red"]),
+        (["train", "x", "--itertions", "3"], ["options: --itertions, 3; perhaps you meant --iterations n; see"]),
+        (["train", "x", "--run"], ["missing value for argument '--run'. expected 1 values; see nexwarp train"]),
+        (["sfm", "x", "y", "--matching", "no"], ["invalid choice 'no' for argument '--matching'. expected one of"]),
+    ],
+)
+def test_wrong_arguments(arguments, words, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit) as exited:
+        cli.main(arguments)
+    out, err = capsys.readouterr()
+    assert exited.value.code == 2 and out == ""
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1 and not set(err) & set("│─╭╰")
+    assert all(word in err.lower() for word in words), err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["render", "--help"]])
+def test_help(arguments, capsys):
+    with pytest.raises(SystemExit) as exited:
+        cli.main(arguments)
+    out, err = capsys.readouterr()
+    assert exited.value.code == 0 and "usage: nexwarp" in out and err == ""
+
+
+def test_python_dash_m(tmp_path):
+    """`python -m nexwarp` is the same program; of a mistake, one line is all that reaches the terminal."""
+    command = [sys.executable, "-m", "nexwarp", "train", str(tmp_path / "no"), "--device", "cpu"]
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=120)
+    assert done.returncode == 2
+    assert (
+        done.stderr
+        == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a scene: COLMAP, nerfstudio or Blender\n"
+    )
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--background", "pink"], ["background: expected white, black, random or three numbers", "'pink'"]),
+        (["--masks", "absent"], ["masks: no folder 'absent'"]),
+        (["--points", "nowhere.ply"], ["nowhere.ply: no such file, expected a PLY file"]),
+        (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
+    ],
+)
+def test_flags_of_scenes_that_cannot_be(scene, refuses, flags, words):
+    refuses(scene, flags, *words)

@@ -1,0 +1,234 @@
+"""Runs that are interrupted or killed go on to the same bits."""
+
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nexwarp.cli import main as cli
+from nexwarp.cli.display import TrainingDisplay
+from nexwarp.train.densify import Densifier
+from nexwarp.train.trainer import Trainer
+from tests.cli.support import FLAGS, RUN_FILES, picture, read, refused, snapshot
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+
+def interrupt_after(
+    patch: pytest.MonkeyPatch, owner: type, method: str, calls: int, number: int = signal.SIGINT
+) -> None:
+    """Press Ctrl-C (or send another signal), once, in the given call of a method."""
+    original: Callable[..., Any] = getattr(owner, method)
+    count = iter(range(1, 1_000_000))
+
+    def interrupted(*args: Any, **kwargs: Any) -> Any:
+        if next(count) == calls:
+            signal.raise_signal(number)
+        return original(*args, **kwargs)
+
+    patch.setattr(owner, method, interrupted)
+
+
+@pytest.mark.parametrize(
+    ("owner", "method", "calls"),
+    [
+        (TrainingDisplay, "__call__", 7),  # between two steps
+        (TrainingDisplay, "__call__", 1),  # before there is any checkpoint
+        (Densifier, "accumulate", 5),  # after a backward pass, before the optimizer steps
+        (torch.optim.Adam, "step", 8),
+    ],
+)
+def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, capsys, owner, method, calls):
+    """Ctrl-C anywhere in a step, then --resume: the same model, byte for byte, as of the run that was left alone."""
+    run = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_after(patch, owner, method, calls)
+        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 130
+    assert capsys.readouterr().err == "nexwarp: interrupted; continue with --resume\n"
+    assert {f.name for f in run.iterdir()} - {"checkpoint.old"} == {"config.json", "metrics.jsonl", "checkpoint"}
+    assert read(run / "checkpoint", "state.json")["iteration"] == calls
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
+    assert f"resumed at iteration {calls}" in capsys.readouterr().out
+    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+    expected, metrics = read(trained, "metrics.json"), read(run, "metrics.json")
+    for key in ("psnr", "ssim", "views", "iterations", "surfels"):
+        assert metrics[key] == expected[key], key
+
+
+def test_a_killed_run_resumes_to_the_same_bits(trained, scene, tmp_path):
+    """Without a chance to save anything, the last regular checkpoint serves."""
+
+    class Killed(BaseException):
+        pass
+
+    def kill(_: Any, step: Any) -> None:
+        if step.iteration == 7:
+            raise Killed
+
+    run = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingDisplay, "__call__", kill)
+        with pytest.raises(Killed):
+            cli.main(["train", str(scene), "--run", str(run), *FLAGS])
+    assert read(run / "checkpoint", "state.json")["iteration"] == 6
+    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
+    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
+def test_other_signals_stop_in_order_too(trained, scene, tmp_path, capsys, name, code):
+    number = getattr(signal, name)
+    before, run = signal.getsignal(number), tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_after(patch, torch.optim.Adam, "step", 7, number)
+        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == code
+    assert capsys.readouterr().err == "nexwarp: terminated; continue with --resume\n"
+    assert read(run / "checkpoint", "state.json")["iteration"] == 7
+    assert signal.getsignal(number) == before
+    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
+    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+
+
+def test_a_closed_terminal_does_not_stop_what_nohup_started(scene, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            interrupt_after(patch, torch.optim.Adam, "step", 2, signal.SIGHUP)
+            command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "3"]
+            assert cli.main(command) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, monkeypatch, capsys):
+    seen, save = [], Trainer.save
+    monkeypatch.setattr(Trainer, "save", lambda self, run: (seen.append(self.iteration), save(self, run)))
+    run = tmp_path / "run"
+    command = ["train", str(scene), "--run", str(run), *FLAGS]
+    assert cli.main([*command, "--checkpoint-every", "7"]) == 0
+    assert seen == [7, 14, 20]
+    kept = [read(run / name, "state.json")["iteration"] for name in ("checkpoint", "checkpoint.old")]
+    assert kept == [20, 14]
+    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+    refused(capsys, [*command, "--overwrite", "--checkpoint-every", "0"], "--checkpoint-every", "at least 1", "got 0")
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "state", "missing"])
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(trained, scene, finished, capsys, damage):
+    tensors, state = (finished / "checkpoint" / name for name in ("tensors.safetensors", "state.json"))
+    content = tensors.read_bytes()
+    if damage == "cut":
+        tensors.write_bytes(content[: len(content) // 2])
+    elif damage == "flip":
+        tensors.write_bytes(content[:-7] + bytes([content[-7] ^ 1]) + content[-6:])
+    elif damage == "state":
+        state.write_text(state.read_text().replace('"iteration": 20', '"iteration": 21'))
+    else:
+        state.unlink()
+    (finished / "model.safetensors").unlink()
+    capsys.readouterr()
+    assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        f"warning: {finished / 'checkpoint'}: expected a whole checkpoint" in out and "resumed at iteration 18" in out
+    )
+    assert (finished / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+
+
+def test_only_damaged_checkpoints_are_refused_and_left(finished, scene, capsys):
+    for name in ("checkpoint", "checkpoint.old"):
+        (finished / name / "state.json").write_text("{}")
+    before = snapshot(finished)
+    command = ["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]
+    refused(capsys, command, str(finished / "checkpoint"), "expected a whole checkpoint", "format version 1, got None")
+    assert snapshot(finished) == before
+
+
+@pytest.mark.parametrize("left", ["nothing", "half a config", "the config", "half a checkpoint"])
+def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tmp_path, capsys, left):
+    run = tmp_path / "run"
+    run.mkdir()
+    if left == "half a config":
+        (run / f".config.{2**22 + 1}.tmp.json").write_text("{")
+    elif left != "nothing":
+        shutil.copy(trained / "config.json", run)
+    if left == "half a checkpoint":
+        (run / "checkpoint.tmp").mkdir()
+        (run / "checkpoint.tmp" / "tensors.safetensors").write_bytes(b"\x10")
+    command = ["train", str(scene), "--run", str(run), *FLAGS, "--resume"]
+    assert cli.main(command) == 0
+    assert f"{run}: no checkpoint yet, training starts from the beginning" in capsys.readouterr().out
+    assert {f.name for f in run.iterdir()} == RUN_FILES
+    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
+
+
+def test_resuming_removes_what_killed_processes_left(finished, scene):
+    mine = finished / "renders" / f".a.{os.getppid()}.tmp.png"  # of a process that lives
+    for file in (mine, finished / f".model.{2**22 + 1}.tmp.safetensors", finished / ".notes.tmp"):
+        file.touch()
+    assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
+    assert {f.name for f in finished.iterdir()} == RUN_FILES | {".notes.tmp"} and mine.exists()
+
+
+def test_a_run_whose_overwriting_was_killed_is_a_run_still(finished, scene, monkeypatch):
+    """The old config goes last."""
+
+    class Killed(BaseException):
+        pass
+
+    def kill(*_: Any) -> None:
+        raise Killed
+
+    command = ["train", str(scene), "--run", str(finished), *FLAGS]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", kill)
+        with pytest.raises(Killed):
+            cli.main([*command, "--overwrite"])
+    assert {f.name for f in finished.iterdir()} == {"config.json"}
+    assert cli.main([*command, "--resume"]) == 0
+
+
+@pytest.mark.parametrize("change", ["photo", "points"])
+def test_a_scene_that_changed_is_not_resumed(finished, scene, tmp_path, capsys, change):
+    moved = Path(shutil.copytree(scene, tmp_path / "scene"))
+    if change == "photo":
+        with Image.open(moved / "images" / "view_003.png") as image:
+            pixels = np.array(image)
+        pixels[3, 4, 1] ^= 1
+        Image.fromarray(pixels).save(moved / "images" / "view_003.png")
+    else:
+        file = moved / "sparse" / "0" / "points3D.bin"
+        content = bytearray(file.read_bytes())
+        content[8 + 8 + 5] ^= 1  # of the first point's x
+        file.write_bytes(content)
+    command = ["train", str(moved), "--run", str(finished), "--device", "cpu", "--resume"]
+    refused(capsys, command, str(finished), "expected a checkpoint of this run", "photos, masks or points have changed")
+
+
+def test_a_second_interrupt_does_not_wait(scene, tmp_path):
+    def insist(*_: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("not interrupted")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Densifier, "accumulate", insist)
+        assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]) == 130
+
+
+def test_resume_takes_its_settings_from_the_run(scene, tmp_path):
+    """Also those that a scene is loaded with: a resumed run does not change its photos' size."""
+    run = tmp_path / "run"
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--iterations", "2", "--downscale", "2"]) == 0
+    before = read(run, "metrics.json")
+    assert cli.main(["train", str(scene), "--run", str(run), "--resume", "--device", "cpu"]) == 0
+    assert picture(run / "renders" / "test" / "view_000.png").shape == (18, 24, 3)
+    assert read(run, "metrics.json")["views"] == before["views"]

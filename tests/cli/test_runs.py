@@ -1,0 +1,199 @@
+"""The command line from a scene to a finished run: train, eval, render and info."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nexwarp as nw
+from benchmarks.inputs import write_blender, write_points
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
+from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
+from nexwarp.run.metrics import CONVENTION, psnr
+from nexwarp.train.presets import config_from_dict
+from nexwarp.train.trainer import Trainer
+from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
+from tests.test_scene import make_scene
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+
+# A run
+
+
+def test_a_run_holds_what_it_should(trained, scene):
+    assert {f.name for f in trained.iterdir()} == RUN_FILES
+    assert {f.name for f in (trained / "checkpoint").iterdir()} == {"tensors.safetensors", "state.json"}
+    config = read(trained, "config.json")
+    given = {"path": str(scene.resolve()), "images": "images", "downscale": 1, "masks": "masks"}
+    assert config["scene"] == given | dict.fromkeys(("background", "points", "format"))
+    assert config["device"] == "cpu" and config["config"]["preset"] == "default"
+    settings = config_from_dict(config["config"])
+    assert (settings.iterations, settings.max_surfels, settings.texture) == (20, 100, SMALL.texture)
+    metrics = read(trained, "metrics.json")
+    assert list(metrics["views"]) == ["view_000.png", "view_008.png"] and metrics["convention"] == CONVENTION
+    assert metrics["iterations"] == 20 and metrics["preset"] == "default" and metrics["device"] == "cpu"
+    assert metrics["megabytes"] == (trained / "model.safetensors").stat().st_size / 1e6
+    assert metrics["iterations_per_second"] == pytest.approx(20 / metrics["seconds"])
+    for name, figures in metrics["views"].items():
+        render = picture(trained / "renders" / "test" / name)
+        assert render.shape == (36, 48, 3)
+        assert figures["psnr"] == pytest.approx(psnr(render, picture(scene / "images" / name)))
+        assert picture(trained / "renders" / "compare" / name).shape == (36 + CAPTION_HEIGHT, 3 * 48 + 8, 3)
+    stray = [f.name for f in trained.rglob("*") if "tmp" in f.name or f.name.startswith(".")]
+    assert not stray
+
+
+def test_the_model_is_that_of_the_last_iteration(trained):
+    model = nw.load(trained)
+    metrics = read(trained, "metrics.json")
+    assert len(model.surfels) == metrics["surfels"] <= 100
+    assert model.meta["iteration"] == 20 and model.meta["preset"] == "default" and model.options.sh_degree == 3
+    cameras = load_cameras(trained / "cameras.json")
+    assert list(cameras["test"]) == ["view_000.png", "view_008.png"] and len(cameras["train"]) == 8
+    with torch.no_grad():
+        out = model.render(cameras["test"]["view_000.png"])
+    assert torch.equal(to_uint8(out.image), picture(trained / "renders" / "test" / "view_000.png"))
+
+
+def test_training_says_what_it_does(scene, tmp_path, capsys):
+    run = tmp_path / "run"
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--max-hits", "0", "--seed", "3"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "tiny on the CPU, preset default" in out
+    assert "8 training and 2 test views of 48x36" in out
+    for word in ("iteration 20/20", "it/s", "loss", "train", "dB", "surfels", "s left", "test PSNR", "test SSIM"):
+        assert word in out, word
+    settings = config_from_dict(read(run, "config.json")["config"])
+    assert (settings.max_hits, settings.seed) == (0, 3)
+    assert nw.load(run).options.max_hits == 0
+
+
+def test_default_run_folder_is_named_after_the_scene(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["train", str(scene), *FLAGS, "--iterations", "1", "--downscale", "2"]) == 0
+    assert {f.name for f in Path("runs", "tiny").iterdir()} == RUN_FILES - {"checkpoint.old"}
+    assert picture(Path("runs/tiny/renders/test/view_000.png")).shape == (18, 24, 3)
+
+
+# eval, render, info
+
+
+def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more")
+
+    command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "finish", full)
+        assert cli.main(command) == 2
+    told = "out of memory: needed 2.00 GiB; training is complete and saved: --resume finishes the run"
+    assert capsys.readouterr().err == f"nexwarp: error: {told}\n"
+    assert cli.main([*command, "--resume"]) == 0
+    assert "resumed at iteration 20" in capsys.readouterr().out
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
+def test_eval_reproduces_the_metrics(finished, capsys):
+    before = read(finished, "metrics.json")
+    renders = snapshot(finished / "renders")
+    (finished / "metrics.json").unlink()
+    shutil.rmtree(finished / "renders")
+    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
+    now = read(finished, "metrics.json")
+    assert now == {key: before[key] for key in ("psnr", "ssim", "views", "convention")}
+    assert snapshot(finished / "renders") == renders
+    assert f"{before['psnr']:.2f} dB" in capsys.readouterr().out
+
+
+def test_eval_keeps_the_facts_of_the_training(finished):
+    before = read(finished, "metrics.json")
+    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
+    assert read(finished, "metrics.json") == before
+
+
+def test_eval_finds_a_scene_that_moved(finished, scene, tmp_path, capsys):
+    before = read(finished, "metrics.json")
+    config = read(finished, "config.json")
+    config["scene"]["path"] = str(tmp_path / "gone")
+    (finished / "config.json").write_text(json.dumps(config))
+    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 2
+    assert str(tmp_path / "gone") in capsys.readouterr().err
+    assert read(finished, "metrics.json") == before
+    assert cli.main(["eval", str(finished), "--scene", str(scene), "--device", "cpu"]) == 0
+    assert read(finished, "metrics.json") == before
+
+
+def test_render_needs_no_photos(scene, tmp_path, capsys):
+    moved = Path(shutil.copytree(scene, tmp_path / "scene"))
+    run = tmp_path / "run"
+    assert cli.main(["train", str(moved), "--run", str(run), *FLAGS, "--iterations", "2"]) == 0
+    tests = snapshot(run / "renders" / "test")
+    shutil.rmtree(run / "renders")
+    moved.rename(tmp_path / "elsewhere")
+    capsys.readouterr()
+    assert cli.main(["render", str(run), "--frames", "3", "--device", "cpu"]) == 0
+    assert "5 pictures" in capsys.readouterr().out
+    assert snapshot(run / "renders" / "test") == tests
+    frames = sorted((run / "renders" / "ellipse").iterdir())
+    assert [f.name for f in frames] == ["0000.png", "0001.png", "0002.png"]
+    pictures = [picture(f) for f in frames]
+    assert all(p.shape == (36, 48, 3) for p in pictures) and not torch.equal(pictures[0], pictures[1])
+
+
+def test_render_without_an_ellipse(finished):
+    assert cli.main(["render", str(finished), "--frames", "0", "--device", "cpu"]) == 0
+    assert {f.name for f in (finished / "renders").iterdir()} == {"test", "compare"}
+
+
+def test_info_tells_what_a_run_holds(trained, scene, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert cli.main(["info", str(trained)]) == 0
+    out = capsys.readouterr().out
+    metrics = read(trained, "metrics.json")
+    size = (trained / "model.safetensors").stat().st_size / 1e6
+    for text in (str(scene), f"{metrics['surfels']} (budget 100)", "4 levels of 1,024", f"{size:.1f} MB"):
+        assert text in out, text
+    assert f"{metrics['psnr']:.2f} dB" in out and f"{metrics['ssim']:.4f}" in out
+
+
+def test_info_of_an_unfinished_run(finished, capsys):
+    for name in ("model.safetensors", "metrics.json"):
+        (finished / name).unlink()
+    assert cli.main(["info", str(finished)]) == 0
+    assert "none yet" in capsys.readouterr().out
+
+
+# Scenes in other forms
+
+
+def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
+    """Background, masks and points of the flags reach the run, and eval and --resume find them there again."""
+    path = write_blender(make_scene(tmp_path / "colmap"), tmp_path / "blender")
+    for file in path.rglob("*.png"):
+        with Image.open(file) as photo:
+            photo.putalpha(Image.linear_gradient("L").resize(photo.size))
+            photo.save(file)
+    points = write_points(tmp_path / "mine.ply", np.random.default_rng(0).uniform(-1, 1, (50, 3)), np.zeros((50, 3)))
+    run = tmp_path / "run"
+    flags = ["--run", str(run), "--device", "cpu", "--max-surfels", "32"]
+    flags += ["--background", "0,0.5,1", "--masks", "alpha", "--points", str(points), "--iterations", "3"]
+    assert cli.main(["train", str(path), *flags]) == 0
+    assert "50 points" in capsys.readouterr().out
+    config = read(run, "config.json")
+    given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
+    assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given
+    assert config["config"]["background"] == [0.0, 0.5, 1.0]
+    assert nw.load(run).options.background == (0.0, 0.5, 1.0)
+    before = read(run, "metrics.json")["psnr"]
+    assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
+    assert read(run, "metrics.json")["psnr"] == pytest.approx(before, abs=1e-6)
+    assert cli.main(["train", str(path), "--run", str(run), "--device", "cpu", "--resume"]) == 0
+    assert cli.main(["train", str(path), "--run", str(run), "--resume", "--background", "white"]) == 2
+    assert "--background: expected 0,0.5,1 as in the run to resume, got white" in capsys.readouterr().err

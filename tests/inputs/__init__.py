@@ -1,0 +1,1 @@
+"""Tests of scenes in every form."""

@@ -1,0 +1,168 @@
+"""Expected, median and top depth and normals: the float64 reference, values by hand, and laws."""
+
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from tests.reference.surface import surface
+from tests.scenes import Scene, layered_scene, make_camera, make_surfels, multiply, random_scene, rigid
+from tests.tolerances import FLIPS, assert_close
+
+# On a CPU both forms of the kernels: see `conftest.form`.
+pytestmark = pytest.mark.usefixtures("form")
+
+DEPTHS = ("expected_depth", "median_depth", "top_depth")
+BUFFERS = (*DEPTHS, "normals")
+MAX_HITS = 8
+
+
+def draw(scene: Scene, **options: Any) -> nw.Rendering:
+    return nw.render(make_surfels(scene), None, make_camera(scene), **options)
+
+
+def facing_quads(*quads: tuple[float, float], device: torch.device, turned: bool = False) -> Scene:
+    """Quads (depth, opacity) wider than the image that face the camera; turned ones show their back."""
+    count = len(quads)
+    scene = random_scene(count, width=12, height=9, dtype=torch.float64, device=device)
+    z, opacities = torch.tensor(quads, dtype=torch.float64, device=device).unbind(-1)
+    quat = [0.0, 1.0, 0.0, 0.0] if turned else [1.0, 0.0, 0.0, 0.0]
+    return scene | {
+        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
+        "quats": torch.tensor(quat, dtype=torch.float64, device=device).expand(count, 4).clone(),
+        "scales": torch.full((count, 2), 100.0, dtype=torch.float64, device=device),
+        "opacities": opacities,
+        "gammas": torch.full((count, 2), 50.0, dtype=torch.float64, device=device),
+        "viewmat": torch.eye(4, dtype=torch.float64, device=device),
+    }
+
+
+def assert_everywhere(buffer: torch.Tensor, value: float | list[float], name: str) -> None:
+    """Fail unless each pixel has the value."""
+    expected = torch.tensor(value, dtype=torch.float64, device=buffer.device).expand_as(buffer)
+    assert_close(buffer, expected, kind="value", name=name)
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, low_pass: bool, device: torch.device) -> None:
+    if name == "layered":
+        scene = layered_scene(dtype=dtype, device=device)
+    else:
+        scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
+    if name == "specks":
+        scene["scales"] *= 0.1
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, None, camera, low_pass=low_pass)
+    shape = [x.detach().double().cpu() for x in surfels.activated()]
+    viewmat = camera.viewmat.detach().double().cpu()
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    expected = surface(*shape, viewmat, *intrinsics, low_pass)
+    assert expected.expected_depth.any() and (name != "specks" or not expected.expected_depth.all())
+    flips = 0.0 if dtype == torch.float64 else FLIPS
+    for buffer in BUFFERS:
+        values = getattr(out, buffer), getattr(expected, buffer)
+        assert_close(*values, kind="value", name=buffer, allow_flips=flips)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("depth", [0.5, 7.0])
+def test_an_opaque_quad_has_its_depth_and_its_normal(depth: float, turned: bool, device: torch.device) -> None:
+    """Whichever side the camera sees, the normal points at it."""
+    out = draw(facing_quads((depth, 0.99), device=device, turned=turned))
+    for name in DEPTHS:
+        assert_everywhere(getattr(out, name), depth, name)
+    assert_everywhere(out.normals, [0.0, 0.0, -1.0], "normals")
+
+
+def test_depths_of_layers_by_hand(device: torch.device) -> None:
+    """Weights 0.3, 0.7 * 0.6 = 0.42 and 0.28 * 0.5 = 0.14; transmittances 0.7, 0.28 and 0.14."""
+    out = draw(facing_quads((4.0, 0.5), (2.0, 0.3), (3.0, 0.6), device=device))
+    assert_everywhere(out.expected_depth, (0.3 * 2 + 0.42 * 3 + 0.14 * 4) / 0.86, "expected depth")
+    assert_everywhere(out.median_depth, 3.0, "median depth")
+    assert_everywhere(out.top_depth, 3.0, "top depth")
+
+
+def test_the_median_of_what_is_mostly_transparent_is_the_last_hit(device: torch.device) -> None:
+    out = draw(facing_quads((2.0, 0.3), (5.0, 0.2), device=device))
+    assert_everywhere(out.median_depth, 5.0, "median depth")
+    assert_everywhere(out.top_depth, 2.0, "top depth")
+
+
+def test_a_rigid_motion_turns_normals_and_keeps_depths(device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device)
+    quat = (0.3, -0.7, 0.4, 0.5)
+    motion = rigid(quat, (3.0, -1.0, 2.0)).to(device)
+    turn = torch.tensor([quat], dtype=torch.float64, device=device)
+    moved = scene | {
+        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
+        "quats": multiply(turn, scene["quats"]),
+        "viewmat": scene["viewmat"] @ motion.inverse(),
+    }
+    out, expected = draw(moved), draw(scene)
+    for name in DEPTHS:
+        assert_close(getattr(out, name), getattr(expected, name), kind="value", name=name)
+    assert_close(out.normals, expected.normals @ motion[:3, :3].T, kind="value", name="normals")
+
+
+def test_with_room_for_all_hits_the_buffer_has_the_expected_and_the_top_depth(device: torch.device) -> None:
+    scene = random_scene(MAX_HITS, dtype=torch.float64, device=device)
+    out = draw(scene, max_hits=MAX_HITS)
+    total = out.weights.sum(-1)
+    mean = (out.weights * out.depths).sum(-1) / torch.where(total > 0, total, 1.0)
+    assert total.any() and not total.all()
+    assert_close(out.expected_depth, mean.detach(), kind="value", name="expected depth")
+    assert_close(out.top_depth, out.depths[..., 0].detach(), kind="value", name="top depth")
+
+
+@pytest.mark.parametrize("max_hits", [0, 1, MAX_HITS])
+def test_surface_does_not_depend_on_max_hits(max_hits: int, device: torch.device) -> None:
+    scene = layered_scene(device=device)
+    out, expected = draw(scene, max_hits=max_hits), draw(scene, max_hits=2)
+    for name in BUFFERS:
+        assert torch.equal(getattr(out, name), getattr(expected, name)), name
+
+
+def test_normals_are_unit_face_the_camera_and_are_0_where_nothing_is_hit(device: torch.device) -> None:
+    scene = random_scene(1, device=device)
+    out = draw(scene)
+    lengths = out.normals.norm(dim=-1)
+    hit = out.alpha > 0
+    assert hit.any() and not hit.all()
+    assert_close(lengths, hit.to(lengths), kind="value", name="length")
+    for name in BUFFERS:
+        assert not getattr(out, name)[~hit].any(), name
+    camera = make_camera(scene)
+    _, rays = ops.unproject(out.depths.detach(), camera.viewmat.detach(), out.intermediates.pinhole)
+    assert ((out.normals * rays.view_as(out.normals)).sum(-1) <= 0).all()
+
+
+def test_an_empty_scene_has_no_surface(device: torch.device) -> None:
+    out = draw(random_scene(0, device=device))
+    for name in BUFFERS:
+        assert getattr(out, name).shape[:2] == (18, 23) and not getattr(out, name).any(), name
+
+
+def test_surface_is_not_differentiable(device: torch.device) -> None:
+    out = draw(random_scene(device=device))
+    assert out.image.requires_grad
+    assert not any(getattr(out, name).requires_grad for name in BUFFERS)
+
+
+def test_surface_of_short_lists(device: torch.device) -> None:
+    """Where lists lack entries the walk goes over all surfels, and finds the same."""
+    scene = random_scene(60, width=70, height=40, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+    shape = [x.detach() for x in surfels.activated()]
+    projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat.detach())
+    found = []
+    for room in (None, 3):
+        tiles = ops.intersect_tiles(*shape, projection, camera.viewmat.detach(), pinhole, room=room)
+        hits = ops.collect(projection, tiles, pinhole)
+        found.append(ops.surface(projection, tiles, hits, pinhole, camera.viewmat.detach()))
+    for name in BUFFERS:
+        assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name

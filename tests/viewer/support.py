@@ -1,0 +1,105 @@
+"""A viewer that serves, a client that speaks its protocol as a browser does, and cameras to look from."""
+
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import nexwarp as nw
+from nexwarp.viewer import Viewer
+from tests.scenes import intrinsics, rigid
+
+OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
+
+
+def ring(count: int = 6) -> dict[str, dict[str, nw.Camera]]:
+    """Cameras around the random scene, turned and off the origin."""
+    cameras = {}
+    for i in range(count):
+        viewmat = rigid((0.9, 0.2, -0.3 + 0.1 * i, 0.1), (0.3 - 0.2 * i, -0.2, 0.5)).float()
+        cameras[f"{i}.png"] = nw.Camera(viewmat, intrinsics(50.0, 50.0, 32.0, 24.0).float(), 64, 48)
+    return {"train": cameras}
+
+
+class Client:
+    """What a browser says and hears, without the browser."""
+
+    def __init__(self, viewer: Viewer, **arguments: Any) -> None:
+        import viser
+        from websockets.sync.client import connect
+
+        protocol = f"viser-v{viser.__version__}"
+        url = viewer.url.replace("http", "ws")
+        self.socket = connect(
+            url, subprotocols=[protocol], compression=None, max_size=None, max_queue=None, **arguments
+        )
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+    def send(self, kind: str, **values: Any) -> None:
+        import msgspec
+
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **values}))
+
+    def look(self, **changes: Any) -> None:
+        values = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -4), "fov": 0.8, "image_width": 96, "image_height": 72}
+        values |= {"near": 0.01, "far": 1000.0, "look_at": (0, 0, 0), "up_direction": (0, -1, 0)}
+        self.send("ViewerCameraMessage", **(values | changes))
+
+    def hear(self, seconds: float = 20.0) -> Iterator[dict[str, Any]]:
+        """Messages as they come; TimeoutError after some time."""
+        import msgspec
+        import zstandard
+
+        end = time.monotonic() + seconds
+        while True:
+            raw = self.socket.recv(timeout=max(end - time.monotonic(), 0.01))
+            length = int.from_bytes(raw[8:16], "little")
+            data = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + length]))
+            yield from data["messages"]
+
+    def picture(self) -> np.ndarray:
+        """The next picture."""
+        for message in self.hear():
+            if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
+                return np.asarray(Image.open(io.BytesIO(message["rgb_data"])))
+        raise AssertionError
+
+    def control(self, label: str) -> str:
+        """Identifier of a control; panels are sent first."""
+        for message in self.hear():
+            if message.get("props", {}).get("label") == label:
+                return message["uuid"]
+        raise AssertionError
+
+
+@contextmanager
+def serving(model: nw.Model, **arguments: Any) -> Iterator[Viewer]:
+    """A viewer that draws on a thread of its own."""
+    pytest.importorskip("viser")
+    over = threading.Event()
+    with Viewer(lambda: model, ring(), near=0.01, port=0, **arguments) as viewer:
+        thread = threading.Thread(target=viewer.show, args=(over.is_set,))
+        thread.start()
+        try:
+            yield viewer
+        finally:
+            over.set()
+            thread.join()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)

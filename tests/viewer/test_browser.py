@@ -1,0 +1,101 @@
+"""The viewer in a browser."""
+
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.viewer.session import Session
+from nexwarp.viewer.world import camera_to_world
+from tests.viewer.support import serving, wait_for
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def record_and_save(page: Any, session: Session, folder: Path) -> None:
+    """Add two views to a path, save it and a screenshot; what the browser gets is what the run keeps."""
+    assert session.viewpoint is not None
+    page.get_by_role("tab", name="Record").click()
+    page.get_by_role("button", name="Add this view").click()
+    wait_for(lambda: len(session.keyframes) == 1)
+    session.jump("train/4.png")
+    wait_for(lambda: np.allclose(session.viewpoint.pose, camera_to_world(session.cameras["train/4.png"]), atol=1e-3))
+    page.get_by_role("button", name="Add this view").click()
+    wait_for(lambda: len(session.keyframes) == 2)
+    with page.expect_download() as path:
+        page.get_by_role("button", name="Save path").click()
+    saved = json.loads(Path(path.value.path()).read_text())
+    assert len(saved["camera_path"]) == 180 and (saved["render_width"], saved["render_height"]) == (64, 48)
+    assert json.loads((folder / "camera_path_1.json").read_text()) == saved
+    with page.expect_download() as shot:
+        page.get_by_role("button", name="Save screenshot").click()
+    with Image.open(shot.value.path()) as png:
+        assert png.format == "PNG" and png.height == 1080
+        assert png.width == pytest.approx(1080 * session.viewpoint.width / session.viewpoint.height, abs=1)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+@pytest.mark.timeout(180)
+def test_in_a_browser(model, tmp_path):
+    api = pytest.importorskip("playwright.sync_api")
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    errors: list[str] = []
+    with (
+        serving(model, save_path=lambda content: keep_camera_path(tmp_path, content)) as viewer,
+        api.sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        page = browser.new_page(viewport={"width": 900, "height": 700})
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(viewer.url)
+        page.get_by_text("nexwarp · nexwarp").wait_for()
+        wait_for(lambda: len(viewer.sessions) == 1)
+        (session,) = viewer.sessions.values()
+
+        def settled() -> np.ndarray:
+            """The picture as the browser shows it, left of the panel, once it is at its finest."""
+            wait_for(lambda: session.drawn_version == session.version and session.drawn_scale == 1.0)
+            page.wait_for_timeout(500)
+            shot = page.screenshot(clip={"x": 20, "y": 250, "width": 450, "height": 430})
+            return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+        def differ(a: np.ndarray, b: np.ndarray) -> float:
+            return float(np.abs(a - b).mean())
+
+        image = settled()
+        assert image.std() > 10, "a frame has arrived"
+        page.get_by_role("combobox").first.click()
+        page.get_by_role("option", name="ids", exact=True).click()
+        wait_for(lambda: session.settings.mode == "ids")
+        assert differ(settled(), image) > 10, "the mode changes the picture"
+        page.get_by_role("combobox").first.click()
+        page.get_by_role("option", name="image", exact=True).click()
+        wait_for(lambda: session.settings.mode == "image")
+        again = settled()
+        assert differ(again, image) < 2, "and back"
+        slider = page.get_by_role("slider", name="K").or_(page.get_by_role("slider").nth(0))
+        slider.first.focus()
+        page.keyboard.press("Home")
+        wait_for(lambda: session.settings.max_hits == 0)
+        assert differ(settled(), again) > 1, "the slider changes the picture"
+
+        page.mouse.move(200, 450)
+        page.mouse.down()
+        page.mouse.move(320, 430, steps=5)
+        page.mouse.up()
+        settled()
+        assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
+        record_and_save(page, session, tmp_path)
+        browser.close()
+        wait_for(lambda: not viewer.sessions)
+    assert not errors, errors

@@ -1,0 +1,157 @@
+"""The viewer's pace, its cameras and its camera paths."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.viewer.camera_path import OPENGL, Keyframe, interpolate, path_json
+from nexwarp.viewer.pacing import SMALLEST, Pace, Share
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
+from tests.viewer.support import ring
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+
+
+# Pace
+
+
+def test_the_share_of_time_is_kept_whatever_pictures_cost():
+    generator = np.random.default_rng(0)
+    for share in (0.05, 0.2, 0.5):
+        budget, now, spent = Share(share), 0.0, 0.0
+        while now < 500.0:
+            if budget.due(now):
+                cost = generator.uniform(0.01, 0.5)
+                now, spent = now + cost, spent + cost
+                budget.spend(now, cost)
+            now += 0.03
+        assert 0.5 * share < spent / now <= share + 0.01
+    with pytest.raises(ValueError, match="share"):
+        Share(0.2).set(math.nan)
+
+
+def test_pictures_are_sized_to_come_in_time():
+    pace = Pace()
+    assert pace.scale("a", 1280, 800, 0.1) == 0.25
+    pace.observe("a", 1000, 2.0)  # compiles
+    pace.observe("a", 1000, 0.001)
+    for limit in (0.03, 0.1, 0.5, 2.0):
+        scale = pace.scale("a", 1280, 800, limit)
+        assert pace.seconds("a", 1280 * 800 * scale**2) <= limit
+        assert scale == 1.0 or pace.seconds("a", 1280 * 800 * scale**2 * 2) > limit
+    assert min(1280, 800) * pace.scale("a", 1280, 800, 1e-9) == pytest.approx(SMALLEST)
+    assert pace.bands("a", 1e6) == 5 and pace.bands("b", 1e6) == 1
+
+
+# Cameras and paths
+
+
+def test_the_browsers_frame_there_and_back():
+    cameras = list(ring()["train"].values())
+    world = World.around(cameras, torch.zeros(0, 3))
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(world.to_scene(world.to_browser(points)), points, atol=1e-12)
+    centres = world.to_browser(np.stack([camera_to_world(c)[:3, 3] for c in cameras]))
+    assert np.linalg.norm(centres, axis=1).max() == pytest.approx(3.0)
+    assert all(camera_to_world(c)[:3, 1] @ world.up < 0 for c in cameras), "image down is not up"
+    lone = World.around(cameras[:1], torch.randn(50, 3))
+    assert np.isfinite(lone.focus).all() and lone.unit > 0
+    assert World.around([], torch.zeros(0, 3)).unit == 1.0
+
+
+def test_a_browsers_camera_is_the_scenes():
+    camera = ring()["train"]["3.png"]
+    world = World.around(list(ring()["train"].values()), torch.zeros(0, 3))
+    pose = camera_to_world(camera)
+    w = np.sqrt(1 + np.trace(pose[:3, :3])) / 2
+    v = np.array([pose[2, 1] - pose[1, 2], pose[0, 2] - pose[2, 0], pose[1, 0] - pose[0, 1]]) / (4 * w)
+    here = Viewpoint.of((w, *v), world.to_browser(pose[:3, 3]), vertical_fov(camera), 64, 48, world)
+    (back,) = here.bands(1.0, camera.near, torch.zeros(1))
+    torch.testing.assert_close(back.viewmat, camera.viewmat, atol=1e-5, rtol=0)
+    torch.testing.assert_close(back.K, camera.K, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"wxyz": (0, 0, 0, 0)},
+        {"wxyz": (1, 0, 0)},
+        {"position": (math.nan, 0, 0)},
+        {"position": (1e30, 0, 0)},
+        {"fov": 0.0},
+        {"fov": math.pi},
+        {"fov": math.inf},
+        {"width": 0},
+        {"height": 10**9},
+    ],
+)
+def test_what_is_no_camera_is_refused(wrong):
+    good = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0, "width": 64, "height": 48}
+    world = World.around([], torch.zeros(0, 3))
+    Viewpoint.of(**good, world=world)
+    with pytest.raises(ValueError, match="camera"):
+        Viewpoint.of(**(good | wrong), world=world)
+
+
+def keyframes(count: int = 4) -> list[Keyframe]:
+    cameras = ring(count)["train"].values()
+    return [Keyframe(camera_to_world(camera), 0.6 + 0.1 * i) for i, camera in enumerate(cameras)]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_path_meets_its_keyframes_smoothly(closed):
+    keys = keyframes()
+    count = 40 * len(keys) if closed else 40 * (len(keys) - 1) + 1
+    path = interpolate(keys, count, closed)
+    assert len(path) == count
+    for key, frame in zip(keys, path[::40], strict=True):
+        np.testing.assert_allclose(frame.pose, key.pose, atol=1e-6)
+        assert frame.fov == pytest.approx(key.fov)
+    poses = np.stack([frame.pose for frame in path])
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1),
+        np.broadcast_to(np.eye(3), (count, 3, 3)),
+        atol=1e-9,
+        rtol=0,
+    )
+    loop = np.concatenate([poses, poses[:3]]) if closed else poses
+    steps, turns = np.diff(loop, axis=0), np.diff(loop, n=2, axis=0)
+    # No jump in speed anywhere, the seam included: second differences are a frame's share of first ones.
+    assert np.abs(turns).max() < 0.25 * np.abs(steps).max()
+
+
+def test_path_files_hold_what_nerfstudio_reads():
+    keys = keyframes(3)
+    data = json.loads(path_json(keys, 640, 480, 24, 2.0))
+    assert {k: data[k] for k in data if k != "camera_path"} == {
+        "render_width": 640,
+        "render_height": 480,
+        "fps": 24,
+        "seconds": 2.0,
+    }
+    assert len(data["camera_path"]) == 48
+    for key, frame in ((keys[0], data["camera_path"][0]), (keys[-1], data["camera_path"][-1])):
+        pose = np.array(frame["camera_to_world"]).reshape(4, 4)
+        np.testing.assert_allclose(pose @ OPENGL, key.pose, atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 1], -key.pose[:3, 1], atol=1e-6)  # up is up
+        assert frame["fov"] == pytest.approx(math.degrees(key.fov)) and frame["aspect"] == pytest.approx(4 / 3)
+
+
+def test_paths_that_cannot_be(tmp_path):
+    for arguments, word in (
+        ((keyframes(1), 64, 48, 30, 1.0), "two"),
+        ((keyframes(2), 0, 48, 30, 1.0), "width"),
+        ((keyframes(2), 64, 48, 30, math.nan), "seconds"),
+        ((keyframes(2), 64, 48, 120, 1e6), "20,000"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            path_json(*arguments)
+    same = [keyframes(1)[0]] * 3
+    assert np.ptp([frame.pose for frame in interpolate(same, 9)], axis=0).max() < 1e-9
+    assert keep_camera_path(tmp_path, b"1").endswith("camera_path_1.json")
+    assert keep_camera_path(tmp_path, b"2").endswith("camera_path_2.json")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera_path_1.json", "camera_path_2.json"]

@@ -1,0 +1,140 @@
+"""The server: who may look, what clients get, and what nonsense they may send."""
+
+import math
+import shutil
+import socket
+from typing import Any
+
+import pytest
+
+from nexwarp.cli import main as cli
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.viewer.modes import draw
+from nexwarp.viewer.server import may_connect
+from tests.viewer.support import Client, serving, wait_for
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+
+
+def test_only_the_servers_own_pages_may_connect():
+    own = "127.0.0.1:8080"
+    assert may_connect("127.0.0.1", f"http://{own}", own) and may_connect("127.0.0.1", None, own)
+    assert may_connect("127.0.0.1", "http://localhost:9000", "localhost:9000"), "through a tunnel"
+    for origin, asked in (
+        ("http://evil.example", own),
+        ("http://evil.example:8080", "evil.example:8080"),  # a name that leads here
+        ("http://localhost:3000", own),
+        ("null", own),
+    ):
+        assert not may_connect("127.0.0.1", origin, asked)
+    assert may_connect("0.0.0.0", "http://lab.example", "10.0.0.7:8080")
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
+    """The command fails with one line that holds the words."""
+    assert cli.main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and all(word in lines[0] for word in words), lines
+
+
+def test_one_line_for_what_cannot_be_shown(run, tmp_path, capsys, monkeypatch):
+    capsys.readouterr()
+    refused(capsys, ["view", str(tmp_path / "none")], str(tmp_path / "none"), "expected a run folder")
+    shutil.copytree(run, tmp_path / "early")
+    (tmp_path / "early" / "model.safetensors").unlink()
+    refused(capsys, ["view", str(tmp_path / "early")], "model.safetensors")
+    pytest.importorskip("viser")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        refused(capsys, ["view", str(run), "--port", port], "--port", port, "in use", "another")
+        new = ["train", str(run.parent / "tiny"), "--run", str(tmp_path / "new"), "--view", "--port", port]
+        refused(capsys, new, "--port", "in use")
+    assert not (tmp_path / "new").exists()
+    refused(capsys, ["view", str(run), "--port", "70000"], "--port", "65535", "70000")
+    refused(capsys, ["view", str(run), "--host", "203.0.113.1"], "--host", "203.0.113.1")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    refused(capsys, ["view", str(run)], "viser", "pip install 'nexwarp[viewer]'")
+
+
+def test_clients_look_for_themselves_and_come_and_go(model, tmp_path):
+    with serving(model, save_path=lambda content: keep_camera_path(tmp_path, content)) as viewer:
+        with Client(viewer) as one, Client(viewer) as two:
+            one.look()
+            two.look()
+            mode = two.control("Show")
+            wait_for(lambda: len(viewer.sessions) == 2)
+            sessions = list(viewer.sessions.values())
+            two.send("GuiUpdateMessage", uuid=mode, updates={"value": "alpha"})
+            wait_for(lambda: {s.settings.mode for s in sessions} == {"image", "alpha"})
+            wait_for(lambda: all(s.drawn_scale == 1.0 and s.drawn_version == s.version for s in sessions))
+            assert {s.viewpoint.width for s in sessions} == {96}
+            wait_for(lambda: len(viewer.thumbnails) == 6)
+        wait_for(lambda: not viewer.sessions)
+        with Client(viewer) as late:  # finds everything as the first did
+            late.look(position=(0, 0, -3))
+            assert late.picture().ndim == 3
+
+
+def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
+    with serving(model) as viewer, Client(viewer) as good, Client(viewer) as bad:
+        good.look()
+        bad.look()
+        wait_for(lambda: len(viewer.sessions) == 2)
+        session = viewer.sessions[max(viewer.sessions)]
+        slider = session.panel.max_hits
+        uuid = slider._impl.uuid
+        wait_for(lambda: session.drawn_version == session.version)
+        version = session.version
+        for value in ("many", None, [1, 2], math.nan, {"a": 1}):
+            bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+        bad.send("GuiUpdateMessage", uuid=uuid, updates={"removed": True})
+        bad.send("GuiUpdateMessage", uuid=uuid, updates={"update_cb": None})
+        bad.send("GuiUpdateMessage", uuid="of an older page", updates={"value": 3})
+        bad.send("ShareUrlRequest")
+        click = {"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1), "screen_pos": (0, 0), "modifier": None}
+        bad.send("SceneNodeClickMessage", name="/cameras/none", instance_index=None, **click)
+        for wrong in ({"fov": math.nan}, {"wxyz": (0, 0, 0, 0)}, {"image_height": 0}, {"image_width": 10**9}):
+            bad.look(**wrong)
+        bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": 99})
+        wait_for(lambda: session.settings.max_hits == 8)
+        assert slider.value == 8 and not slider._impl.removed and session.version == version + 1
+        assert session.viewpoint.width == 96 and math.isfinite(session.viewpoint.fov)
+        bad.socket.send(b"\xc1 no message at all")
+        wait_for(lambda: len(viewer.sessions) == 1)  # it is shown out
+        good.look(position=(0.5, 0, -3))
+        assert good.picture().ndim == 3
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err, out + err
+
+
+def test_pages_of_other_servers_are_refused(model):
+    from websockets.exceptions import ConnectionClosed
+
+    with serving(model) as viewer, Client(viewer, origin="http://evil.example") as foreign:
+        with pytest.raises(ConnectionClosed):
+            foreign.look()
+            foreign.picture()
+        assert not viewer.sessions
+        with Client(viewer, origin=viewer.url) as own:
+            own.look()
+            assert own.picture().ndim == 3
+
+
+def test_a_picture_that_fails_is_told_and_the_rest_goes_on(model, monkeypatch):
+    from nexwarp.viewer import viewer as module
+
+    def fail(*arguments: Any, **options: Any) -> Any:
+        if arguments[2].mode == "normal":
+            raise RuntimeError("out of memory")
+        return draw(*arguments, **options)
+
+    monkeypatch.setattr(module, "draw", fail)
+    with serving(model) as viewer, Client(viewer) as client:
+        client.look()
+        wait_for(lambda: len(viewer.sessions) == 1)
+        (session,) = viewer.sessions.values()
+        session.change(mode="normal")
+        note = next(m for m in client.hear() if m["type"] == "NotificationShowMessage")
+        assert "out of memory" in str(note)
+        session.change(mode="image")
+        wait_for(lambda: session.drawn_version == session.version and session.drawn_scale == 1.0)
