@@ -12,6 +12,23 @@ Symbols, the same in every file of this package:
     K                        length of the hit buffer (max_hits); id -1, weight 0, depth 0 mark an empty slot
     n                        number of texture points, H * W * K
 
+Words, each with one meaning:
+
+    thread              one execution of a kernel's body: a GPU thread, or one turn of a CPU's loop
+    warp, lane          32 GPU threads that run together, and a thread's index among them (native/warp.py); on a CPU a
+                        warp is one thread
+    SIMD vector, width  several neighbouring pixels or points in one value of a CPU thread, and their number
+                        (native/simd); its elements are called elements, not lanes
+    SIMD form           a stage written with SIMD vectors, for CPUs (cpu/); the scalar form is the body that runs on
+                        CUDA. `launch.cpu_form` chooses between them on a CPU, and tests run both
+    entry               one (tile, surfel) pair of the tile lists; `k` is the place of an entry in the walk
+    gradient slot       where one entry's gradient is added up, before `reduce` adds up each surfel's
+    tile polygon        a surfel's support as projected to the image, which decides its tiles
+    fixed point         sums as integers, which do not depend on the order of their terms (native/fixed_point.py)
+
+Each file's header is its contract: what a thread is, what is read and written, what is differentiated and what is
+frozen, and where the paper defines it.
+
 Kernels are made by cached factories over the scalar type, so that the float64 build of the proofs is the same source.
 A kernel's first argument is `first`, the offset of its thread range: a CPU launch is one serial loop, so `launch.py`
 splits the range over Python threads. Whatever is written is therefore owned by one thread: no kernel relies on CPU

@@ -1,9 +1,13 @@
-"""Widening: what surfels look like from farther away than training saw them. One thread a surfel, forward and backward.
+"""Antialiasing: surfels blurred for cameras that are farther away than any training view was (not in the paper).
+
+A thread is a surfel, forward and backward. Read: the surfels' depths, scales, opacities and gammas, and the largest
+depth / focal of the training views. Written: blurred scales, opacities and gammas; backward, all gradients but those of
+the focal length and of the training views' depths.
 
 A photo's pixel averages over its area, a ray does not: surfels smaller than a pixel alias. Training learns them as its
-own pixels show them; for what is larger than those, each surfel is blurred by the pixel's variance less theirs, and its
-opacity falls as its area grows (the 2D filter of Mip-Splatting, in the surfel's plane). Gammas fall to 1, a Gaussian's.
-The backward kernel writes what `wp.grad` gives for the product of outputs and their gradients; nothing is added up.
+own pixels show them. For larger pixels, each surfel is blurred by the pixel's variance less that of the training views'
+pixels, and its opacity falls as its area grows (the 2D filter of Mip-Splatting, in the surfel's plane). Gammas fall to
+1, a Gaussian's. The backward kernel writes what `wp.grad` gives for the product of outputs and their gradients.
 """
 
 import functools

@@ -22,7 +22,7 @@ from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, walk, walk_functions
+from nexwarp.kernels.walk import buffer_types, overflowed, walk, walk_functions
 
 
 @functools.cache
@@ -70,7 +70,6 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
         # Threads outside the image cull along: all lanes of a warp must reach the votes together.
         done = int(0)
         if not inside:
@@ -83,15 +82,17 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         buffer_colors = colors()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
-        stop = int(start)
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // pixels, tile_offsets, ends, overflow)
+        stop = int(bounds[0])
         width = warp_size()
         lane = lane_index()
-        for batch in range(start, end, width):
+        for batch in range(bounds[0], bounds[1], width):
             if any_in_warp(1 - done) == 0:
                 break
             mine = w.candidate(
                 batch + lane,
-                end,
+                bounds[1],
                 surfel_ids,
                 order,
                 overflow,

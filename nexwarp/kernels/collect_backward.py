@@ -41,7 +41,7 @@ from nexwarp.kernels.native.warp import (
 )
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, walk, walk_functions
+from nexwarp.kernels.walk import buffer_types, overflowed, walk, walk_functions
 
 
 @functools.cache
@@ -117,7 +117,6 @@ def collect_backward_kernel(
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
         # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
@@ -139,10 +138,12 @@ def collect_backward_kernel(
         if wp.static(with_errors):
             error = errors[p]
         transmittance = real(1.0)
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // pixels, tile_offsets, ends, overflow)
         width = warp_size()
         lane = lane_index()
-        last = wp.min(warp_max(stop), end)
-        for batch in range(start, last, width):
+        last = wp.min(warp_max(stop), bounds[1])
+        for batch in range(bounds[0], last, width):
             mine = w.candidate(
                 batch + lane,
                 last,

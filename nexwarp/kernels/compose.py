@@ -1,6 +1,8 @@
 """Composition (paper Eq. 7): image = plain + textured + (1 - alpha) background, textured = base + sum_k weight_k T_k.
 
-Without `base`, a null array, it is 0. One thread a pixel; Warp's own adjoint.
+A thread is a pixel. Read: the buffers of `collect`, the textured colours T (P, K) and the background; without `base`, a
+null array, it is 0. Written: image and textured. Differentiated with respect to all that is read by Warp's own
+adjoint.
 """
 
 import functools

@@ -1,6 +1,8 @@
-"""Projection: activated surfels to their records in the camera frame (see `surfel.py`). One thread a surfel.
+"""Projection: activated surfels to their records in the camera frame, see `surfel` (paper Sec. 4.2).
 
-Smooth and loop-free: differentiable with respect to every float input by Warp's own adjoint.
+A thread is a surfel. Read: means, rotations, scales, opacities, gammas, plain colours and the world-to-camera matrix.
+Written: records, centres and limits. Smooth and loop-free, so that Warp's own adjoint differentiates records and
+centres with respect to every float input; limits only cull and are frozen.
 """
 
 import functools

@@ -1,7 +1,8 @@
-"""Spherical harmonics colours of degree 0 to 3: plain (a thread a surfel) and textured (a thread a point).
+"""Spherical harmonics colours of degree 0 to 3: plain and textured appearance (paper Sec. 4.1).
 
-Colours are linear in the coefficients, and `wp.grad` differentiates the basis. The backward kernels write gradients,
-they do not add to them. Constants and signs are the field's.
+A thread is a surfel (plain) or a point (textured). Read: coefficients and directions. Written: colours; backward, the
+gradients of coefficients and directions, which `wp.grad` of the basis gives. Nothing is added up. A colour that was
+clamped to 0 has no gradient. Constants and signs are the field's.
 """
 
 import functools

@@ -17,7 +17,7 @@ from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_sum
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import surfel_at, walk, walk_functions
+from nexwarp.kernels.walk import overflowed, surfel_at, walk, walk_functions
 
 
 @functools.cache
@@ -62,7 +62,6 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed_point: 
         thread = first + wp.tid()
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         focal = vec2(intrinsics[0], intrinsics[1])
-        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
         # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
         p = wp.min(xy[1], size[1] - 1) * size[0] + wp.min(xy[0], size[0] - 1)
         stop = stops[p]
@@ -71,7 +70,9 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed_point: 
         error = errors[p]
         transmittance = real(1.0)
         lane = lane_index()
-        for k in range(start, end):
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // pixels, tile_offsets, ends, overflow)
+        for k in range(bounds[0], bounds[1]):
             live = int(0)
             if k < stop:
                 live = 1

@@ -19,7 +19,7 @@ from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import walk, walk_functions
+from nexwarp.kernels.walk import overflowed, walk, walk_functions
 
 
 @functools.cache
@@ -64,7 +64,6 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        start, end, overflow = walk(thread // pixels, tile_offsets, ends, surfel_ids)
         stop = int(0)
         if inside:
             stop = stops[xy[1] * size[0] + xy[0]]
@@ -75,10 +74,12 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         heaviest = real(0.0)
         top_depth = real(0.0)
         normal = vec3()
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // pixels, tile_offsets, ends, overflow)
         width = warp_size()
         lane = lane_index()
-        last = wp.min(warp_max(stop), end)
-        for batch in range(start, last, width):
+        last = wp.min(warp_max(stop), bounds[1])
+        for batch in range(bounds[0], last, width):
             mine = w.candidate(
                 batch + lane,
                 last,

@@ -1,4 +1,7 @@
-"""Tile lists: which surfels may be seen in which tile, near to far. Integers only, nothing here is differentiable.
+"""Tile lists (paper Sec. 3, after 3DGS): which surfels may be seen in which tile, near to far.
+
+A thread is a surfel, one of several that share a surfel, a tile or an entry, as each kernel says. Written are integers
+and what only culls: nothing here is differentiated.
 
 A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
 projected: a convex polygon of at most five corners, the tile polygon. A tile row's slab cuts out one span of it, so the

@@ -1,6 +1,8 @@
-"""Hit points and ray directions in the world frame. One thread a pixel; Warp's own adjoint.
+"""Hit points and ray directions in the world frame, for the texturing pass (paper Sec. 4.2).
 
-The point of a hit at z-depth t is origin + t * R^T d; the direction is R^T d, unit, for the textured colour's SH.
+A thread is a pixel. Read: depths (P, K) and the world-to-camera matrix. Written: for a hit at z-depth t the point
+origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's SH. Differentiated with respect
+to depths and the matrix by Warp's own adjoint.
 """
 
 import functools

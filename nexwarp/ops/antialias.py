@@ -1,4 +1,4 @@
-"""Surfels as they look from farther away than training saw them."""
+"""Antialiasing: surfels as a camera sees them that is farther away than any training view was."""
 
 from collections.abc import Iterable
 
@@ -19,14 +19,16 @@ def antialias(
     farthest: torch.Tensor,
     focal: float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Blur surfels by what a pixel covers more than in training; differentiable, but for `farthest` and `focal`.
+    """Blur surfels where a pixel covers more of them than it did in training.
+
+    Differentiable with respect to all arguments but `farthest` and `focal`.
 
     Args:
         depths: (N,) z-depths of the centres, world units.
         scales: (N, 2) world units.
         opacities: (N,).
         gammas: (N, 2).
-        farthest: (N,) depth / focal of the farthest look that training had, world units.
+        farthest: (N,) largest depth / focal at which a training view saw the surfel, world units.
         focal: of the camera, pixels.
 
     Returns:
@@ -45,7 +47,7 @@ def antialias(
         }
     )
     tensors = (x.contiguous() for x in (depths, scales, opacities, gammas))
-    return _Widen.apply(farthest.contiguous(), float(focal), *tensors)
+    return _Antialias.apply(farthest.contiguous(), float(focal), *tensors)
 
 
 def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
@@ -57,7 +59,7 @@ class _Context(Context):
     focal: float
 
 
-class _Widen(torch.autograd.Function):
+class _Antialias(torch.autograd.Function):
     @staticmethod
     def forward(ctx: _Context, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
         real = real_of(farthest)

@@ -32,11 +32,11 @@ from nexwarp.ops.tiles import Tiles
 
 @dataclass
 class SplatErrorRequest:
-    """Asks the backward pass to add up blended errors on its way; see `Rendering.request_splat_error`.
+    """Request that the backward pass also adds up blended errors; see `Rendering.request_splat_error`.
 
     Attributes:
-        errors: (H, W) error of each pixel, set between forward and backward; None asks for nothing.
-        sums_after_backward: (N,) what `splat_error` would give; the backward pass fills it.
+        errors: (H, W) error of each pixel, set between forward and backward; None requests nothing.
+        sums_after_backward: (N,) what `splat_error` would return; the backward pass sets it.
     """
 
     errors: torch.Tensor | None = None
@@ -45,7 +45,7 @@ class SplatErrorRequest:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the collection pass found.
+    """Outputs of the collection pass.
 
     Attributes:
         plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6); differentiable.
@@ -55,7 +55,7 @@ class Hits:
         weights: (H, W, K), 0 in empty slots; differentiable.
         alpha: (H, W) 1 - final transmittance; differentiable.
         stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
-        error_request: asks the backward pass for blended errors.
+        error_request: request for blended errors, empty at first.
     """
 
     plain: torch.Tensor

@@ -28,12 +28,12 @@ SHARING = 8
 
 @dataclass(frozen=True)
 class ListCapacity:
-    """How much room lists have, and what to ask for how much they need.
+    """Capacity of tile lists, and what tells whether it suffices; see `fits`.
 
     Attributes:
-        entries: M, that there is room for.
+        entries: M, the number of entries that the lists can hold.
         ends: (N,) int32, as in `Tiles`.
-        kind: what renderings that need about as much have in common.
+        kind: (tile columns, tile rows, low-pass): renderings of one kind need about as many entries.
     """
 
     entries: int
@@ -51,11 +51,11 @@ class Tiles:
         surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
         entries: (M,) int32, emission index of each of those.
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
-        reaches: (N, 2), half the sides of the support rectangle, |u| and |v| of a hit cannot exceed them.
+        reaches: (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed.
         tile_size: pixels along a tile's side.
         columns: tiles in a row.
-        exact: whether there is room for exactly the entries that there are; otherwise unused places are at the end,
-            or, when `ends` says that there are more than M, the lists are incomplete and the walk goes over `order`.
+        exact: whether the lists hold exactly the entries that there are. Otherwise unused places are at the end; or,
+            where `ends` counts more than M entries, the lists are incomplete and the walk goes over `order`.
         kind: as in `ListCapacity`.
     """
 
@@ -72,7 +72,7 @@ class Tiles:
 
     @property
     def room(self) -> ListCapacity:
-        """All of the lists that is worth keeping of a rendering."""
+        """What `fits` needs to know of these lists."""
         return ListCapacity(len(self.surfel_ids), self.ends, self.kind)
 
 
@@ -103,8 +103,8 @@ def intersect_tiles(
         camera: the image plane.
         low_pass: whether supports include the screen-space low-pass.
         tile_size: pixels along a tile's side, a multiple of 8.
-        room: entries to make room for; by default as many as there are (CPU) or as there will hardly be more than
-            (CUDA, where the exact number would cost a wait). Too few is slow but right.
+        room: number of entries that the lists can hold. By default, on a CPU, the exact number; on CUDA, where the
+            exact number would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
 
     Raises:
         ValueError: there are more than MAX_ENTRIES entries; on CUDA only when that is noticed without a wait.
@@ -207,7 +207,7 @@ def _total(ends: torch.Tensor, tiles: int) -> int:
 
 @dataclass
 class _Need:
-    """What renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later."""
+    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later."""
 
     room: int
     total: torch.Tensor
@@ -218,7 +218,7 @@ _needs: dict[tuple[object, ...], _Need] = {}
 
 
 def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
-    """Entries to make room for on CUDA: what such renderings needed so far, and half as much again.
+    """Capacity of lists on CUDA: what renderings of this kind needed so far, and half as much again.
 
     Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
     of two). A later one that needs more than there is room for is still right, since the walk then goes over all
@@ -255,7 +255,7 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
 
 
 def fits(room: ListCapacity) -> bool:
-    """Whether lists that a CUDA graph fills have the room that their kind is known to need; asked after each replay."""
+    """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay."""
     return _room(room.ends, room.kind) <= room.entries
 
 

@@ -14,7 +14,7 @@ from nexwarp.kernels.native.simd import simd_functions
 from nexwarp.kernels.native.simd.slots import slot_functions
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import surfel_at, walk
+from nexwarp.kernels.walk import overflowed, surfel_at, walk
 
 
 def strip_width(tile_size: int) -> int:
@@ -172,9 +172,10 @@ def collect_simd_kernel(real: type, max_hits: int, low_pass: bool, tile_size: in
         buffer_red = reals_by_slot()
         buffer_green = reals_by_slot()
         buffer_blue = reals_by_slot()
-        start, end, overflow = walk(thread // strips, tile_offsets, ends, surfel_ids)
-        stop = integers(integer(start))
-        for k in range(start, end):
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // strips, tile_offsets, ends, overflow)
+        stop = integers(integer(bounds[0]))
+        for k in range(bounds[0], bounds[1]):
             i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
@@ -422,8 +423,9 @@ def collect_simd_backward_kernel(
         half = view.half_strip(intrinsics)
         one = reals(ONE)
         transmittance = reals(ONE)
-        start, end, overflow = walk(thread // strips, tile_offsets, ends, surfel_ids)
-        for k in range(start, wp.min(end, last)):
+        overflow = overflowed(ends, surfel_ids)
+        bounds = walk(thread // strips, tile_offsets, ends, overflow)
+        for k in range(bounds[0], wp.min(bounds[1], last)):
             i = surfel_at(k, surfel_ids, order, overflow)
             ra = records[i, 0]
             rb = records[i, 1]
