@@ -202,6 +202,46 @@ def test_optimizers_that_do_not_fit_are_refused(
         nw.Trainer(scene, SMALL, "cpu", optimizer=make)
 
 
+# CUDA graphs
+
+
+def capturable(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+    on_gpu = [group | {"lr": torch.tensor(group["lr"], device="cuda")} for group in groups]
+    return torch.optim.AdamW(on_gpu, capturable=True)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("make", "captured"), [(None, True), (capturable, True), (radam, False)])
+def test_own_losses_and_optimizers_are_captured_where_they_can_be(
+    scene: Scene, make: OptimizerMaker | None, captured: bool
+) -> None:
+    """Replayed steps have the bits of launched ones."""
+
+    def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
+        return 0.1 * (rendering.image - target.photo).square().mean()
+
+    runs = []
+    for graphs in (False, True):
+        config = dataclasses.replace(SMALL, iterations=120, deterministic=True, cuda_graphs=graphs)
+        trainer = nw.Trainer(scene, config, "cuda", losses={"own": loss}, optimizer=make)
+        trainer.run()
+        runs.append(trainer)
+    assert (runs[1].graphs is not None) == captured
+    assert runs[1].graphs is None or any(stage.graph is not None for stage in runs[1].graphs.stages.values())
+    for (name, value), (_, other) in zip(runs[0]._named_parameters(), runs[1]._named_parameters(), strict=True):
+        assert torch.equal(value, other), name
+
+
+@pytest.mark.cuda
+def test_a_loss_that_cannot_be_captured_warns_and_trains_on(scene: Scene) -> None:
+    def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
+        return rendering.alpha.mean() * rendering.alpha.max().item()  # waits for the GPU
+
+    with pytest.warns(UserWarning, match="launched kernel by kernel, not as CUDA graphs: "):
+        model = nw.train(scene, SMALL, device="cuda", losses={"own": loss})
+    assert model.meta["iteration"] == SMALL.iterations
+
+
 # Scenes in memory
 
 

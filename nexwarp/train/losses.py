@@ -73,8 +73,7 @@ def training_losses(
         loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
         mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
             and the texture are 0. None is True everywhere.
-        empty: (H, W) bool, True where nothing is to be seen but `target`, which is the background there: the terms of
-            the texture and of its weight do not count.
+        empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
