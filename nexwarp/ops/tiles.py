@@ -123,12 +123,7 @@ def intersect_tiles(
     arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows), sharing]
     counts = torch.empty(count * sharing, dtype=torch.int32, device=means.device)
     launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)])
-    # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
-    total = counts.sum().clamp_max(LARGEST_INT).view(1) if count * columns * rows > LARGEST_INT else None
-    _scan(counts)
-    ends = counts[sharing - 1 :: sharing]
-    if total is not None:
-        ends[-1:] = total
+    ends = _ends(counts, sharing, count * columns * rows)
     exact = means.device.type == "cpu" and room is None
     if room is None:
         room = _total(ends, columns * rows) if exact else _room(ends, kind)
@@ -186,6 +181,19 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     arrays = [wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)]
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
+
+
+def _ends(counts: torch.Tensor, sharing: int, most: int) -> torch.Tensor:
+    """Turn the counts of each surfel's `sharing` threads into ends, in place, and return the surfels' ends (N,).
+
+    Of very many entries, which may be as many as `most`, the last end is the largest int32 if it is larger.
+    """
+    total = counts.sum().clamp_max(LARGEST_INT).view(1) if most > LARGEST_INT else None
+    _scan(counts)
+    ends = counts[sharing - 1 :: sharing]
+    if total is not None:
+        ends[-1:] = total
+    return ends
 
 
 def _scan(counts: torch.Tensor) -> None:
