@@ -15,6 +15,7 @@ from tests.test_threads import Passes
 from tests.tolerances import assert_close
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
+FORMS: tuple[launch.CpuForm, ...] = ("simd", "scalar")
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 # What `simd_kernels._function` calculates, by name.
@@ -114,7 +115,7 @@ def test_exp_and_log_of_whatever_comes() -> None:
 
 
 @pytest.mark.parametrize("form", ["Simd", "cuda", ""])
-def test_a_form_that_is_none_is_refused(form: str) -> None:
+def test_a_form_that_is_none_is_refused(form: launch.CpuForm) -> None:
     with pytest.raises(ValueError, match=r"^form: expected 'simd' or 'scalar', got "), launch.cpu_form(form):
         pass
 
@@ -130,7 +131,7 @@ def test_both_forms_of_collection_agree(
     size = {} if layered else {"width": 61, "height": 45}
     scene: Scene = (layered_scene if layered else random_scene)(150, seed=3, dtype=dtype, **size)
     buffers, gradients = [], []
-    for form in ("simd", "scalar"):
+    for form in FORMS:
         with launch.cpu_form(form):
             passes = Passes(scene, low_pass=low_pass, max_hits=max_hits, tile_size=tile_size)
             buffers.append(passes.buffers())
@@ -156,7 +157,7 @@ def test_both_forms_of_lookup_agree(count: int, features: int, dtype: torch.dtyp
     depths = (1 + torch.rand(count, generator=generator, dtype=torch.float64)).to(dtype)
     depths[3::7] = 0.0  # points to skip
     results = []
-    for form in ("simd", "scalar"):
+    for form in FORMS:
         with launch.cpu_form(form):
             leaves = [positions.clone().requires_grad_(), depths.clone().requires_grad_()]
             out = texture(*leaves, 24.0)

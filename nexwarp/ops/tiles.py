@@ -172,17 +172,6 @@ def _depth_order(centers: torch.Tensor) -> torch.Tensor:
     return order[:count]
 
 
-def _ends(counts: torch.Tensor, sharing: int, most: int) -> torch.Tensor:
-    """Turn counts, `sharing` a surfel, into the ends of the surfels' entries, in place; `most` bounds their number."""
-    # The ends of very many entries do not fit into int32, so that the last one is then the largest that does.
-    total = counts.sum().clamp_max(LARGEST_INT).view(1) if most > LARGEST_INT else None
-    _scan(counts)
-    ends = counts[sharing - 1 :: sharing]
-    if total is not None:
-        ends[-1:] = total
-    return ends
-
-
 def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> None:
     """Sort the first `count` pairs by the low `bits` bits of their keys, stably, in place."""
     if count == 0:
@@ -190,6 +179,19 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     sorted_keys, sorted_values = wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)  # type: ignore[arg-type]  # no ctypes
+
+
+def _ends(counts: torch.Tensor, sharing: int, most: int) -> torch.Tensor:
+    """Turn the counts of each surfel's `sharing` threads into ends, in place, and return the surfels' ends (N,).
+
+    Of very many entries, which may be as many as `most`, the last end is the largest int32 if it is larger.
+    """
+    total = counts.sum().clamp_max(LARGEST_INT).view(1) if most > LARGEST_INT else None
+    _scan(counts)
+    ends = counts[sharing - 1 :: sharing]
+    if total is not None:
+        ends[-1:] = total
+    return ends
 
 
 def _scan(counts: torch.Tensor) -> None:
