@@ -48,7 +48,9 @@ def begun(
 @pytest.fixture
 def background_job(request: pytest.FixtureRequest, begun: background_jobs.BackgroundJobs) -> Any:
     """What the work of the test's mark `background_job` gave."""
-    return begun.result(background_jobs.key(request.node))
+    job = background_jobs.key(request.node)
+    assert job is not None
+    return begun.result(job)
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -73,7 +75,7 @@ def seed() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def usual_signals() -> Iterator[None]:
     """Signals stop the tests' commands even where pytest itself runs under nohup or in a script's background."""
-    usual = {"SIGINT": signal.default_int_handler, "SIGHUP": signal.SIG_DFL, "SIGTERM": signal.SIG_DFL}
+    usual: dict[str, Any] = {"SIGINT": signal.default_int_handler, "SIGHUP": signal.SIG_DFL, "SIGTERM": signal.SIG_DFL}
     found = {getattr(signal, name): handler for name, handler in usual.items() if hasattr(signal, name)}
     before = {number: signal.signal(number, handler) for number, handler in found.items()}
     yield

@@ -19,6 +19,9 @@ Scene = dict[str, Any]
 SURFEL_KEYS = ("means", "quats", "scales", "opacities", "gammas", "sh")
 CAMERA_KEYS = ("viewmat", "K", "width", "height", "near")
 
+# Means, quats, scales, opacities and gammas.
+Shape = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
 
 def uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
     return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
@@ -122,6 +125,12 @@ def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def make_surfels(scene: Scene) -> nw.Surfels:
     return nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
+
+
+def detached_shape(surfels: nw.Surfels) -> Shape:
+    """Return the activated geometry without its history."""
+    means, quats, scales, opacities, gammas = surfels.activated()
+    return means.detach(), quats.detach(), scales.detach(), opacities.detach(), gammas.detach()
 
 
 def make_camera(scene: Scene, **changes: Any) -> nw.Camera:

@@ -1,11 +1,14 @@
 """Activation in one kernel is what torch's own functions give, to the ends of every range."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.kernels import launch
+from tests.narrowing import total
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close, assert_finite
 
@@ -20,7 +23,7 @@ def make_raw(count: int, dtype: torch.dtype, device: torch.device) -> nw.Surfels
     with torch.no_grad():
         for name in RAW:
             getattr(surfels, name).normal_()
-        surfels.raw_quats *= torch.exp(torch.randn(count, 1, dtype=torch.float64))
+        surfels.raw_quats.mul_(torch.exp(torch.randn(count, 1, dtype=torch.float64)))
     return surfels.to(device=device, dtype=dtype)
 
 
@@ -49,10 +52,15 @@ def gradients(surfels: nw.Surfels, outputs: tuple[torch.Tensor, ...]) -> list[to
     return list(torch.autograd.grad(outputs, [getattr(surfels, name) for name in RAW], signals(surfels)))
 
 
+def about(name: str) -> Callable[[str], str]:
+    """Make the function that puts `name` before the message of a failed comparison."""
+    return lambda text: f"{name}: {text}"
+
+
 def assert_exact(actual: torch.Tensor, expected: torch.Tensor, kind: str, name: str) -> None:
     """Each element to 1e-12 of its own size in float64, all together to the table's tolerance in float32."""
     if actual.dtype == torch.float64:
-        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=0.0, msg=lambda text: f"{name}: {text}")
+        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=0.0, msg=about(name))
     else:
         assert_close(actual, expected, kind=kind, name=name)
 
@@ -91,7 +99,7 @@ def test_extremes_are_finite_and_what_torch_gives(dtype: torch.dtype, device: to
             torchs = signals(surfels)[2] * logits.sigmoid() * (-logits).sigmoid()
         rtol = 1e-12 if dtype == torch.float64 else 2e-6
         smallest = torch.finfo(dtype).tiny
-        torch.testing.assert_close(ours, torchs, rtol=rtol, atol=smallest, msg=lambda text, n=name: f"{n}: {text}")
+        torch.testing.assert_close(ours, torchs, rtol=rtol, atol=smallest, msg=about(name))
     name, ours, torchs = grads[0]
     lengths = surfels.raw_quats.detach().norm(dim=-1, keepdim=True).clamp_min(1e-12)
     for row in range(len(surfels)):
@@ -106,7 +114,7 @@ def test_a_scale_may_overflow_as_in_torch(device: torch.device) -> None:
     assert activated.scales[1, 0].isinf() and activated.gammas[2, 1].isinf()
     expected = gradients(surfels, tuple(getattr(surfels, name) for name in ACTIVATED))
     for name, actual, wanted in zip(RAW, gradients(surfels, activated[1:]), expected, strict=True):
-        torch.testing.assert_close(actual, wanted, rtol=1e-5, atol=1e-6, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(actual, wanted, rtol=1e-5, atol=1e-6, msg=about(name))
 
 
 def test_gradcheck(device: torch.device) -> None:
@@ -123,8 +131,8 @@ def test_one_gradient_alone(wanted: str, device: torch.device) -> None:
     expected = dict(zip(RAW, gradients(surfels, surfels.activated()[1:]), strict=True))
     for name in RAW:
         getattr(surfels, name).requires_grad_(name == wanted)
-    total = sum((x * g).sum() for x, g in zip(surfels.activated()[1:], signals(surfels), strict=True))
-    total.backward()
+    loss = total((x * g).sum() for x, g in zip(surfels.activated()[1:], signals(surfels), strict=True))
+    loss.backward()
     for name in RAW:
         grad = getattr(surfels, name).grad
         assert torch.equal(grad, expected[name]) if name == wanted else grad is None, name
@@ -144,7 +152,7 @@ def test_no_surfels(device: torch.device) -> None:
     surfels = make_raw(0, torch.float32, device)
     activated = surfels.activated()
     assert [tuple(x.shape) for x in activated] == [(0, 3), (0, 4), (0, 2), (0,), (0, 2)]
-    sum(x.sum() for x in activated[1:]).backward()
+    total(x.sum() for x in activated[1:]).backward()
     assert all(getattr(surfels, name).grad.shape == getattr(surfels, name).shape for name in RAW)
 
 
@@ -165,4 +173,4 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match=r"^log_scales: expected shape \(N=4, 2\), got \(3, 2\)$"):
         ops.activate(raw[0], raw[1][:3], raw[2], raw[3])
     with pytest.raises(TypeError, match=r"^raw_gammas: expected dtype torch.float32, got torch.float64$"):
-        ops.activate(*raw[:3], raw[3].double())
+        ops.activate(raw[0], raw[1], raw[2], raw[3].double())

@@ -4,9 +4,12 @@ import pytest
 import torch
 
 from nexwarp import ops
-from nexwarp.finish.detail_limits import NEVER
 from nexwarp.kernels.antialias import FILTER
+from nexwarp.representation.detail_limits import NEVER
 from tests.tolerances import assert_close, assert_finite
+
+# Depths, scales, opacities and gammas.
+Shape = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def antialiased(
@@ -24,7 +27,7 @@ def antialiased(
     return wide, opacities * share.prod(1), 1 + (gammas - 1) * share.square()
 
 
-def arguments(count: int, dtype: torch.dtype, device: torch.device) -> list[torch.Tensor]:
+def arguments(count: int, dtype: torch.dtype, device: torch.device) -> tuple[Shape, torch.Tensor]:
     generator = torch.Generator().manual_seed(5)
     shapes = ((count,), (count, 2), (count,), (count, 2), (count,))
     depths, scales, opacities, gammas, farthest = (
@@ -32,13 +35,15 @@ def arguments(count: int, dtype: torch.dtype, device: torch.device) -> list[torc
     )
     # Pixels of 0.006 to 0.05 units, a few behind the camera.
     values = [5 * depths - 0.4, 0.001 + 0.1 * scales, opacities, 1 + 9 * gammas, 0.002 + 0.03 * farthest]
-    return [x.to(dtype=dtype, device=device) for x in values]
+    depths, scales, opacities, gammas, farthest = (x.to(dtype=dtype, device=device) for x in values)
+    return (depths, scales, opacities, gammas), farthest
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) -> None:
-    *shape, farthest = arguments(500, dtype, device)
-    shape = [x.requires_grad_() for x in shape]
+    shape, farthest = arguments(500, dtype, device)
+    for x in shape:
+        x.requires_grad_()
     signals = [torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(x) for x in shape[1:]]
     found, expected = ops.antialias(*shape, farthest, 90.0), antialiased(*shape, farthest, 90.0)
     far = shape[0].detach() / 90.0 > farthest
@@ -53,20 +58,26 @@ def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) 
 
 
 def test_widening_gradcheck(device: torch.device) -> None:
-    *shape, farthest = arguments(9, torch.float64, device)
-    assert torch.autograd.gradcheck(lambda *x: ops.antialias(*x, farthest, 90.0), [x.requires_grad_() for x in shape])
+    shape, farthest = arguments(9, torch.float64, device)
+
+    def widened(depths: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        scales, opacities, gammas = rest
+        return ops.antialias(depths, scales, opacities, gammas, farthest, 90.0)
+
+    assert torch.autograd.gradcheck(widened, [x.requires_grad_() for x in shape])
 
 
 def test_widening_of_extremes_is_finite(device: torch.device) -> None:
     """And what is far larger than a pixel stays as it is."""
-    *shape, farthest = arguments(8, torch.float32, device)
+    shape, farthest = arguments(8, torch.float32, device)
     with torch.no_grad():
         shape[0].fill_(1e4)
         shape[1][:, 0] = torch.tensor([1e-38, 1e-30, 1e-20, 1e10, 1e18, 1e25, 1e38, 1.0])
         shape[1][:, 1] = shape[1][:, 0]
         shape[3][:, 1] = torch.tensor([1e30, 1e10, 1.0, 1.0, 1e3, 1.0, 1.0, 1.0])
         farthest.copy_(torch.tensor([0.0] * 7 + [NEVER]))
-    shape = [x.requires_grad_() for x in shape]
+    for x in shape:
+        x.requires_grad_()
     found = ops.antialias(*shape, farthest, 1.0)
     for name, values, given in zip(("scales", "opacities", "gammas"), found, shape[1:], strict=True):
         assert_finite(values, name)
@@ -78,7 +89,7 @@ def test_widening_of_extremes_is_finite(device: torch.device) -> None:
 
 
 def test_bad_arguments_are_named() -> None:
-    *shape, farthest = arguments(6, torch.float32, torch.device("cpu"))
+    shape, farthest = arguments(6, torch.float32, torch.device("cpu"))
     with pytest.raises(ValueError, match="farthest"):
         ops.antialias(*shape, farthest[:4], 90.0)
     with pytest.raises(TypeError, match="gammas"):

@@ -1,6 +1,7 @@
 """Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.exposure_calibration import photo_gains
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews
+from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -44,7 +46,7 @@ def light(camera: Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> to
 
 def photographs(
     log_gains: torch.Tensor, outliers: float = 0.0, lens: tuple[float, float] = (0.0, 0.0)
-) -> tuple[list, list, list]:
+) -> tuple[list[Camera], list[torch.Tensor], list[torch.Tensor]]:
     """Photos of coloured points, each a pixel, with gains, through a lens; some pixels are of something else."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(900, 3, generator=generator) * torch.tensor([3.0, 1.6, 1.0]) + torch.tensor([-1.5, -0.8, 2.2])
@@ -63,7 +65,9 @@ def photographs(
         wrong = torch.rand(len(kept), generator=generator) < outliers
         color[wrong] = torch.rand(int(wrong.sum()), 3, generator=generator)
         photo[row[torch.from_numpy(first)], column[torch.from_numpy(first)]] = to_uint8(color[None])[0]
-        cameras.append(camera), photos.append(photo), seen.append(points[kept])
+        cameras.append(camera)
+        photos.append(photo)
+        seen.append(points[kept])
     return cameras, photos, seen
 
 
@@ -100,26 +104,26 @@ def test_the_falloff_of_the_lens_is_found(lens):
     row, column = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
     assert expected.min() < 0.85
-    assert (exposures.falloff_of(camera) / expected - 1).abs().max() < 0.01
+    assert (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
 
 
 def test_the_falloff_is_the_angle_s():
     """A window sees what the whole does there, and so does a camera of twice the pixels; beyond all points it ends."""
     cameras = [looking(0.0), looking(1.0)]
     exposures = Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.25))
-    whole = exposures.falloff_of(cameras[0])
+    whole = present(exposures.falloff_of(cameras[0]))
     assert whole.shape == (48, 64, 1) and whole.max() > 0.999
-    torch.testing.assert_close(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30)), whole[5:35, 10:30])
+    torch.testing.assert_close(present(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30))), whole[5:35, 10:30])
     K2 = K * torch.tensor([[3.0], [3.0], [1.0]])
-    fine = exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144))
+    fine = present(exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144)))
     torch.testing.assert_close(fine[1::3, 1::3], whole)
-    wide = exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000))
+    wide = present(exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000)))
     assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
     assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
     assert exposures.falloff_of(cameras[1]) is whole  # made once
     for left in range(50):
         exposures.falloff_of(cameras[0].crop(left, 0, 20, 30))
-    assert torch.equal(exposures.falloff_of(cameras[0]), whole)
+    assert torch.equal(present(exposures.falloff_of(cameras[0])), whole)
     with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
         Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
 
@@ -218,7 +222,7 @@ def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff)
     photos = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
     gains = photos.gains(camera)
     if falloff is not None:
-        gains = gains * photos.falloff_of(camera)
+        gains = gains * present(photos.falloff_of(camera))
         assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
     out = nw.render(surfels, texture, camera, background=options.background, exposures=photos)
     for name in ("image", "plain", "textured"):
@@ -244,13 +248,13 @@ def test_photos_are_brought_to_one_exposure():
     torch.testing.assert_close(mine.get(1, 1)[1], image / 255.0)
     lens = Exposures.of(gains.log(), [camera, camera], (-0.3, -0.2, 0.4))
     even = TrainingViews(views, torch.device("cpu"), gains, lens)
-    expected = image / 255.0 / gains[0] / lens.falloff_of(camera)
+    expected = image / 255.0 / gains[0] / present(lens.falloff_of(camera))
     torch.testing.assert_close(even.get(0, 1)[1], expected)
     halves = expected.view(24, 2, 32, 2, 3).mean((1, 3))
     torch.testing.assert_close(even.get(0, 2)[1], halves)
 
 
-def trained(scene: Scene, **changes: bool) -> tuple[Model, float]:
+def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
     """A small training with some settings changed, and the PSNR of its test views."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
     trainer = Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
@@ -274,7 +278,7 @@ def test_training_takes_exposures_out(tmp_path):
     expected -= expected.mean()
     _, without = trained(scene, exposures=False)
     model, figure = trained(scene, exposures=True)
-    assert (model.exposures.log_gains - expected[:, None]).abs().max() < 0.03
+    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03
     assert figure > without + 0.5
 
 
@@ -286,14 +290,17 @@ def test_training_takes_vignetting_out(tmp_path):
     lens = Exposures.of(torch.zeros(len(cameras), 3), cameras, (0.0, float(np.log(0.6)), corner))
 
     def dark(views: list[View]) -> list[View]:
-        return [dataclasses.replace(v, image=to_uint8(v.image / 255 * lens.falloff_of(v.camera))) for v in views]
+        falloffs = [present(lens.falloff_of(view.camera)) for view in views]
+        darker = [to_uint8(view.image / 255 * falloff) for view, falloff in zip(views, falloffs, strict=True)]
+        return [dataclasses.replace(view, image=image) for view, image in zip(views, darker, strict=True)]
 
     scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
     camera = scene.test[0].camera
     even, without = trained(scene, vignetting=False)
-    assert even.exposures.falloff_of(camera) is None
+    assert present(even.exposures).falloff_of(camera) is None
     model, figure = trained(scene, vignetting=True)
-    assert (model.exposures.falloff_of(camera) - lens.falloff_of(camera)).abs().max() < 0.08
+    found = present(present(model.exposures).falloff_of(camera))
+    assert (found - present(lens.falloff_of(camera))).abs().max() < 0.08
     assert figure > without + 0.2
 
 
@@ -305,8 +312,10 @@ def test_each_of_many_photos_has_its_own_gains(tmp_path, monkeypatch):
     expected = Trainer(scene, config, "cpu").views.scales
     monkeypatch.setattr(exposures, "MOST_PHOTOS", 4)
     trainer = Trainer(scene, config, "cpu")
-    assert len(trainer.exposures.log_gains) <= 4 < len(scene.train)
-    assert torch.equal(trainer.views.scales, expected) and expected.shape == (len(scene.train), 3)
+    scales = trainer.views.scales
+    assert isinstance(expected, torch.Tensor) and isinstance(scales, torch.Tensor)
+    assert len(present(trainer.exposures).log_gains) <= 4 < len(scene.train)
+    assert torch.equal(scales, expected) and expected.shape == (len(scene.train), 3)
     trainer.run()
 
 
@@ -332,7 +341,7 @@ def test_the_benchmark_tells_spread_and_errors():
     test = views[2::4]
     found = compare(train, test)
     kept = torch.stack([course[i] for i in range(16) if i % 4 != 2])
-    torch.testing.assert_close(found["spread"].float(), kept.std(0), atol=0.01, rtol=0)
+    torch.testing.assert_close(torch.as_tensor(found["spread"]).float(), kept.std(0), atol=0.01, rtol=0)
     expected = (course[2::4] - kept.mean(0)).square().mean().sqrt().item()
     assert found["ignored"] == pytest.approx(expected, abs=0.01)
     assert found["predicted"] < 0.2 * found["ignored"]

@@ -10,7 +10,8 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp import tape as warp_passes
 from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES, check_entries
-from tests.scenes import SURFEL_KEYS, Scene, make_camera, make_surfels, make_texture, random_scene
+from tests.narrowing import present
+from tests.scenes import SURFEL_KEYS, Scene, detached_shape, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite
 
 # On a CPU both forms of the kernels: see `conftest.form`.
@@ -56,16 +57,17 @@ def check_finite(scene: Scene, raw: dict[str, float] | None = None, **options: A
     with torch.no_grad():
         for name, value in (raw or {}).items():
             getattr(surfels, name).fill_(value)
-    out = nw.render(surfels, texture, camera, **({"max_hits": 4, "background": BACKGROUND} | options))
+    settings: dict[str, Any] = {"max_hits": 4, "background": BACKGROUND} | options
+    out = nw.render(surfels, texture, camera, **settings)
     total = out.image.new_zeros(())
     for name in BUFFERS:
         assert_finite(getattr(out, name), name)
         total = total + (getattr(out, name) * torch.randn_like(getattr(out, name))).sum()
     total.backward()
-    assert_finite(camera.viewmat.grad, "gradient of viewmat")
+    assert_finite(present(camera.viewmat.grad), "gradient of viewmat")
     for module in (surfels, texture):
         for name, parameter in module.named_parameters():
-            assert_finite(parameter.grad, f"gradient of {name}")
+            assert_finite(present(parameter.grad), f"gradient of {name}")
     return out
 
 
@@ -240,13 +242,14 @@ def test_more_entries_than_lists_can_have_are_refused(count: int, device: torch.
 
 def warp_lists(surfels: nw.Surfels, camera: nw.Camera) -> Any:
     """What a program without torch calls."""
-    shape = [x.detach().contiguous() for x in surfels.activated()]
+    shape = detached_shape(surfels)
     centers = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat).centers.detach()
     kinds = (wp.vec3, wp.vec4, wp.vec2, wp.float32, wp.vec2, wp.vec3, wp.mat44)
     tensors = (*shape, centers, camera.viewmat.detach()[None].contiguous())
-    arrays = [wp.from_torch(x, dtype=kind) for x, kind in zip(tensors, kinds, strict=True)]
+    arrays = [wp.from_torch(x.contiguous(), dtype=kind) for x, kind in zip(tensors, kinds, strict=True)]
+    means, quats, scales, opacities, gammas, positions, viewmat = (x for x in arrays if isinstance(x, wp.array))
     image = warp_passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
-    return warp_passes.intersect_tiles(*arrays, image)
+    return warp_passes.intersect_tiles(means, quats, scales, opacities, gammas, positions, viewmat, image)
 
 
 @pytest.mark.parametrize("count", [9000, 17_000])
@@ -254,7 +257,7 @@ def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.
     """On CUDA a list is made before anybody knows how many there are."""
     surfels, camera = too_many(device, count)
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    shape = [x.detach() for x in surfels.activated()]
+    shape = detached_shape(surfels)
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=1000)
     assert int(tiles.ends[-1]) == LARGEST_INT > len(tiles.surfel_ids) == 1000  # so the walk goes over all surfels

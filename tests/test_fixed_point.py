@@ -10,22 +10,13 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.kernels import launch
-from nexwarp.kernels.native.fixed_point import LARGEST, fixed_point_add
+from nexwarp.kernels.native.fixed_point import LARGEST
 from nexwarp.ops._interop import from_fixed_point
+from tests.fixed_point_kernels import add_in_order
+from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.test_threads import Passes, errors_of
 from tests.tolerances import assert_close
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def add_in_order(
-    order: wp.array(dtype=wp.int32),
-    terms: wp.array(dtype=wp.float32),
-    sums: wp.array2d(dtype=wp.int64),
-    bad: wp.array(dtype=wp.int32),
-):
-    put = wp.static(fixed_point_add(wp.float32))
-    put(sums, 0, terms[order[wp.tid()]], bad)
 
 
 def summed(terms: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
@@ -119,7 +110,7 @@ def test_gradients_repeat_bit_for_bit() -> None:
             request = out.request_splat_error(out.alpha.detach())
             parameters = [*surfels.parameters(), *texture.parameters()]
             grads = torch.autograd.grad(out.image.square().sum() + out.weights.square().sum(), parameters)
-            found.append([*grads, request.sums_after_backward, out.splat_error(out.alpha.detach())])
+            found.append([*grads, present(request.sums_after_backward), out.splat_error(out.alpha.detach())])
     finally:
         torch.use_deterministic_algorithms(False)
     for other in found[1:]:

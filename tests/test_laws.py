@@ -8,6 +8,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.render import jitter_factors
+from tests.narrowing import present
 from tests.reference import render as reference
 from tests.scenes import (
     Scene,
@@ -83,7 +84,7 @@ def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:
         generators[axis, b, a], generators[axis, a, b] = 1.0, -1.0
         generators[axis + 3, axis, 3] = 1.0
     moved = generators @ viewmat.detach().double().cpu()
-    return (moved * viewmat.grad.double().cpu()).sum(dim=(1, 2))
+    return (moved * present(viewmat.grad).double().cpu()).sum(dim=(1, 2))
 
 
 def twin(module: torch.nn.Module | None) -> Any:
@@ -150,7 +151,7 @@ def test_render_agrees_with_the_reference(
         texture.half_precision = half
         if half:
             texture.half().float()
-    options = {
+    options: dict[str, Any] = {
         "max_hits": max_hits,
         "background": BACKGROUND,
         "sh_degree": sh_degree,
@@ -171,7 +172,7 @@ def test_render_agrees_with_the_reference(
         values = getattr(out, buffer), getattr(expected, buffer)
         assert_close(*values, kind="value", name=buffer, precision=row, allow_flips=flips)
     assert_gradients(surfels, surfels64, row)
-    if textured:
+    if texture is not None:
         assert_gradients(texture, texture64, row)
     assert_close(
         rigid_gradient(camera.viewmat),
@@ -363,7 +364,7 @@ def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -
         make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")}),
         twin(texture),
     )
-    options = {"max_hits": max_hits, "background": BACKGROUND}
+    options: dict[str, Any] = {"max_hits": max_hits, "background": BACKGROUND}
     torch.manual_seed(3)
     drawn = torch.randn(camera.height, camera.width, max_hits, dtype=torch.float64, device=device)
     shares = (1 + drawn * jitter / camera.focal).cpu()

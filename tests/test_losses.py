@@ -1,6 +1,7 @@
 """The losses against hand-computed cases, the paper's sums written out, and finite differences."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torch.autograd import gradcheck
 from nexwarp.camera import visible_points
 from nexwarp.train import losses
 from nexwarp.train.losses import LossWeights
+from tests.narrowing import present, total
 from tests.tolerances import assert_close
 
 DTYPES = [torch.float32, torch.float64]
@@ -179,7 +181,7 @@ def test_grid_loss_has_a_zero_gradient_at_zero() -> None:
     assert torch.autograd.grad(loss, grid)[0].eq(0.0).all()
 
 
-def arguments(slots: int = 2, with_grid: bool = True) -> dict[str, torch.Tensor | None]:
+def arguments(slots: int = 2, with_grid: bool = True) -> dict[str, Any]:
     image, target = images()
     weights = 0.4 * torch.rand(13, 17, slots, dtype=torch.float64)
     return {
@@ -224,7 +226,7 @@ def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
 
 
 def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def names(given: dict[str, torch.Tensor | None], **weights: float) -> set[str]:
+    def names(given: dict[str, Any], **weights: Any) -> set[str]:
         return set(losses.training_losses(**given, loss_weights=LossWeights(**weights)))
 
     assert names(arguments(slots=0)) == {"l1", "dssim", "opacity", "grid"}
@@ -259,7 +261,7 @@ def scene_of_losses() -> dict[str, torch.Tensor]:
 
 def terms_of(tensors: dict[str, torch.Tensor], **options: torch.Tensor) -> dict[str, torch.Tensor]:
     factors = LossWeights(opacity=0.0, grid=0.0)
-    rest = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
+    rest: dict[str, Any] = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
     return losses.training_losses(**tensors, **rest, loss_weights=factors, **options)
 
 
@@ -267,9 +269,9 @@ def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
     tensors = scene_of_losses()
     mask = torch.rand(13, 17) < 0.7
     terms = terms_of(tensors, mask=mask)
-    sum(terms.values()).backward()
+    total(terms.values()).backward()
     for name in ("image", "textured", "weights"):
-        gradient = tensors[name].grad
+        gradient = present(tensors[name].grad)
         assert not gradient[~mask].any() and gradient[mask].any(), name
     spoilt = {name: torch.where(mask[..., None], x, 0.1 * x) for name, x in tensors.items() if name != "weights"}
     again = terms_of({**tensors, **spoilt, "target": tensors["target"]}, mask=mask)
@@ -291,9 +293,10 @@ def test_where_nothing_is_only_the_image_counts() -> None:
     expected = terms_of(tensors)
     for name in ("l1", "dssim"):
         assert_close(terms[name], expected[name], kind="value", name=name)
-    sum(terms.values()).backward()
+    total(terms.values()).backward()
     for name in ("textured", "weights"):
-        assert not tensors[name].grad[empty].any() and tensors[name].grad[~empty].any(), name
+        gradient = present(tensors[name].grad)
+        assert not gradient[empty].any() and gradient[~empty].any(), name
 
 
 def test_border_loss_by_hand() -> None:
@@ -308,11 +311,11 @@ def test_visible_points_by_hand() -> None:
     nan = float("nan")
     pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [nan, 1.0], [2.5, 1.5], [0.0, 2.999], [1.0, 3.0]])
     depths = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0, 5.0, 1.0])
-    places, expected = visible_points(pixels, depths, 4, 3)
+    places, expected = present(visible_points(pixels, depths, 4, 3))
     assert places.tolist() == [1 * 4 + 2, 2 * 4 + 0] and expected.tolist() == [2.0, 5.0]
     mask = torch.ones(3, 4, dtype=torch.bool)
     mask[1, 2] = False
-    places, expected = visible_points(pixels, depths, 4, 3, mask)
+    places, expected = present(visible_points(pixels, depths, 4, 3, mask))
     assert places.tolist() == [8] and expected.tolist() == [5.0]
     assert visible_points(pixels, depths, 4, 3, torch.zeros(3, 4, dtype=torch.bool)) is None
     assert visible_points(pixels, -depths.abs(), 4, 3) is None

@@ -10,6 +10,7 @@ from nexwarp.kernels import launch
 from nexwarp.ops import photometric
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.train import losses
+from tests.narrowing import present, total
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 
@@ -48,6 +49,13 @@ def expected_terms(given: dict[str, torch.Tensor], factors: dict[str, float]) ->
     return {name: factor * terms[name]() for name, factor in factors.items()}
 
 
+def terms_of(
+    given: dict[str, torch.Tensor], factors: dict[str, float] = FACTORS
+) -> tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor | None]:
+    image, textured, weights, target = given.values()
+    return photometric_terms(image, textured, weights, target, **factors)
+
+
 def moved(given: dict[str, torch.Tensor], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     return {name: x.detach().to(device, dtype).requires_grad_(x.requires_grad) for name, x in given.items()}
 
@@ -60,16 +68,17 @@ def test_terms_are_the_references(device: torch.device, slots: int, names: tuple
     given = inputs(slots=slots)
     expected = expected_terms(given, factors)
     leaves = moved(given, device, dtype)
-    actual = dict(zip(FACTORS, photometric_terms(*leaves.values(), **factors), strict=True))
+    actual = dict(zip(FACTORS, terms_of(leaves, factors), strict=True))
     assert {name for name, term in actual.items() if term is not None} == set(names)
     for name in names:
-        assert_close(actual[name], expected[name], kind="value", name=name)
+        assert_close(present(actual[name]), expected[name], kind="value", name=name)
     # Each term has a cotangent of its own.
     scales = {name: 2.0 + index for index, name in enumerate(names)}
-    totals = [sum(scales[name] * terms[name] for name in names) for terms in (actual, expected)]
+    wanted_terms: list[dict[str, torch.Tensor | None]] = [actual, {**expected}]
+    totals = [total(scales[name] * present(terms[name]) for name in names) for terms in wanted_terms]
     gradients = [
-        torch.autograd.grad(total, [source[name] for name in NAMES], allow_unused=True)
-        for total, source in zip(totals, (leaves, given), strict=True)
+        torch.autograd.grad(loss, [source[name] for name in NAMES], allow_unused=True)
+        for loss, source in zip(totals, (leaves, given), strict=True)
     ]
     for name, gradient, wanted in zip(NAMES, *gradients, strict=True):
         assert (gradient is None) == (wanted is None), name
@@ -81,7 +90,12 @@ def test_terms_are_the_references(device: torch.device, slots: int, names: tuple
 def test_gradients_against_finite_differences() -> None:
     given = inputs(3, 4)
     target = given.pop("target")
-    assert gradcheck(lambda *x: photometric_terms(*x, target, **FACTORS), tuple(given.values()))
+
+    def terms(*x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        leaves = dict(zip(NAMES, x, strict=True)) | {"target": target}
+        return tuple(present(term) for term in terms_of(leaves))
+
+    assert gradcheck(terms, tuple(given.values()))
 
 
 @pytest.mark.parametrize("wanted", SUBSETS, ids="+".join)
@@ -91,13 +105,13 @@ def test_gradients_go_only_where_they_are_wanted(wanted: tuple[str, ...]) -> Non
         given = inputs(2, 3)
         for name, need in zip(NAMES, needed, strict=True):
             given[name].requires_grad_(need)
-        actual = dict(zip(FACTORS, photometric_terms(*given.values(), **FACTORS), strict=True))
+        actual = dict(zip(FACTORS, terms_of(given), strict=True))
         expected = expected_terms(given, FACTORS)
         leaves = [given[name] for name in NAMES if given[name].requires_grad]
-        totals = [sum(terms[name] for name in wanted) for terms in (actual, expected)]
+        totals = [total(terms[name] for name in wanted) for terms in (actual, expected)]
         if not totals[1].requires_grad:
             continue
-        gradients = [torch.autograd.grad(total, leaves, allow_unused=True) for total in totals]
+        gradients = [torch.autograd.grad(loss, leaves, allow_unused=True) for loss in totals]
         for gradient, want in zip(*gradients, strict=True):
             assert (gradient is None) == (want is None)
             if gradient is not None:
@@ -107,7 +121,7 @@ def test_gradients_go_only_where_they_are_wanted(wanted: tuple[str, ...]) -> Non
 def test_nothing_wanted_launches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     given = inputs()
     monkeypatch.setattr(photometric, "launch", None)
-    assert photometric_terms(*given.values()) == (None, None, None)
+    assert terms_of(given, {}) == (None, None, None)
     assert photometric_terms(None, None, None, None) == (None, None, None)
 
 
@@ -120,8 +134,8 @@ def test_inputs_need_not_be_contiguous(device: torch.device) -> None:
     assert not any(x.is_contiguous() for x in turned.values())
     results = []
     for source in (given, turned):
-        terms = photometric_terms(*source.values(), **FACTORS)
-        results.append([*terms, *torch.autograd.grad(sum(terms), [source[name] for name in NAMES])])
+        terms = terms_of(source)
+        results.append([*map(present, terms), *torch.autograd.grad(total(terms), [source[name] for name in NAMES])])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
@@ -135,9 +149,9 @@ def test_inputs_may_be_expanded() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1)])
 def test_tiny_images(device: torch.device, size: tuple[int, int]) -> None:
     given = inputs(*size)
-    terms = photometric_terms(*moved(given, device, torch.float64).values(), **FACTORS)
+    terms = terms_of(moved(given, device, torch.float64))
     for term, (name, expected) in zip(terms, expected_terms(given, FACTORS).items(), strict=True):
-        assert_close(term, expected, kind="value", name=name)
+        assert_close(present(term), expected, kind="value", name=name)
 
 
 def test_equal_colours_have_no_gradient(device: torch.device) -> None:
@@ -147,7 +161,7 @@ def test_equal_colours_have_no_gradient(device: torch.device) -> None:
     image = target.clone().requires_grad_()
     textured = torch.zeros_like(target).requires_grad_()
     weights = torch.full((4, 5, 2), 0.5, device=device).requires_grad_()
-    loss = sum(photometric_terms(image, textured, weights, target, l1=1.0, texture=1.0)[:2])
+    loss = total(photometric_terms(image, textured, weights, target, l1=1.0, texture=1.0)[:2])
     to_image, to_textured, to_weights = torch.autograd.grad(loss, [image, textured, weights])
     assert not to_image.any()
     assert not to_textured[0].any() and (to_textured[1:] < 0.0).all()
@@ -158,9 +172,9 @@ def test_a_nan_shows_in_its_terms_and_stays_in_its_pixel(device: torch.device) -
     given = moved(inputs(), device, torch.float64)
     with torch.no_grad():
         given["weights"][3, 4, 1] = float("nan")
-    terms = photometric_terms(*given.values(), **FACTORS)
-    assert [bool(term.isnan()) for term in terms] == [False, True, True]
-    gradients = torch.autograd.grad(sum(terms), [given[name] for name in NAMES])
+    terms = terms_of(given)
+    assert [bool(present(term).isnan()) for term in terms] == [False, True, True]
+    gradients = torch.autograd.grad(total(terms), [given[name] for name in NAMES])
     assert [int(gradient.isnan().sum()) for gradient in gradients] == [0, 3, 2]
 
 
@@ -179,8 +193,8 @@ def test_result_does_not_depend_on_threads() -> None:
     results = []
     for count in (1, 2, 3, 3):
         launch.set_num_threads(count)
-        terms = photometric_terms(*given.values(), **FACTORS)
-        results.append([*terms, *torch.autograd.grad(sum(terms), [given[name] for name in NAMES])])
+        terms = terms_of(given)
+        results.append([*map(present, terms), *torch.autograd.grad(total(terms), [given[name] for name in NAMES])])
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
 
@@ -190,8 +204,8 @@ def test_result_repeats_on_cuda() -> None:
     given = moved(inputs(190, 270), torch.device("cuda"), torch.float32)
     results = []
     for _ in range(3):
-        terms = photometric_terms(*given.values(), **FACTORS)
-        results.append([*terms, *torch.autograd.grad(sum(terms), [given[name] for name in NAMES])])
+        terms = terms_of(given)
+        results.append([*map(present, terms), *torch.autograd.grad(total(terms), [given[name] for name in NAMES])])
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
 
@@ -211,6 +225,6 @@ def test_wrong_inputs_name_the_argument() -> None:
     given = inputs()
     given["weights"] = given["weights"][:-1]
     with pytest.raises(ValueError, match=r"^weights: expected shape \(H=7, W=9, K=2\), got \(6, 9, 2\)"):
-        photometric_terms(*given.values(), **FACTORS)
-    terms = photometric_terms(*given.values(), l1=1.0)  # which does not read the weights
+        terms_of(given)
+    terms = terms_of(given, {"l1": 1.0})  # which does not read the weights
     assert terms[0] is not None and terms[1:] == (None, None)

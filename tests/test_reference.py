@@ -1,6 +1,7 @@
 """The reference is right: hand-computed values, and gradients against finite differences."""
 
 import math
+from typing import Any
 
 import pytest
 import scipy.special
@@ -25,14 +26,14 @@ def leaves(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return tuple(value.detach().clone().requires_grad_() for value in tensors)
 
 
-def pinhole(scene: Scene) -> dict[str, float]:
+def pinhole(scene: Scene) -> dict[str, Any]:
     """The intrinsics of `scene` as the reference takes them."""
     (fx, _, cx), (_, fy, cy), _ = scene["K"].tolist()
     sizes = {key: scene[key] for key in ("width", "height", "near")}
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy} | sizes
 
 
-def sheets(*surfels: tuple[float, float], scale: tuple[float, float] = (0.2, 0.1)) -> dict[str, torch.Tensor]:
+def sheets(*surfels: tuple[float, float], scale: tuple[float, float] = (0.2, 0.1)) -> dict[str, Any]:
     """Surfels (z, opacity) that face the camera on its axis, with primary colours in turn."""
     z, opacities = tensor(*surfels).unbind(-1)
     count = len(surfels)
@@ -48,7 +49,7 @@ def sheets(*surfels: tuple[float, float], scale: tuple[float, float] = (0.2, 0.1
 
 
 # Five by five pixels; the centre of pixel [2, 2] is the principal point, a pixel is 0.2 wide at depth 2.
-VIEW = {"fx": 10.0, "fy": 10.0, "cx": 2.5, "cy": 2.5, "width": 5, "height": 5, "near": 0.01}
+VIEW: dict[str, Any] = {"fx": 10.0, "fy": 10.0, "cx": 2.5, "cy": 2.5, "width": 5, "height": 5, "near": 0.01}
 
 
 def value_of(number: torch.Tensor, expected: float | list[float], name: str) -> None:
@@ -205,7 +206,8 @@ def test_gradients_of_collect(max_hits: int, low_pass: bool) -> None:
     inputs = leaves(*(scene[key] for key in FLOATS), colors, scene["viewmat"])
 
     def blend(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        hits = collect(*tensors, **pinhole(scene), max_hits=max_hits, low_pass=low_pass)
+        named: dict[str, Any] = dict(zip((*FLOATS, "colors", "viewmat"), tensors, strict=True))
+        hits = collect(**named, **pinhole(scene), max_hits=max_hits, low_pass=low_pass)
         return hits.plain, hits.base, hits.depths, hits.weights, hits.alpha
 
     assert blend(*inputs)[4].max() > 0.3
@@ -255,7 +257,7 @@ def test_gradients_of_encode() -> None:
         torch.randn(3, 16, 2, dtype=torch.float64),
     )
     resolutions = tensor(1.0, 1.7, 3.0)
-    assert torch.autograd.gradcheck(lambda *tensors: encode(*tensors, resolutions, focal=4.0), inputs)
+    assert torch.autograd.gradcheck(lambda x, t, grid: encode(x, t, grid, resolutions, focal=4.0), inputs)
 
 
 def test_gradients_of_plain_colors() -> None:
@@ -264,7 +266,7 @@ def test_gradients_of_plain_colors() -> None:
         torch.randn(3, 3, dtype=torch.float64),
         tensor(3.0, -4.0, 5.0),
     )
-    assert torch.autograd.gradcheck(lambda *tensors: plain_colors(*tensors, degree=3), inputs)
+    assert torch.autograd.gradcheck(lambda sh, means, position: plain_colors(sh, means, position, degree=3), inputs)
 
 
 # The whole
@@ -280,8 +282,8 @@ def test_a_field_of_zeros_is_grey() -> None:
     scene = random_scene(6, dtype=torch.float64)
     field = make_field()
     field.mlp[-1].zero_()
-    arguments = [scene[key] for key in (*FLOATS, "sh")]
-    out = render(*arguments, field, scene["viewmat"], **pinhole(scene), background=(0.1, 0.2, 0.3))
+    arguments = {key: scene[key] for key in (*FLOATS, "sh", "viewmat")}
+    out = render(**arguments, texture=field, **pinhole(scene), background=(0.1, 0.2, 0.3))
     grey = 0.5 * out.weights.sum(-1, keepdim=True).expand(-1, -1, 3)
     assert_close(out.textured, grey, kind="value", name="textured")
     behind = (1 - out.alpha)[..., None] * tensor(0.1, 0.2, 0.3)
@@ -300,10 +302,10 @@ def test_the_field_is_asked_where_the_pixel_sees_the_surfel() -> None:
     grid[0, entries] = corners.double()
     mlp = [torch.eye(3, dtype=torch.float64)]
     sh = torch.zeros(1, 1, 3, dtype=torch.float64)
-    surfel = [scene[key] for key in FLOATS]
+    arguments = {key: scene[key] for key in (*FLOATS, "viewmat")}
     # Resolution 0.25 puts x in [0, 4) into one cell, where the features are x / 4.
     texture = Texture(grid, tensor(0.25), mlp)
-    out = render(*surfel, sh, texture, scene["viewmat"], **VIEW, max_hits=1)
+    out = render(**arguments, sh=sh, texture=texture, **VIEW, max_hits=1)
     factor = 1 - math.exp(-((10 / (0.25 * 2.0)) ** 2) / (2 * math.pi))
     # Pixel [3, 2] sees the surfel 0.2 below the axis, at (0.5, 0.7, 3) in the world.
     coefficients = factor * tensor(0.5, 0.7, 3.0) / 4
@@ -313,11 +315,8 @@ def test_the_field_is_asked_where_the_pixel_sees_the_surfel() -> None:
 
 def test_no_texture_makes_no_difference_of_max_hits() -> None:
     scene = random_scene(8, dtype=torch.float64)
-    arguments = [scene[key] for key in (*FLOATS, "sh")]
-    images = [
-        render(*arguments, None, scene["viewmat"], **pinhole(scene), max_hits=max_hits).image
-        for max_hits in (0, 1, 2, 8)
-    ]
+    arguments = {key: scene[key] for key in (*FLOATS, "sh", "viewmat")}
+    images = [render(**arguments, texture=None, **pinhole(scene), max_hits=max_hits).image for max_hits in (0, 1, 2, 8)]
     for image in images[1:]:
         assert_close(image, images[0], kind="value", name="image")
 
@@ -333,11 +332,9 @@ def test_gradients_of_the_whole_render(sh_degree: int, textured: bool, low_pass:
     inputs = leaves(*(scene[key] for key in (*FLOATS, "sh", "viewmat")), field.grid, *field.mlp)
 
     def picture(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        *surfels, viewmat, grid = tensors[:8]
-        texture = Texture(grid, field.resolutions, tensors[8:]) if textured else None
-        out = render(
-            *surfels, texture, viewmat, **pinhole(scene), background=(0.2, 0.4, 0.6), low_pass=low_pass
-        )  # fmt: skip
+        named: dict[str, Any] = dict(zip((*FLOATS, "sh", "viewmat"), tensors[:7], strict=True))
+        texture = Texture(tensors[7], field.resolutions, tensors[8:]) if textured else None
+        out = render(**named, texture=texture, **pinhole(scene), background=(0.2, 0.4, 0.6), low_pass=low_pass)
         return out.image, out.plain, out.textured, out.depths, out.weights, out.alpha
 
     assert picture(*inputs)[5].max() > 0.3
@@ -346,7 +343,7 @@ def test_gradients_of_the_whole_render(sh_degree: int, textured: bool, low_pass:
 
 def test_no_surfels() -> None:
     scene = random_scene(0, dtype=torch.float64)
-    arguments = [scene[key] for key in (*FLOATS, "sh")]
-    out = render(*arguments, make_field(), scene["viewmat"], **pinhole(scene), background=(0.1, 0.2, 0.3))
+    arguments = {key: scene[key] for key in (*FLOATS, "sh", "viewmat")}
+    out = render(**arguments, texture=make_field(), **pinhole(scene), background=(0.1, 0.2, 0.3))
     assert_close(out.image, tensor(0.1, 0.2, 0.3).expand(18, 23, 3), kind="value", name="image")
     assert (out.ids == -1).all() and not out.alpha.any()

@@ -8,6 +8,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.kernels import launch
+from tests.narrowing import present
 from tests.reference import sh as reference
 from tests.tolerances import assert_close
 
@@ -38,8 +39,13 @@ def signal(colors: torch.Tensor) -> torch.Tensor:
     return torch.randn(colors.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(colors)
 
 
+def colors_of(leaves: Leaves, degree: int) -> torch.Tensor:
+    sh0, shN, means, position = leaves
+    return ops.plain_colors((sh0, shN), means, position, degree)
+
+
 def gradients(leaves: Leaves, degree: int) -> Leaves:
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], degree)
+    colors = colors_of(leaves, degree)
     return list(torch.autograd.grad(colors, leaves, signal(colors)))
 
 
@@ -50,7 +56,7 @@ def test_plain_colors_agree_with_the_reference(
 ) -> None:
     leaves = make(300, stored, dtype, device)
     twins = [x.detach().double().cpu().requires_grad_() for x in leaves]
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], degree)
+    colors = colors_of(leaves, degree)
     sh0, shN, means, position = twins
     expected = reference.plain_colors(torch.cat([sh0, shN], dim=1), means, position, degree)
     assert 0.02 < (expected == 0).double().mean() < 0.5
@@ -75,7 +81,7 @@ def test_coefficients_above_the_degree_have_zero_gradients(stored: int, degree: 
 
 def test_clamped_channels_have_no_gradient(device: torch.device) -> None:
     leaves = make(300, 3, torch.float64, device)
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    colors = colors_of(leaves, 3)
     clamped = colors == 0
     sh0, shN, means, position = torch.autograd.grad(colors, leaves, signal(colors) * clamped)
     assert clamped.any() and not any(x.any() for x in (sh0, shN, means, position))
@@ -95,7 +101,7 @@ def test_a_surfel_at_the_camera_takes_the_forward_direction(dtype: torch.dtype, 
         shN *= 0.1
         means[2] = position
     leaves = [sh0, shN, means, position]
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    colors = colors_of(leaves, 3)
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=device)
     expected = 0.5 + reference.evaluate(torch.cat([sh0, shN], dim=1)[2], forward, 3)
     assert_close(colors[2], expected, kind="value", name="colour at the camera")
@@ -114,7 +120,7 @@ def test_moving_the_camera_is_moving_the_surfels_the_other_way(device: torch.dev
 @pytest.mark.parametrize("stored", range(4))
 def test_gradcheck(stored: int, device: torch.device) -> None:
     leaves = make(6, stored, torch.float64, device)
-    assert torch.autograd.gradcheck(lambda *x: ops.plain_colors(x[:2], *x[2:], 3), leaves)
+    assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), 3), leaves)
 
 
 @pytest.mark.parametrize("wanted", NAMES)
@@ -123,20 +129,21 @@ def test_one_gradient_alone(wanted: str, device: torch.device) -> None:
     expected = dict(zip(NAMES, gradients(leaves, 2), strict=True))
     for name, x in zip(NAMES, leaves, strict=True):
         x.requires_grad_(name == wanted)
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], 2)
+    colors = colors_of(leaves, 2)
     colors.backward(signal(colors))
     for name, x in zip(NAMES, leaves, strict=True):
-        assert torch.equal(x.grad, expected[name]) if name == wanted else x.grad is None, name
+        assert torch.equal(present(x.grad), expected[name]) if name == wanted else x.grad is None, name
 
 
 @pytest.mark.parametrize("stored", range(4))
 def test_no_surfels(stored: int, device: torch.device) -> None:
     leaves = make(0, stored, torch.float32, device)
-    colors = ops.plain_colors(leaves[:2], *leaves[2:], 3)
+    colors = colors_of(leaves, 3)
     assert colors.shape == (0, 3)
     colors.sum().backward()
     for x in leaves:
-        assert x.grad.shape == x.shape and not x.grad.any()
+        gradient = present(x.grad)
+        assert gradient.shape == x.shape and not gradient.any()
 
 
 def test_strided_input(device: torch.device) -> None:
@@ -146,7 +153,7 @@ def test_strided_input(device: torch.device) -> None:
     assert torch.equal(colors, ops.plain_colors((sh0, shN), means, position, 3))
     colors.backward(signal(colors))
     grad_sh0, grad_shN, _, _ = gradients([sh0, shN, means, position], 3)
-    assert torch.equal(strided.grad, torch.cat([grad_sh0, grad_shN], dim=1))
+    assert torch.equal(present(strided.grad), torch.cat([grad_sh0, grad_shN], dim=1))
 
 
 def test_plain_colors_do_not_depend_on_threads() -> None:
@@ -155,7 +162,7 @@ def test_plain_colors_do_not_depend_on_threads() -> None:
     results = []
     for count in (1, 3):
         launch.set_num_threads(count)
-        results.append([ops.plain_colors(leaves[:2], *leaves[2:], 3), *gradients(leaves, 3)])
+        results.append([colors_of(leaves, 3), *gradients(leaves, 3)])
     launch.set_num_threads(before)
     assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
 
@@ -171,5 +178,6 @@ def test_bad_input() -> None:
 def test_no_surfels_give_empty_gradients() -> None:
     """Also when the gradient comes expanded from a sum, with strides that no contiguous tensor has."""
     leaves = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (2,), (), (2,), (3,))]
-    ops.project(*leaves, torch.eye(4)).records.sum().backward()
-    assert [x.grad.shape for x in leaves] == [x.shape for x in leaves]
+    means, quats, scales, opacities, gammas, colors = leaves
+    ops.project(means, quats, scales, opacities, gammas, colors, torch.eye(4)).records.sum().backward()
+    assert [present(x.grad).shape for x in leaves] == [x.shape for x in leaves]

@@ -1,6 +1,7 @@
 """SIMD vectors calculate what torch does, each group of snippets by itself; SIMD forms agree with the others."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -36,13 +37,15 @@ def positive(dtype: torch.dtype, count: int = 5) -> torch.Tensor:
     return (10.0 ** (2 * torch.rand(count, WIDTH, dtype=torch.float64) - 1)).to(dtype)
 
 
-def as_vectors(tensor: torch.Tensor) -> wp.array:
+def as_vectors(tensor: torch.Tensor) -> "wp.array[Any]":
     """View (..., WIDTH) reals or integers as SIMD vectors."""
     wp.init()
     integral = not tensor.is_floating_point()
     wide = tensor.element_size() == 8
     f = simd_functions(wp.float64 if wide else wp.float32, WIDTH)
-    return wp.from_torch(tensor, dtype=f.integers if integral else f.reals)
+    array = wp.from_torch(tensor, dtype=f.integers if integral else f.reals)
+    assert isinstance(array, wp.array)
+    return array
 
 
 def run(kernel: wp.Kernel, *tensors: torch.Tensor) -> None:
@@ -115,7 +118,7 @@ def test_exp_and_log_of_whatever_comes() -> None:
 
 
 @pytest.mark.parametrize("form", ["Simd", "cuda", ""])
-def test_a_form_that_is_none_is_refused(form: launch.CpuForm) -> None:
+def test_a_form_that_is_none_is_refused(form: Any) -> None:
     with pytest.raises(ValueError, match=r"^form: expected 'simd' or 'scalar', got "), launch.cpu_form(form):
         pass
 
@@ -128,7 +131,7 @@ def test_both_forms_of_collection_agree(
     layered: bool, low_pass: bool, max_hits: int, tile_size: int, dtype: torch.dtype
 ) -> None:
     """Sizes that no strip or tile divides, so that some of their pixels lie outside the image."""
-    size = {} if layered else {"width": 61, "height": 45}
+    size: dict[str, Any] = {} if layered else {"width": 61, "height": 45}
     scene: Scene = (layered_scene if layered else random_scene)(150, seed=3, dtype=dtype, **size)
     buffers, gradients = [], []
     for form in FORMS:

@@ -8,7 +8,16 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from tests.reference.surface import surface
-from tests.scenes import Scene, layered_scene, make_camera, make_surfels, multiply, random_scene, rigid
+from tests.scenes import (
+    Scene,
+    detached_shape,
+    layered_scene,
+    make_camera,
+    make_surfels,
+    multiply,
+    random_scene,
+    rigid,
+)
 from tests.tolerances import FLIPS, assert_close
 
 # On a CPU both forms of the kernels: see `conftest.form`.
@@ -57,10 +66,10 @@ def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, low_pa
         scene["scales"] *= 0.1
     surfels, camera = make_surfels(scene), make_camera(scene)
     out = nw.render(surfels, None, camera, low_pass=low_pass)
-    shape = [x.detach().double().cpu() for x in surfels.activated()]
+    means, quats, scales, opacities, gammas = (x.double().cpu() for x in detached_shape(surfels))
     viewmat = camera.viewmat.detach().double().cpu()
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    expected = surface(*shape, viewmat, *intrinsics, low_pass)
+    expected = surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics, low_pass)
     assert expected.expected_depth.any() and (name != "specks" or not expected.expected_depth.all())
     flips = 0.0 if dtype == torch.float64 else FLIPS
     for buffer in BUFFERS:
@@ -157,7 +166,7 @@ def test_surface_of_short_lists(device: torch.device) -> None:
     scene = random_scene(60, width=70, height=40, device=device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    shape = [x.detach() for x in surfels.activated()]
+    shape = detached_shape(surfels)
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat.detach())
     found = []
     for room in (None, 3):

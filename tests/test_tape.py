@@ -1,5 +1,7 @@
 """A Warp-only program differentiates a whole render with `tape.backward()`, and agrees with torch's gradients."""
 
+from typing import Any
+
 import pytest
 import torch
 import warp as wp
@@ -7,39 +9,18 @@ import warp as wp
 import nexwarp as nw
 from nexwarp import tape as passes
 from nexwarp.kernels.types import types
+from tests.narrowing import present
 from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, random_scene
+from tests.tape_kernels import REAL, matmul, relu, weighted_sum
 from tests.tolerances import assert_close
 
 HITS = 2
-REAL = wp.float64
 
 
-@wp.kernel(module="unique")
-def matmul(weights: wp.array2d(dtype=REAL), x: wp.array2d(dtype=REAL), y: wp.array2d(dtype=REAL)):
-    o, i = wp.tid()
-    total = REAL(0.0)
-    for k in range(weights.shape[1]):
-        total += weights[o, k] * x[k, i]
-    y[o, i] = total
-
-
-# A kernel of its own: Warp's adjoint does not replay the sum's dynamic loop, so a max behind it would see zeros.
-@wp.kernel(module="unique")
-def relu(x: wp.array2d(dtype=REAL), y: wp.array2d(dtype=REAL)):
-    o, i = wp.tid()
-    y[o, i] = wp.max(x[o, i], REAL(0.0))
-
-
-@wp.kernel(module="unique")
-def weighted_sum(
-    image: wp.array(dtype=types(REAL).vec3), weights: wp.array(dtype=types(REAL).vec3), loss: wp.array(dtype=REAL)
-):
-    i = wp.tid()
-    wp.atomic_add(loss, 0, wp.dot(image[i], weights[i]))
-
-
-def to_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
-    return wp.from_torch(tensor.detach().clone().contiguous(), dtype=dtype, requires_grad=True)
+def to_warp(tensor: torch.Tensor, dtype: type) -> "wp.array[Any]":
+    array = wp.from_torch(tensor.detach().clone().contiguous(), dtype=dtype, requires_grad=True)
+    assert isinstance(array, wp.array)
+    return array
 
 
 @pytest.mark.parametrize("residual", [False, True])
@@ -71,15 +52,15 @@ def test_tape_and_torch_give_the_same_gradients(residual: bool, device: torch.de
     assert_close(image, out.image, kind="value", name="image")
     assert_close(loss, (out.image * weights).sum(), kind="value", name="loss")
     for (name, parameter), gradient in zip(named.items(), through, strict=True):
-        assert_close(gradient, parameter.grad, kind="gradient", name=name)
-    assert_close(gradients["grid"], texture.grid.grad, kind="gradient", name="grid")
+        assert_close(gradient, present(parameter.grad), kind="gradient", name=name)
+    assert_close(gradients["grid"], present(texture.grid.grad), kind="gradient", name="grid")
     for index, matrix in enumerate(texture.mlp.parameters()):
-        assert_close(gradients[f"mlp{index}"], matrix.grad, kind="gradient", name=f"mlp{index}")
+        assert_close(gradients[f"mlp{index}"], present(matrix.grad), kind="gradient", name=f"mlp{index}")
     position = torch.autograd.grad(camera.position, viewmat, gradients["position"])[0]
-    assert_close(gradients["viewmat"] + position, viewmat.grad, kind="gradient", name="viewmat")
+    assert_close(gradients["viewmat"] + position, present(viewmat.grad), kind="gradient", name="viewmat")
 
 
-def launch(tape: wp.Tape, kernel: wp.Kernel, shape: tuple[int, int], inputs: list[wp.array]) -> wp.array:
+def launch(tape: wp.Tape, kernel: wp.Kernel, shape: tuple[int, int], inputs: "list[wp.array[Any]]") -> "wp.array[Any]":
     y = wp.zeros(shape, dtype=REAL, device=inputs[0].device, requires_grad=True)
     with tape:
         wp.launch(kernel, shape, inputs=inputs, outputs=[y], device=y.device)
@@ -106,7 +87,7 @@ def warp_program(
 
     tape = wp.Tape()
     colors = passes.plain_colors(tape, x["sh"], x["means"], position, 3)
-    shape = [x[key] for key in ("means", "quats", "scales", "opacities", "gammas")]
+    shape = (x["means"], x["quats"], x["scales"], x["opacities"], x["gammas"])
     records, centers, limits = passes.project(tape, *shape, colors, view)
     lists = passes.intersect_tiles(*shape, centers, view, image)
     hits = passes.collect(tape, records, centers, limits, lists, image, HITS)

@@ -13,6 +13,7 @@ from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import depth_loss
 from nexwarp.train.trainer import Trainer
+from tests.narrowing import present, total
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -27,17 +28,21 @@ BIG = {"width": 61, "height": 45}
 WIDE = {"width": 300, "height": 200}
 
 
+def leaf(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.detach().clone().requires_grad_()
+
+
 class Passes:
     """The passes of one rendering, their inputs being leaves: project -> tiles -> collect, then a fixed random loss."""
 
     def __init__(self, scene: Scene, *, tile_size: int = 16, max_hits: int = 2, low_pass: bool = False) -> None:
         surfels, camera = make_surfels(scene), make_camera(scene)
-        shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
-        viewmat = camera.viewmat.detach().clone().requires_grad_()
-        shape = tuple(x.detach().clone().requires_grad_() for x in shape)
+        viewmat = leaf(camera.viewmat)
+        means, quats, scales = leaf(surfels.means), leaf(surfels.quats), leaf(surfels.scales)
+        shape = (means, quats, scales, leaf(surfels.opacities), leaf(surfels.gammas))
         self.pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
         self.low_pass = low_pass
-        sh = surfels.sh.detach().clone().requires_grad_()
+        sh = leaf(surfels.sh)
         self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
         self.projection = ops.project(*shape, self.colors, viewmat)
         self.tiles = ops.intersect_tiles(
@@ -52,12 +57,12 @@ class Passes:
 
     def gradients(self) -> dict[str, torch.Tensor]:
         generator = torch.Generator().manual_seed(2)
-        loss = sum(
+        loss = total(
             (x * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)).sum()
             for x in (self.hits.plain, self.hits.base, self.hits.depths, self.hits.weights, self.hits.alpha)
         )
         loss.backward()
-        return {name: leaf.grad for name, leaf in self.leaves.items()}
+        return {name: present(leaf.grad) for name, leaf in self.leaves.items()}
 
     def blended(self, errors: torch.Tensor) -> torch.Tensor:
         return ops.splat_error(
@@ -93,7 +98,7 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
         request.errors = errors
         results.append(passes.buffers() | {"blended": passes.blended(errors)})
         results[-1] |= {f"grad_{name}": grad for name, grad in passes.gradients().items()}
-        results[-1]["requested"] = request.sums_after_backward
+        results[-1]["requested"] = present(request.sums_after_backward)
     assert len(launch.chunks(4 * 3 * 16**2)) > 3  # there was something to share out
     assert_identical(results)
 
@@ -270,7 +275,7 @@ def test_many_points_in_one_pixel_add_up_in_order():
             torch.set_num_threads(threads)
             weights = torch.full(shape, 0.3, requires_grad=True)
             depth_loss(depths, weights, places, expected).backward()
-            results.append({"weights": weights.grad})
+            results.append({"weights": present(weights.grad)})
     finally:
         torch.set_num_threads(before)
     assert_identical(results)

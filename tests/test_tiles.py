@@ -1,6 +1,7 @@
 """Tile lists: what is listed, in which order, and what happens when there is no room for all of it."""
 
 import itertools
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from tests.tolerances import assert_close
 
 
 @pytest.fixture
-def one_thread() -> None:
+def one_thread() -> Iterator[None]:
     """Without room, a CPU's gradients go straight to surfels: atomics are none there, so only one thread may run."""
     threads = launch.get_num_threads()
     launch.set_num_threads(1)
@@ -25,7 +26,7 @@ def passes(scene: Scene, low_pass: bool, room: int | None) -> tuple[ops.Tiles, o
     surfels = nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS})
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    shape = [getattr(surfels, key) for key in SURFEL_KEYS[:5]]
+    shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, 3)
     projection = ops.project(*shape, colors, camera.viewmat)
     tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass, room=room)

@@ -1,0 +1,20 @@
+"""What a type checker cannot see by itself: an optional value that is there, a sum that is a tensor."""
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+import torch
+
+T = TypeVar("T")
+
+
+def present(value: T | None) -> T:
+    """Return `value`, which must not be None."""
+    assert value is not None
+    return value
+
+
+def total(terms: Iterable[torch.Tensor | None]) -> torch.Tensor:
+    """Sum one or more terms, none of which may be None."""
+    first, *rest = map(present, terms)
+    return sum(rest, first)
