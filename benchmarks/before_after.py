@@ -14,6 +14,7 @@ script imports nothing of nexwarp.
 
 import argparse
 import datetime
+import functools
 import hashlib
 import json
 import os
@@ -221,7 +222,7 @@ def compare(given: argparse.Namespace, checkouts: Sequence[Checkout]) -> dict[st
             given.out.write_text(json.dumps(report, indent=1) + "\n")
 
     for stage in filter(None, given.stages.split(",")):
-        part(stage, given.repeats, lambda c, stage=stage: stage_values(c, stage, cuda=cuda, data=given.data))
+        part(stage, given.repeats, functools.partial(stage_values, stage=stage, cuda=cuda, data=given.data))
     if given.demo:
         part("demo", given.repeats, measure_demo)
         print(f"the models' tensors are {'equal' if report['demo_tensors']['equal'] else 'DIFFERENT'}\n")

@@ -27,8 +27,8 @@ def run(options: Options) -> list[Measurement]:
     except ImportError as error:
         print(f"no peers: {error}", file=sys.stderr)
         return []
-    size = (20_000, 400, 259) if options.quick else ()
-    scene = garden(*size, data=options.data).to(options.device)
+    scene = garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
+    scene = scene.to(options.device)
     theirs = gsplat_2dgs(scene, options, gsplat)
     ours = stage(scene, options)
     names = ("forward", "forward + backward")

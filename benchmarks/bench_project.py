@@ -18,14 +18,12 @@ def run(options: Options) -> list[Measurement]:
 def plain_colors(scene: SurfelScene, options: Options) -> list[Measurement]:
     """SH of degree 3 of every surfel."""
     s = scene.surfels
-    leaves = [x.detach().clone().requires_grad_() for x in (s.sh0, s.shN, s.means)]
+    sh0, shN, means = leaves = [x.detach().clone().requires_grad_() for x in (s.sh0, s.shN, s.means)]
     position = scene.camera.position
-    colors = ops.plain_colors(leaves[:2], leaves[2], position, 3)
+    colors = ops.plain_colors((sh0, shN), means, position, 3)
     (signal,) = random_like((colors,))
     return [
-        options.time(
-            "plain colours, forward", lambda: ops.plain_colors(leaves[:2], leaves[2], position, 3), **scene.facts
-        ),
+        options.time("plain colours, forward", lambda: ops.plain_colors((sh0, shN), means, position, 3), **scene.facts),
         options.time(
             "plain colours, backward",
             lambda: torch.autograd.grad(colors, leaves, signal, retain_graph=True),

@@ -5,6 +5,7 @@ And one search for floaters, which training repeats once densification is over.
 
 import sys
 import time
+from collections.abc import Sequence
 
 import torch
 
@@ -88,7 +89,7 @@ def make_trainer(scene: SurfelScene, options: Options) -> Trainer:
 @torch.no_grad()
 def training_scene(scene: SurfelScene, options: Options) -> Scene:
     """Return a scene to train on: with the scene's photos, or else with renderings of its surfels alone."""
-    images = scene.photos
+    images: Sequence[torch.Tensor] = scene.photos
     cameras = scene.cameras
     if not images:
         moved = scene.to(options.device)

@@ -11,6 +11,7 @@ nexwarp's code (one target, in a process of its own; `pip install atheris`).
 """
 
 import argparse
+import ctypes
 import inspect
 import multiprocessing
 import os
@@ -18,7 +19,6 @@ import random
 import re
 import resource
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -29,6 +29,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from benchmarks.fuzz_inputs import Files, damage, strategy
 from benchmarks.fuzz_targets import TARGETS, FuzzTarget
@@ -67,7 +68,7 @@ class Result:
     inputs: int = 0
     loaded: int = 0
     seconds: float = 0.0
-    refusals: Counter = field(default_factory=Counter)
+    refusals: Counter[str] = field(default_factory=Counter)
     failures: list[Failure] = field(default_factory=list)
 
 
@@ -149,7 +150,7 @@ def _batch(
             break
         if time.monotonic() - now[1] > HANG:
             hung = True
-            os.kill(process.pid, signal.SIGKILL)
+            process.kill()
             while True:
                 try:
                     _collect(ours.recv(), target, result, folder, failed)
@@ -167,7 +168,7 @@ def _batch(
     return index + 1
 
 
-def _collect(message: tuple, target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
+def _collect(message: tuple[Any, ...], target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
     if message[0] == "failure":
         _, kind, index, detail, kept = message
         result.failures.append(_saved(Failure(target.name, index, kind, detail), Path(kept), failed))
@@ -196,7 +197,7 @@ def _work(
     valid: list[Files],
     folder: Path,
     report: Connection,
-    now: "multiprocessing.Array",
+    now: "ctypes.Array[ctypes.c_double]",
     first: int,
     last: int,
     left: float,
@@ -255,8 +256,6 @@ def _report(report: Connection, counts: Result) -> None:
 
 
 def _limit_memory() -> None:
-    import ctypes
-
     import torch
 
     # Torch's threads do not survive the fork; without this it may wait for them.

@@ -125,7 +125,7 @@ def _text(rng: random.Random, data: bytes) -> bytes:
     return b"\n".join(lines)
 
 
-def _places(value: Any, path: tuple = ()) -> list[tuple]:
+def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths to all values in JSON."""
     found = [path]
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -134,7 +134,7 @@ def _places(value: Any, path: tuple = ()) -> list[tuple]:
     return found
 
 
-def _replaced(value: Any, path: tuple, new: Any) -> Any:
+def _replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     if not path:
         return new
     copy = dict(value) if isinstance(value, dict) else list(value)

@@ -19,6 +19,7 @@ from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply, write_ply
+from nexwarp.io.json_files import Json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
@@ -211,7 +212,7 @@ def _model(folder: Path) -> list[Files]:
     texture = NeuralTexture(levels=2, table_size=16, width=8, hidden_layers=1, sh_degree=1)
     options = RenderOptions(background=(0.1, 0.2, 0.3), sh_degree=1)
     surfels, limits = _surfels(), DetailLimits(torch.ones(5), torch.full((5,), 2.0))
-    meta = {"near": 0.01, "scene_scale": 1.5, "preset": "default"}
+    meta: dict[str, Json] = {"near": 0.01, "scene_scale": 1.5, "preset": "default"}
     save_model(folder / "a", Model(surfels, texture, options=options, meta=meta))
     save_model(folder / "b", Model(surfels, texture, detail_limits=limits, options=options))
     load(folder / "a")  # the first load imports modules for seconds, which no input must pay for
@@ -263,16 +264,16 @@ def _images(folder: Path) -> list[Files]:
 
 def _read_images(folder: Path) -> None:
     """Read a file as a mask and as a photo; raise the first reader's error."""
-    outcomes = []
+    outcomes: list[ValueError | None] = []
     for read in (read_mask, read_image, read_transparent):
         try:
             read(folder / "mask")
             outcomes.append(None)
         except ValueError as error:
             outcomes.append(error)
-    for error in outcomes:
-        if error is not None:
-            raise error
+    for outcome in outcomes:
+        if outcome is not None:
+            raise outcome
 
 
 def _exr(folder: Path) -> list[Files]:

@@ -11,7 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -159,7 +159,7 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
     if not centred:
         fx, fy, cx, cy = camera.params
         shared |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    frames: dict[str, list] = {"train": [], "test": []}
+    frames: dict[str, list[dict[str, Any]]] = {"train": [], "test": []}
     for index, identity in enumerate(sorted(model.reg_image_ids(), key=lambda i: model.image(i).name)):
         image = model.image(identity)
         split = "train" if index % 8 else "test"

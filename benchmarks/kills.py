@@ -47,7 +47,11 @@ class Kill:
 
 
 def kill_and_resume(
-    start: Callable[[Path], subprocess.Popen], resume: Callable[[Path], int], run: Path, seconds: float, expected: bytes
+    start: Callable[[Path], subprocess.Popen[bytes]],
+    resume: Callable[[Path], int],
+    run: Path,
+    seconds: float,
+    expected: bytes,
 ) -> Kill:
     """Start a training, kill it so many seconds after its folder got its config, resume it and compare.
 
@@ -81,7 +85,7 @@ def kill_and_resume(
     return Kill(seconds, tuple(left), writing, same)
 
 
-def undisturbed(start: Callable[[Path], subprocess.Popen], run: Path) -> tuple[bytes, float]:
+def undisturbed(start: Callable[[Path], subprocess.Popen[bytes]], run: Path) -> tuple[bytes, float]:
     """Let a training run to its end.
 
     Returns:
@@ -126,7 +130,7 @@ class Kills:
         """Run, print, and return the exit code."""
         train = self.command()
 
-        def start(run: Path) -> subprocess.Popen:
+        def start(run: Path) -> subprocess.Popen[bytes]:
             return subprocess.Popen([*train, "--run", str(run)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
         def resume(run: Path) -> int:

@@ -9,6 +9,7 @@ tenth of the distance to 3 neighbours, L1 + 0.2 D-SSIM, opacity and scale regula
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ class Gaussians:
         unit: world units in one of the normalised frame.
     """
 
-    splats: dict[str, torch.nn.Parameter]
+    splats: torch.nn.ParameterDict
     centre: torch.Tensor
     unit: float
 
@@ -43,7 +44,7 @@ class Gaussians:
         """On disk as float32, 10^6 bytes."""
         return len(self.splats["means"]) * FLOATS * 4 / 1e6
 
-    def render(self, camera: Camera, degree: int = SH_DEGREE) -> tuple[torch.Tensor, dict]:
+    def render(self, camera: Camera, degree: int = SH_DEGREE) -> tuple[torch.Tensor, dict[str, Any]]:
         """Return an image (H, W, 3), not clamped, over black, and gsplat's intermediate results for its strategy."""
         from gsplat.rendering import rasterization
 

@@ -73,7 +73,7 @@ class Geometry:
         pinhole: the image plane.
     """
 
-    shape: tuple[torch.Tensor, ...]
+    shape: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
     colors: torch.Tensor
     viewmat: torch.Tensor
     pinhole: ops.Pinhole
@@ -101,10 +101,11 @@ class Geometry:
 def geometry(scene: SurfelScene) -> Geometry:
     """Activate a scene's surfels, and their colours as its camera sees them."""
     s, c = scene.surfels, scene.camera
-    shape = tuple(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas))
+    tensors = (s.means, s.quats, s.scales, s.opacities, s.gammas)
+    means, quats, scales, opacities, gammas = (x.clone().requires_grad_() for x in tensors)
     colors = ops.plain_colors((s.sh0, s.shN), s.means, c.position, 3).requires_grad_()
     pinhole = ops.Pinhole(c.K, c.width, c.height, c.near)
-    return Geometry(shape, colors, c.viewmat, pinhole)
+    return Geometry((means, quats, scales, opacities, gammas), colors, c.viewmat, pinhole)
 
 
 def entries(tiles: ops.Tiles) -> int:

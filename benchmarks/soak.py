@@ -210,7 +210,8 @@ class Soak:
             sample(step.iteration)
 
         trainer.run(observe)
-        return samples, *extremes
+        least, most = extremes
+        return samples, least, most
 
 
 def _sampler(samples: list[MemorySample], count: int, device: torch.device) -> Callable[[int], None]:

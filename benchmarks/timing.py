@@ -51,7 +51,7 @@ class Measurement:
     sizes: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     device_name: str = ""
-    commit: str = field(default_factory=lambda: commit())
+    commit: str = field(default_factory=lambda: current_commit())
     date: str = field(default_factory=lambda: datetime.datetime.now(datetime.timezone.utc).isoformat("T", "seconds"))
     versions: str = field(default_factory=lambda: f"torch {torch.__version__}, warp {wp.__version__}")
 
@@ -133,8 +133,13 @@ def figure(
 
 def ratio(name: str, top: Measurement, bottom: Measurement, note: str = "") -> Measurement:
     """Ratio of two medians of one run; its spread is that of `top` alone, over the median of `bottom`."""
-    over = {key: getattr(top, key) / bottom.median for key in ("median", "p10", "p90")}
-    kept = {"scene": top.scene, "sizes": top.sizes, "repeats": top.repeats, "device_name": top.device_name}
+    over: dict[str, Any] = {key: getattr(top, key) / bottom.median for key in ("median", "p10", "p90")}
+    kept: dict[str, Any] = {
+        "scene": top.scene,
+        "sizes": top.sizes,
+        "repeats": top.repeats,
+        "device_name": top.device_name,
+    }
     return Measurement(name=name, device=top.device, unit="x", note=note, **over, **kept)
 
 
@@ -187,7 +192,7 @@ def device_name(kind: str) -> str:
 
 
 @functools.cache
-def commit() -> str:
+def current_commit() -> str:
     """Commit of the working tree, with a + when it was changed; "unknown" without git."""
     try:
         git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10)

@@ -147,7 +147,7 @@ def differences(results: Results, against: str = DEFAULT.name) -> list[dict[str,
     found = []
     for (size, iterations), rows in sorted(groups.items()):
         base = rows.pop(against, {})
-        shown = []
+        shown: list[dict[str, Any]] = []
         for name, scenes in rows.items():
             both = [scene for scene in scenes if scene in base]
             if len(both) < 2:
@@ -167,7 +167,8 @@ def _difference(one: list[dict[str, Any]], two: list[dict[str, Any]], metric: st
     pairs = {result["seed"]: result for result in two}
     if all(_share_start(result, pairs.get(result["seed"])) for result in one):
         values = [(result.get(metric), pairs[result["seed"]].get(metric)) for result in one]
-        spread = None if any(None in pair for pair in values) else _spread(a - b for a, b in values)
+        known = [a - b for a, b in values if a is not None and b is not None]
+        spread = _spread(known) if len(known) == len(values) else None
         return spread and (spread[0], None if spread[1] is None else spread[1] ** 2 / len(one))
     mine, other = (_spread(result.get(metric) for result in each) for each in (one, two))
     if mine is None or other is None:
