@@ -23,7 +23,7 @@ def make_model(count: int = 24) -> Model:
     return Model(make_surfels(random_scene(count)), make_texture(), options=OPTIONS, meta=META)
 
 
-def rewrite(file: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], None]) -> None:
+def rewrite(file: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], object]) -> None:
     """Let `change` alter tensors and metadata of a saved model."""
     with safe_open(file, "pt") as opened:
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}

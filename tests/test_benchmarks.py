@@ -23,6 +23,7 @@ from nexwarp.model import model as model_module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.ops import Pinhole
+from nexwarp.render import render
 from nexwarp.representation.detail_limits import NEVER
 from tests.tolerances import assert_close
 
@@ -34,7 +35,7 @@ def small_scene() -> SurfelScene:
 
 
 def test_timer_finds_the_median_of_a_known_sleep() -> None:
-    calls = []
+    calls: list[None] = []
 
     def nap() -> None:
         calls.append(None)
@@ -58,7 +59,7 @@ def test_ratio_divides_medians() -> None:
 
 
 def test_table_compares_gpu_and_cpu() -> None:
-    facts = {"name": "walk", "scene": "cloud", "p10": 1.0, "p90": 1.0}
+    facts: dict[str, Any] = {"name": "walk", "scene": "cloud", "p10": 1.0, "p90": 1.0}
     results = [Measurement(device=d, median=m, **facts) for d, m in (("cuda", 2.0), ("cpu", 50.0))]
     assert "times as fast" in table(results)
     assert table(results).splitlines()[-1].split() == ["walk", "cloud", "50", "2", "25"]
@@ -160,7 +161,6 @@ def test_frames_of_the_trained_scene_are_timed_with_its_options(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, seen = fox(run_folder), []
-    render = model_module.render
 
     def note(surfels: Surfels, texture: NeuralTexture, camera: Camera, *options: Any, **others: Any) -> Any:
         seen.append((texture, options[:5], others["detail_limits"]))

@@ -18,7 +18,9 @@ BACKGROUND = (0.3, 0.9, 0.1)
 PASSES = [f.name for f in fields(Buffers) if f.name not in ("camera", "background")]
 
 
-def make(count: int = 24, max_hits: int = 2, textured: bool = True, device: torch.device | str = "cpu") -> Buffers:
+def make(
+    count: int = 24, max_hits: int = 2, textured: bool | str = True, device: torch.device | str = "cpu"
+) -> Buffers:
     scene = random_scene(count, device=device)
     texture = make_texture(device=device, residual=textured == "residual") if textured else None
     surfels, camera = make_surfels(scene), make_camera(scene)
@@ -157,7 +159,8 @@ def test_nothing_in_view(tmp_path: Path) -> None:
     surfels = nw.Surfels.from_activated(
         *(scene[k][:0] for k in ("means", "quats", "scales", "opacities", "gammas", "sh"))
     )
-    buffers = render_buffers(nw.Model(surfels, make_texture()), make_camera(scene), background=BACKGROUND)
+    options = nw.RenderOptions(background=BACKGROUND)
+    buffers = render_buffers(nw.Model(surfels, make_texture(), options=options), make_camera(scene))
     save_buffers(tmp_path / "a.exr", buffers)
     after = load_buffers(tmp_path / "a.exr")
     assert torch.allclose(after.image, torch.tensor(BACKGROUND).expand_as(after.image))

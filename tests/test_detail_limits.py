@@ -52,6 +52,7 @@ def test_what_training_never_textured_keeps_its_plain_colour(device: torch.devic
     assert_alike(out, draw(scene))
     out.image.sum().backward()
     for name, parameter in surfels.named_parameters():
+        assert parameter.grad is not None
         assert_finite(parameter.grad, name)
 
 

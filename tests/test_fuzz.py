@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,13 +35,13 @@ print(json.dumps(results))
 """
 
 
-def fuzzed(folder: Path) -> subprocess.CompletedProcess:
+def fuzzed(folder: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", PROGRAM, str(folder), json.dumps(DRIVERS)]
     return subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
 
 
 @pytest.fixture
-def results(background_job: subprocess.CompletedProcess) -> dict:
+def results(background_job: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     pytest.importorskip("hypothesis")
     assert background_job.returncode == 0, background_job.stderr
     return json.loads(background_job.stdout.splitlines()[-1])
@@ -48,7 +49,7 @@ def results(background_job: subprocess.CompletedProcess) -> dict:
 
 @pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", TARGETS)
-def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
+def test_readers_load_or_refuse_in_one_line(results: dict[str, Any], name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
     assert result["failures"] == [], "\n".join(result["failures"])
     assert result["inputs"] == inputs
@@ -57,7 +58,7 @@ def test_readers_load_or_refuse_in_one_line(results: dict, name: str) -> None:
 
 @pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", DRAWN)
-def test_readers_stand_what_hypothesis_draws(results: dict, name: str) -> None:
+def test_readers_stand_what_hypothesis_draws(results: dict[str, Any], name: str) -> None:
     result = results[f"hypothesis {name}"]
     assert result["failures"] == [], "\n".join(result["failures"])
     assert result["inputs"] == DRIVERS["hypothesis"][0]

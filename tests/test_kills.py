@@ -45,7 +45,7 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path, count):
     command = [sys.executable, "-c", "from tests.test_kills import main; main()", "train", str(scene), *FLAGS]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
 
-    def start(run: Path) -> subprocess.Popen:
+    def start(run: Path) -> subprocess.Popen[bytes]:
         silent = subprocess.DEVNULL
         return subprocess.Popen([*command, "--run", str(run)], env=environment, stdout=silent, stderr=silent)
 
@@ -62,7 +62,7 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path, count):
 def test_a_kill_is_waited_for(tmp_path):
     """A training that ends before its moment is an error only when it began nothing."""
 
-    def start(run: Path) -> subprocess.Popen:
+    def start(run: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
 
     begun = time.perf_counter()

@@ -93,7 +93,7 @@ def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flag
     save_cameras(run / "cameras.json", {"train": {}, "test": dict(zip(names, cameras, strict=True))})
     assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 0
     model = nw.load(run)
-    changes = {"exposure": "mean"} if "mean" in flags else {}
+    changes: dict[str, Any] = {"exposure": "mean"} if "mean" in flags else {}
     for name, camera in zip(names, cameras, strict=True):
         with torch.no_grad():
             out = model.render(camera, **changes)
@@ -114,7 +114,7 @@ def test_options_take_the_exposure_and_the_limits_away(
     assert_same(model.render(camera), pure(model, camera, exposures=exposures, detail_limits=limits))
     assert_same(model.render(camera, exposure="mean"), pure(model, camera, detail_limits=limits))
     assert_same(model.render(camera, detail_limits=False), pure(model, camera, exposures=exposures))
-    bare = {"exposure": "mean", "detail_limits": False}
+    bare: dict[str, Any] = {"exposure": "mean", "detail_limits": False}
     assert_same(model.render(camera, **bare), pure(model, camera))
     images = [model.render(camera, **{key: bare[key] for key in keys}).image for keys in ((), *zip(bare), tuple(bare))]
     for i, one in enumerate(images):
@@ -263,9 +263,10 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
                 exposures=model.exposures,
                 detail_limits=model.detail_limits,
             )
-        leaves = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
+        leaves: dict[str, torch.Tensor] = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
         leaves |= dict(model.surfels.named_parameters())
-        found.append(dict(zip(leaves, torch.autograd.grad(out.image.square().sum(), leaves.values()), strict=True)))
+        gradients = torch.autograd.grad(out.image.square().sum(), tuple(leaves.values()))
+        found.append(dict(zip(leaves, gradients, strict=True)))
     for name, gradient in found[0].items():
         assert_finite(gradient, name)
         assert gradient.abs().max() > 0, name
@@ -383,6 +384,7 @@ def test_changes_that_are_no_options_are_named() -> None:
     for error, changes in bad:
         with pytest.raises(error, match=rf"^{next(iter(changes))}: expected"):
             model.render(camera, **changes)
-    for other in ("camera", None, camera.viewmat, ["camera"]):
+    others: list[Any] = ["camera", None, camera.viewmat, ["camera"]]
+    for other in others:
         with pytest.raises(TypeError, match=r"^camera: expected a nexwarp\.Camera"):
             model.render(other)

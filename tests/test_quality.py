@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,13 +19,14 @@ from benchmarks.quality.curve import curves_of
 from benchmarks.quality.jobs import SCENES, TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import drop_unfinished, read_results
 from benchmarks.quality.rows import DEFAULT, GSPLAT, ROWS, Row
-from benchmarks.quality.run import METRIC_FUNCTIONS, config_name, file_name, run_job
+from benchmarks.quality.run import config_name, file_name, run_job
 from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, moved
 from benchmarks.quality.tables import differences, markdown, summary
 from benchmarks.timing import ROOT
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
+from nexwarp.run import evaluate
 from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
@@ -78,11 +80,12 @@ def test_moved_scenes_look_the_same(scene: Scene) -> None:
         assert (pixels - again).abs().max() < 0.01
         assert_close(scaled / 100, depths, kind="gradient", name="depths")
         assert two.camera.near == pytest.approx(100 * one.camera.near)
+        assert one.points is not None and two.points is not None
         seen, _ = two.camera.project(two.points)
         assert (seen - one.camera.project(one.points)[0]).abs().max() < 0.01
 
 
-def result(row: str, seed: int, **figures: float | str) -> dict:
+def result(row: str, seed: int, **figures: Any) -> dict[str, Any]:
     job = dataclasses.asdict(TrainingJob("fox", "", row, 40, seed, 100))
     figures = {"psnr": 30.0, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0, "seconds": 5.0} | figures
     return job | {"settings": {}, "commit": "abc", "jobs": 1, "peak_mib": 100} | figures
@@ -179,8 +182,8 @@ def test_differences_are_means_of_scenes_with_the_error_of_their_seeds() -> None
     figures = "-0.75 ± 0.90 | +0.0000 ± 0.0000 | +0.1000 ± 0.0500 |  | +0.50 ± 0.00"
     assert f"| no gamma | {figures} | fox, kitchen |" in text
     (group,) = differences(results, "no gamma")
-    figures = {row["row"]: row["psnr"] for row in group["rows"]}
-    assert figures == {"K = 3": (2.25, None), "default": (-second["psnr"][0], second["psnr"][1])}
+    found = {row["row"]: row["psnr"] for row in group["rows"]}
+    assert found == {"K = 3": (2.25, None), "default": (-second["psnr"][0], second["psnr"][1])}
     text = markdown(results, "no gamma")
     assert "## Mean of the scenes less that of no gamma, 40 primitives, 100 iterations" in text
     assert "| default | +0.75 ± 0.90 |" in text
@@ -237,7 +240,7 @@ def test_the_table_as_json_has_the_same_figures(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "table.md").exists()
 
 
-def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     threads = torch.get_num_threads()
     settings = {"texture.levels": 4, "texture.table_size": 1024}
     command = ["train", "--row", f"mine:default:{json.dumps(settings)}", "--scenes", "tiny", "--seeds", "0"]
@@ -255,7 +258,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     (model,) = (tmp_path / "models").glob("*/model.safetensors")
     assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
     trained = nw.load(model)
-    assert trained.texture.residual
+    assert trained.texture is not None and trained.texture.residual
     assert found["quarter_psnr"] == pytest.approx(quarter_psnr(trained, folder / "tiny"), abs=0.05)
     assert main(command) == 0
     assert "0 of 1 trainings to do" in capsys.readouterr().out
@@ -330,11 +333,11 @@ def test_a_training_from_a_shared_start_is_the_training(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit: its surfels, its texture and its figures."""
-    monkeypatch.setitem(METRIC_FUNCTIONS, "lpips", lambda *_: None)  # it warns where its weights are not
+    monkeypatch.setitem(evaluate.METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
-    differ = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
+    differ: dict[str, dict[str, Any]] = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
     rows = {name: settings | small for name, settings in differ.items()}
     command = ["train", "--scenes", "tiny", "--seeds", "1", "--size", "60", "--iterations", "12", "--data", str(folder)]
     command += ["--out", str(out), "--models", str(models)]
@@ -343,7 +346,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     assert main(command) == 0
     found = read_results([out])
     assert {job.row for job in found} == set(rows)
-    texture = []
+    textures = []
     for job, result in found.items():
         assert result["together"] == {"rows": [*rows], "iterations": 9}
         row = Row(job.row, settings=rows[job.row])
@@ -351,11 +354,12 @@ def test_a_training_from_a_shared_start_is_the_training(
         assert alone["views"] == result["views"] and "together" not in alone
         one, other = (nw.load(path / file_name(job)) for path in (models, tmp_path / "alone"))
         assert one.meta == other.meta and one.options.max_hits == rows[job.row].get("max_hits", 2)
+        assert one.texture is not None and other.texture is not None
         for part, same in ((one.surfels, other.surfels), (one.texture, other.texture)):
             state = same.state_dict()
             assert all(torch.equal(tensor, state[name]) for name, tensor in part.state_dict().items())
-        texture.append(one.texture.grid)
-    assert not torch.equal(*texture[:2])
+        textures.append(one.texture.grid)
+    assert not torch.equal(*textures[:2])
     torch.set_num_threads(threads)
 
 
@@ -365,6 +369,7 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     command += ["--seeds", "0,1", "--size", "60", "--iterations", "1000000", "--data", str(folder)]
     command += ["--out", str(tmp_path / "out.jsonl")]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
         assert process.stdout.readline() == b"2 of 2 trainings to do\n"
         time.sleep(3)
         process.send_signal(how)  # to this process alone
@@ -426,10 +431,10 @@ A_MEAN = r"\d+\.\d\d ± \d\.\d\d, 0\.\d{4}, 0\.\d{4}"
 A_DIFFERENCE = r"[+-]\d+\.\d\d ± \d\.\d\d, [+-]0\.\d{4} ± 0\.\d{4}, [+-]0\.\d{4} ± 0\.\d{4}"
 
 
-def kept(name: str) -> dict[str, set[tuple]]:
+def kept(name: str) -> dict[str, set[tuple[str | int, ...]]]:
     """Of which trainings a figure of a document is: (scene, variant, size, row), or (row, against) of a difference."""
     results = read_results([ROOT / "benchmarks" / "results" / f"{name}.jsonl"])
-    found: dict[str, set[tuple]] = {}
+    found: dict[str, set[tuple[str | int, ...]]] = {}
     for row in summary(results):
         (figure, spread), (similarity, _), (error, _) = (row[metric] for metric in ("psnr", "ssim", "flip"))
         if spread is not None:

@@ -77,8 +77,7 @@ def test_a_cpu_repeats_itself(tmp_path, capsys):
     """Really trained, twice, by `nexwarp train`."""
     scene = write_demo(tmp_path / "scene", width=32, height=24, views=9, points=100)
     small = "--set texture.levels=2 --set texture.table_size=64 --set texture.width=8"
-    options = {"scene": str(scene), "device": "cpu", "iterations": 3, "max_surfels": 50}
-    assert Repeat(**options, extra=small)() == 0
+    assert Repeat(scene=str(scene), device="cpu", iterations=3, max_surfels=50, extra=small)() == 0
     out = capsys.readouterr().out
     assert "2 runs, 1 different model: identical bytes" in out and "| 2 |" in out
     assert out.count(" dB | ") == 2

@@ -87,7 +87,7 @@ def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsy
     clean = 'echo "========= RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)"'
     path = stub(tmp_path, f'case "$2" in memcheck) {found};; *) {clean};; esac')
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setattr(sanitize.sys, "executable", "true")  # which does not even render
+    monkeypatch.setattr(sys, "executable", "true")  # which does not even render
     assert find_tool() == path
     assert Sanitize(tool="memcheck,racecheck")() == 1
     out = capsys.readouterr().out

@@ -45,7 +45,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def refused(capsys: pytest.CaptureFixture, arguments: list[str], *words: str) -> None:
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
     """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
     capsys.readouterr()
     assert cli.main(arguments) == 2

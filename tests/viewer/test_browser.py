@@ -70,14 +70,14 @@ def test_in_a_browser(model, tmp_path):
         page.mouse.move(320, 430, steps=5)
         page.mouse.up()
         settled()
+        assert session.viewpoint is not None
         assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
         page.get_by_role("tab", name="Record").click()
         page.get_by_role("button", name="Add this view").click()
         wait_for(lambda: len(session.keyframes) == 1)
         session.jump("train/4.png")
-        wait_for(
-            lambda: np.allclose(session.viewpoint.pose, camera_to_world(session.cameras["train/4.png"]), atol=1e-3)
-        )
+        pose = camera_to_world(session.cameras["train/4.png"])
+        wait_for(lambda: session.viewpoint is not None and np.allclose(session.viewpoint.pose, pose, atol=1e-3))
         page.get_by_role("button", name="Add this view").click()
         wait_for(lambda: len(session.keyframes) == 2)
         with page.expect_download() as path:
