@@ -10,7 +10,7 @@ gains from test photos. Runs on a CPU; nothing is trained.
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -29,7 +29,7 @@ def gains_of(views: list[View]) -> tuple[torch.Tensor, tuple[float, float, float
     return torch.from_numpy(log_gains), falloff
 
 
-def compare(train: list[View], test: list[View]) -> dict[str, torch.Tensor | float]:
+def compare(train: list[View], test: list[View]) -> dict[str, Any]:
     """Return the spread of the training photos' gains, and the root mean square errors of the test views' gains.
 
     Returns:

@@ -11,6 +11,7 @@ nexwarp's code (one target, in a process of its own; `pip install atheris`).
 """
 
 import argparse
+import ctypes
 import inspect
 import multiprocessing
 import os
@@ -255,8 +256,6 @@ def _report(report: Connection, counts: Result) -> None:
 
 
 def _limit_memory() -> None:
-    import ctypes
-
     import torch
 
     # Torch's threads do not survive the fork; without this it may wait for them.

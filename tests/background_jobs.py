@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+Work = tuple[Any, ...]  # a function and its arguments after the folder
+
 # So many tests that the other ones take longer than the work, and wait for most kernels.
 MANY = 500
 
@@ -36,9 +38,9 @@ class BackgroundJobs:
 
     def __init__(self, pool: ThreadPoolExecutor, folder: Callable[[str], Path]) -> None:
         self.pool, self.folder = pool, folder
-        self._begun: dict[tuple, Future] = {}
+        self._begun: dict[Work, Future[Any]] = {}
 
-    def begin(self, works: Iterable[tuple]) -> None:
+    def begin(self, works: Iterable[Work]) -> None:
         """Put work in line.
 
         Folders are made at once, in this thread: later ones may meet what a test has done to the file system's calls.
@@ -47,7 +49,7 @@ class BackgroundJobs:
             if work not in self._begun:
                 self._begun[work] = self.pool.submit(self._do, work, self.folder(work[0].__name__))
 
-    def result(self, work: tuple) -> Any:
+    def result(self, work: Work) -> Any:
         """Wait for work; what is still in line, or never was, is done here and now."""
         future = self._begun.get(work)
         if future is None or future.cancel():
@@ -58,7 +60,7 @@ class BackgroundJobs:
                 future.set_exception(error)
         return future.result()
 
-    def _do(self, work: tuple, folder: Path) -> Any:
+    def _do(self, work: Work, folder: Path) -> Any:
         function, *arguments = work
         return function(folder, *arguments)
 
@@ -74,8 +76,8 @@ def begun(items: list[pytest.Item], folder: Callable[[str], Path], first: list[s
     ahead = None
     with ThreadPoolExecutor(1 if many else 2) as pool:
         if many:
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            ahead = subprocess.Popen(first, cwd=Path(__file__).parents[1], **quiet)
+            quiet = subprocess.DEVNULL
+            ahead = subprocess.Popen(first, cwd=Path(__file__).parents[1], stdout=quiet, stderr=quiet)
             pool.submit(ahead.wait)
         beside = BackgroundJobs(pool, folder)
         beside.begin(work for item in items if (work := key(item)))

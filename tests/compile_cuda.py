@@ -23,8 +23,16 @@ def usual() -> Iterator[wp.Kernel]:
 
 def one_run() -> Iterator[wp.Kernel]:
     """Yield those of a default run."""
-    few = {"degrees": (3,), "features": (2, 4), "clamps": (False,), "low_passes": (False,), "ssim_lanes": (1,)}
-    yield from thread_kernels(wp.float32, wp.float16, TILE_SIZE, **few)
+    yield from thread_kernels(
+        wp.float32,
+        wp.float16,
+        TILE_SIZE,
+        degrees=(3,),
+        features=(2, 4),
+        clamps=(False,),
+        low_passes=(False,),
+        ssim_lengths=(1,),
+    )
     yield from walk_kernels(wp.float32, TILE_SIZE, (2,), low_passes=(False,))
 
 

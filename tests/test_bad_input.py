@@ -71,7 +71,7 @@ BAD_CAMERAS = [
 
 @pytest.mark.parametrize(("argument", "error", "value"), BAD_CAMERAS)
 def test_bad_camera(argument: str, error: type[Exception], value: Any) -> None:
-    good = {"viewmat": torch.eye(4), "K": K, "width": 16, "height": 16, "near": 0.01}
+    good: dict[str, Any] = {"viewmat": torch.eye(4), "K": K, "width": 16, "height": 16, "near": 0.01}
     nw.Camera(**good)
     assert_refused(error, argument, nw.Camera, **(good | {argument: value}))
 
@@ -178,7 +178,8 @@ BAD_TEXTURES = [
 
 @pytest.mark.parametrize(("argument", "error", "value"), BAD_TEXTURES)
 def test_bad_texture(argument: str, error: type[Exception], value: Any) -> None:
-    good = {"levels": 2, "table_size": 2**6, "features": 2, "min_resolution": 2.0, "max_resolution": 8.0}
+    good: dict[str, Any] = {"levels": 2, "table_size": 2**6, "features": 2}
+    good |= {"min_resolution": 2.0, "max_resolution": 8.0}
     nw.NeuralTexture(**good)
     assert_refused(error, argument, nw.NeuralTexture, **(good | {argument: value}))
 

@@ -13,7 +13,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from nexwarp.model.model_file import write_atomically
+from nexwarp.io.files import write_atomically
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
 from tests.model_file_support import refused
@@ -175,7 +175,8 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
 @pytest.mark.parametrize("before", [0, 1, 2, 3])
 def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, before):
     """Whatever number of saves came before; and the next save, killed at any moment too, starts from what is left."""
-    moment, calls = 0, []
+    moment = 0
+    calls: list[str] = []
     while moment <= len(calls):
         run = tmp_path / f"run{moment}"
         run.mkdir()

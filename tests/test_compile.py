@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProcess:
+def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(folder)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
@@ -29,7 +29,7 @@ def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProces
         ),
     ],
 )
-def test_kernels_compile_for_cuda(arch: int, least: int, background_job: subprocess.CompletedProcess) -> None:
+def test_kernels_compile_for_cuda(arch: int, least: int, background_job: subprocess.CompletedProcess[str]) -> None:
     assert background_job.returncode == 0, background_job.stderr
     sizes = json.loads(background_job.stdout.splitlines()[-1])
     assert len(sizes) >= least

@@ -197,7 +197,12 @@ def test_a_crash_leaves_nothing(tmp_path, monkeypatch):
 
 def test_demo_folder_is_made_once_where_the_user_says(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(demo_module, "write_demo", lambda folder: (calls.append(folder), folder.mkdir(parents=True)))
+
+    def write(folder):
+        calls.append(folder)
+        folder.mkdir(parents=True)
+
+    monkeypatch.setattr(demo_module, "write_demo", write)
     monkeypatch.setenv("NEXWARP_CACHE", str(tmp_path / "one"))
     assert demo_folder() == demo_folder() == calls[0] and calls[0].parent == tmp_path / "one" and len(calls) == 1
     monkeypatch.delenv("NEXWARP_CACHE")

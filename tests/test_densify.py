@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -30,8 +31,8 @@ def make(count: int = 40, seed: int = 0, opacity: float | None = None) -> tuple[
 
 def step(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> None:
     """One Adam step on a loss whose gradient differs in every element."""
-    loss = sum((p * torch.linspace(0.5, 1.5, p.numel()).view(p.shape)).sum() for p in surfels.parameters())
-    loss.backward()
+    losses = [(p * torch.linspace(0.5, 1.5, p.numel()).view(p.shape)).sum() for p in surfels.parameters()]
+    torch.stack(losses).sum().backward()
     optimizer.step()
     optimizer.zero_grad()
 
@@ -53,7 +54,7 @@ def sharp_kernel(surfels: nw.Surfels, row: int, points: torch.Tensor, gamma: flo
     return torch.exp(-(u.abs() ** (2 * gamma) + v.abs() ** (2 * gamma)) / 2)
 
 
-def densifier_of(surfels: nw.Surfels, budget: int = 10_000, **changes: object) -> Densifier:
+def densifier_of(surfels: nw.Surfels, budget: int = 10_000, **changes: Any) -> Densifier:
     return Densifier(DensifyConfig(**changes), surfels, budget)
 
 

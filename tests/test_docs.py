@@ -152,7 +152,7 @@ def field_docs(owner: type) -> dict[str, str]:
     return docs
 
 
-def options(command: type) -> Iterator[tuple[str, str, str]]:
+def options(command: Any) -> Iterator[tuple[str, str, str]]:
     """What a command takes: how it is written, its default, what it means."""
     docs, hints = field_docs(command), get_type_hints(command, include_extras=True)
     for f in dataclasses.fields(command):

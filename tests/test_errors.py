@@ -12,6 +12,7 @@ import torch
 import nexwarp as nw
 from nexwarp import errors
 from nexwarp.cli import main as cli
+from nexwarp.cli.commands import Info
 from nexwarp.cli.device import pick_device
 from nexwarp.errors import (
     CheckpointError,
@@ -95,7 +96,7 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(cli.Info, "__call__", fail)
+    monkeypatch.setattr(Info, "__call__", fail)
 
 
 @pytest.mark.parametrize(

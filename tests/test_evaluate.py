@@ -3,6 +3,7 @@
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,8 @@ def test_figures_are_those_of_the_written_pictures(tmp_path, model):
         figures = result["views"][view.name]
         assert figures["psnr"] == pytest.approx(psnr_of(picture, view.image), abs=1e-5)
         assert figures["ssim"] == pytest.approx(ssim(picture, view.image), abs=1e-9)
-    first, second = (result["views"][name] for name in NAMES)
+    each: list[Any] = [result["views"][name] for name in NAMES]
+    first, second = each
     assert first["psnr"] > second["psnr"] + 5 and first["ssim"] > second["ssim"]
     for key in ("psnr", "ssim"):
         assert result[key] == pytest.approx((first[key] + second[key]) / 2, abs=1e-12)

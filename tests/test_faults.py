@@ -66,7 +66,7 @@ def check_whole(folder: Path) -> None:
     whole_checkpoints(folder)
 
 
-def one_line(capsys: pytest.CaptureFixture, *words: str) -> None:
+def one_line(capsys: pytest.CaptureFixture[str], *words: str) -> None:
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
     assert all(word in err for word in words), err
@@ -99,6 +99,7 @@ def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, cap
         capsys.readouterr()
         with failing(disk):
             code = cli.main(command)
+        assert disk.fatal is not None
         where = disk.requests[disk.fatal]
         assert code == 2, where
         one_line(capsys, os.strerror(disk.number))

@@ -100,7 +100,12 @@ def test_the_size_of_the_pictures_does_not_matter(height: int) -> None:
 def test_sixty_views_between_are_looked_at_or_one_for_each_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last time it is 240."""
     looks = []
-    monkeypatch.setattr(module, "between", lambda cameras, *_: looks.append(len(cameras)) or cameras)
+
+    def look(cameras: list[nw.Camera], *_: object) -> list[nw.Camera]:
+        looks.append(len(cameras))
+        return cameras
+
+    monkeypatch.setattr(module, "between", look)
     for count in (1, 40, 130):
         looks.clear()
         found(facing([NEAR], torch.device("cpu")), [looking_ahead(-9.0)] * count, [1.0] * count)

@@ -18,6 +18,7 @@ from nexwarp.train import views as training_views
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.settings import with_settings
+from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from tests.test_trainer import assert_same_state
 
@@ -211,14 +212,15 @@ def test_a_capture_that_fails_leaves_training_as_it_is(
 def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: Scene) -> None:
     launched = trained(tiny_scene, cuda_graphs=False)
     trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
-    optimize, failed = trainer._optimize, []
+    optimize = trainer._optimize
+    failed: list[int] = []
 
-    def failing(view: Any) -> Any:
+    def failing(target: Target) -> step_graphs.StepResult:
         if trainer.iteration == 31 and not failed:  # the first step after a round
             assert graphs_of(trainer) > 0
             failed.append(1)
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-        return optimize(view)
+        return optimize(target)
 
     trainer._optimize = failing  # type: ignore[method-assign]
     trainer.run()

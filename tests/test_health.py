@@ -19,6 +19,8 @@ from nexwarp.train.checkpoint import save_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.health import LossLog, describe, needed_memory, not_finite
+from nexwarp.train.schedules import make_optimizer
+from nexwarp.train.step_losses import step_losses
 from nexwarp.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -50,6 +52,7 @@ def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
         kind, _, name = where.rpartition(" ")
         parameter = dict(run._named_parameters())[name]
         target = parameter.grad if kind == "gradient" else parameter.data
+        assert target is not None
         target.view(-1)[3] = value
 
     return spoil
@@ -57,7 +60,7 @@ def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
 
 def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Trainer], None]) -> list[int]:
     """Let a fault strike before Adam's step of some iterations, each time they come; returns those it struck."""
-    struck, made = [], trainer.make_optimizer
+    struck: list[int] = []
     trainers: list[Trainer] = []
     init = Trainer.__init__
 
@@ -71,7 +74,7 @@ def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Tra
             spoil(trainers[-1])
 
     def make(*args: Any) -> torch.optim.Optimizer:
-        optimizer = made(*args)
+        optimizer = make_optimizer(*args)
         optimizer.register_step_pre_hook(strike)
         return optimizer
 
@@ -80,7 +83,7 @@ def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Tra
     return struck
 
 
-class Once(set):
+class Once(set[int]):
     """Iterations that are met once each."""
 
     def __contains__(self, iteration: object) -> bool:
@@ -125,7 +128,8 @@ def test_losses_are_named_by_the_first_that_is_bad():
 def test_a_fault_is_found_named_and_gone_back_from(scene, monkeypatch, where, value):
     """Struck once at iteration 13: told by 16, the next look; back at 12, the last good state, with half the rates."""
     struck = inject(monkeypatch, Once({13}), poison(where, value))
-    run, told, seen = Trainer(scene, SMALL, "cpu"), [], []
+    told: list[str] = []
+    run, seen = Trainer(scene, SMALL, "cpu"), []
     run.run(lambda step: seen.append((step.iteration, run.optimizer.param_groups[0]["lr"])), told.append)
     assert struck == [13] and len(told) == 1
     assert where.split()[1] in told[0] and "going back to iteration 12 with half the learning rates" in told[0]
@@ -138,11 +142,11 @@ def test_a_fault_is_found_named_and_gone_back_from(scene, monkeypatch, where, va
 
 
 def test_a_bad_loss_is_named_with_its_iteration(scene, monkeypatch):
-    losses = trainer.step_losses
-    run, told = Trainer(scene, SMALL, "cpu"), []
+    run = Trainer(scene, SMALL, "cpu")
+    told: list[str] = []
 
     def spoilt(*args: Any, **options: Any) -> dict[str, torch.Tensor]:
-        terms = losses(*args, **options)
+        terms = step_losses(*args, **options)
         if run.iteration == 14 and run.rate_factor == 1.0:
             terms["dssim"] = terms["dssim"] * NAN
         return terms
@@ -165,7 +169,8 @@ def test_the_first_tensor_is_named_although_others_follow(scene, monkeypatch, wh
 
 def test_what_happens_again_is_given_up_with_a_report(scene, monkeypatch):
     struck = inject(monkeypatch, {22}, poison("gradient surfels.log_scales"))
-    run, told = Trainer(scene, SMALL, "cpu"), []
+    run = Trainer(scene, SMALL, "cpu")
+    told: list[str] = []
     with pytest.raises(DivergedError, match="halved its learning rates before, so training gives up") as caught:
         run.run(warn=told.append)
     assert isinstance(caught.value, (NexwarpError, RuntimeError)) and "\n" not in str(caught.value)

@@ -99,7 +99,9 @@ def test_masks_take_the_nearest_pixel_and_end_with_the_photo():
     wide.K[:2, :2] *= 0.5  # twice the field of view: three quarters lie outside the photo
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, : WIDTH // 2] = True
-    out = Maps().get(here, wide, None).mask(mask).numpy().reshape(-1)
+    mapped = Maps().get(here, wide, None).mask(mask)
+    assert mapped is not None
+    out = mapped.numpy().reshape(-1)
     pixels = here.project(rays_of(wide))
     with np.errstate(invalid="ignore"):
         inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1)
@@ -122,8 +124,8 @@ def test_the_faces_of_a_panorama_show_their_directions():
     target = sphere.undistorted()
     assert target.width == target.height == round(size[0] / np.pi)
     maps, covered = Maps(), np.zeros(3)
-    for face, rotation in FACES.items():
-        rotation = np.array(rotation, float)
+    for face, rows in FACES.items():
+        rotation = np.array(rows, float)
         assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
         rays = rays_of(target) @ rotation
         directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)

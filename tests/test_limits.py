@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from tests.test_scene import HEIGHT, WIDTH, make_scene, pose
 CAMERA_SIZE = 8 + 8  # where width and height lie in cameras.bin, after the count, id and model
 
 
-def refused(path: Path, match: str, error: type[Exception] = ValueError, **options: object) -> None:
+def refused(path: Path, match: str, error: type[Exception] = ValueError, **options: Any) -> None:
     with pytest.raises(error, match=match) as caught:
         load_scene(path, **options)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
@@ -106,9 +107,9 @@ def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
     (path / "images").mkdir(parents=True)
     frames = []
     for index in range(3):
-        matrix = np.eye(4)
-        matrix[:3] = pose(index)
-        matrix = np.linalg.inv(matrix) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        viewmat = np.eye(4)
+        viewmat[:3] = pose(index)
+        matrix = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
         Image.new("RGB", (8, 6)).save(path / f"images/{index}.png")
         frames.append({"file_path": f"images/{index}.png", "transform_matrix": matrix.tolist()})
     data = {"w": 8, "h": 6, "fl_x": 9.0, "frames": frames}

@@ -107,7 +107,8 @@ def test_numbers_are_fetched_only_for_lines(trainer, tmp_path, total, expected):
     trainer.config = dataclasses.replace(CONFIG, iterations=total)
     with TrainingLog(tmp_path, trainer) as log:
         for iteration in range(1, total + 1):
-            log(Step(iteration))
+            step: Any = Step(iteration)
+            log(step)
     assert [line["iteration"] for line in lines(tmp_path)] == expected == sorted(set(fetched))
 
 
@@ -174,8 +175,8 @@ def test_what_is_not_finite_is_null(trainer, tmp_path):
 
 
 def test_peak_memory_is_at_least_what_is_used_now():
-    assert psutil.Process().memory_info().rss <= 1.01 * peak_memory(torch.device("cpu"))
-    assert peak_memory(torch.device("cpu")) <= psutil.virtual_memory().total
+    used, peak = psutil.Process().memory_info().rss, peak_memory(torch.device("cpu"))
+    assert peak is not None and used <= 1.01 * peak and peak <= psutil.virtual_memory().total
 
 
 # TensorBoard

@@ -269,7 +269,7 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
                 exposures=model.exposures,
                 detail_limits=model.detail_limits,
             )
-        leaves = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
+        leaves: dict[str, torch.Tensor] = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
         leaves |= dict(model.surfels.named_parameters())
         gradients = torch.autograd.grad(out.image.square().sum(), list(leaves.values()))
         found.append(dict(zip(leaves, gradients, strict=True)))

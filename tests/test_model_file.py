@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -263,6 +264,10 @@ def test_nothing_is_unpickled(tmp_path):
     assert marker.exists()
 
 
+def update_meta(key: str, value: object) -> Callable[[dict[str, torch.Tensor], dict[str, Any]], None]:
+    return lambda _, meta: meta.update({key: value})
+
+
 def test_models_that_cannot_render_are_refused(tmp_path):
     from safetensors.torch import load_file, save_file
 
@@ -280,7 +285,7 @@ def test_models_that_cannot_render_are_refused(tmp_path):
         ("exposure", "bright"),
         ("detail_limits", "no"),
     ):
-        rewrite(save_model(tmp_path, model), lambda _, meta, key=key, value=value: meta.update({key: value}))
+        rewrite(save_model(tmp_path, model), update_meta(key, value))
         with pytest.raises(ValueError, match=key):
             nw.load(tmp_path)
     path = save_model(tmp_path, model)

@@ -77,7 +77,7 @@ def rendered(run: Path, camera: nw.Camera) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("views", "names"), [("test", TEST), ("train", TRAIN), ("all", TRAIN + TEST)])
-def test_still_views(run: Path, views: str, names: list[str], capsys: pytest.CaptureFixture) -> None:
+def test_still_views(run: Path, views: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert command("render", run, "--set", views) == 0
     group = {name: "train" if name in TRAIN else "test" for name in names}
     assert files(run / "renders") == {f"{group[n]}/{n.rsplit('.')[0]}.png" for n in names}
@@ -94,7 +94,7 @@ def test_sizes(run: Path) -> None:
         assert picture(run / "renders" / "test" / "a.png").equal(rendered(run, resized(camera, *size)))
 
 
-def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.CaptureFixture) -> None:
+def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = load_cameras(run / "cameras.json")
     model = nw.load(run)
     log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
@@ -167,7 +167,7 @@ def test_a_path_from_a_file(run: Path, tmp_path: Path) -> None:
 # Videos
 
 
-def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
     video = tmp_path / "new" / "out.mp4"
     assert command("render", run, "--video", video, "--frames", "6", "--fps", "12", "--scale", "2") == 0
@@ -219,7 +219,7 @@ def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
 # Exports
 
 
-def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("export", run) == 0
     assert files(run / "export") == {"surfels.ply", "splats.ply"}
     assert capsys.readouterr().out.split() == [str(run / "export" / n) for n in ("surfels.ply", "splats.ply")]
@@ -230,7 +230,7 @@ def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
 
 
-def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture) -> None:
+def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def exported(*options: str) -> bytes:
         assert command("export", run, *options) == 0
         return (run / "export" / "splats.ply").read_bytes()
@@ -267,7 +267,7 @@ def test_export_cameras(run: Path) -> None:
 
 
 @pytest.fixture
-def refuses(run: Path, capsys: pytest.CaptureFixture) -> Callable[..., None]:
+def refuses(run: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
     """Expect one line and exit code 2, and nothing new in the run's folder nor beside it."""
 
     def check(arguments: list[object], *words: str) -> None:
@@ -352,7 +352,7 @@ def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("words", [["render"], ["export"]])
-def test_help(words: list[str], capsys: pytest.CaptureFixture) -> None:
+def test_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exited:
         cli.main([*words, "--help"])
     assert exited.value.code == 0 and "docs/outputs.md" in capsys.readouterr().out

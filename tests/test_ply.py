@@ -143,7 +143,8 @@ def test_observations_of_others_and_behind_lists_are_left_alone(tmp_path):
         (tmp_path / "a.ply").write_bytes(ply(elements, body))
         cloud = read_ply(tmp_path / "a.ply")
         assert cloud.positions.tolist() == [[1, 2, 3]]
-        assert (cloud.observations.tolist() == [[3, 0]]) if known else cloud.observations is None
+        observations = None if cloud.observations is None else cloud.observations.tolist()
+        assert observations == ([[3, 0]] if known else None)
 
 
 SEEN = vertex(1, "float x", "float y", "float z") + "element observation 1\n"

@@ -26,7 +26,6 @@ from benchmarks.timing import ROOT
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
-from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
@@ -342,7 +341,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit: its surfels, its texture and its figures."""
-    monkeypatch.setitem(METRIC_FUNCTIONS, "lpips", lambda *_: None)  # it warns where its weights are not
+    monkeypatch.setitem(evaluate.METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
@@ -355,7 +354,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     assert main(command) == 0
     found = read_results([out])
     assert {job.row for job in found} == set(rows)
-    texture = []
+    textures = []
     for job, result in found.items():
         assert result["together"] == {"rows": [*rows], "iterations": 9}
         row = Row(job.row, settings=rows[job.row])
@@ -367,8 +366,8 @@ def test_a_training_from_a_shared_start_is_the_training(
         for part, same in zip((one.surfels, one.texture), (other.surfels, other.texture), strict=True):
             state = same.state_dict()
             assert all(torch.equal(tensor, state[name]) for name, tensor in part.state_dict().items())
-        texture.append(one.texture.grid)
-    assert not torch.equal(*texture[:2])
+        textures.append(one.texture.grid)
+    assert not torch.equal(*textures[:2])
     torch.set_num_threads(threads)
 
 

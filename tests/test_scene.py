@@ -212,7 +212,12 @@ def damaged(name: str, change=lambda data: data[: len(data) // 2], **options):
 
 def lacking(name: str):
     """Maker of a scene without one of its files."""
-    return lambda path: (make_scene(path) / name).unlink() or path
+
+    def make(path: Path) -> Path:
+        (make_scene(path) / name).unlink()
+        return path
+
+    return make
 
 
 def built(**options):
@@ -282,7 +287,7 @@ def test_bad_downscale(tmp_path):
     with pytest.raises(ValueError, match="downscale: expected at least 1, got 0"):
         load_scene(path, downscale=0)
     with pytest.raises(TypeError, match="downscale: expected an int, got float"):
-        load_scene(path, downscale=2.0)
+        load_scene(path, downscale=2.0)  # type: ignore[arg-type]  # what is refused
     with pytest.raises(ValueError, match=r"downscale: expected at most the size of .*, 48x36, got 37"):
         load_scene(path, downscale=37)
 

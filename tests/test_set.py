@@ -34,7 +34,7 @@ def run(scene, tmp_path_factory) -> Path:
     return run
 
 
-def refused(capsys: pytest.CaptureFixture, arguments: list[str], *words: str) -> None:
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
     """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
     capsys.readouterr()
     assert cli.main(arguments) == 2
@@ -131,7 +131,8 @@ def test_a_run_keeps_what_was_set(run):
     changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "border": 0}
     changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
     assert config == with_settings(preset("default"), changes)
-    assert nw.load(run).texture.grid.shape == (4, 256, 4)
+    texture = nw.load(run).texture
+    assert texture is not None and texture.grid.shape == (4, 256, 4)
 
 
 def test_resume_agrees_or_is_refused(run, scene, capsys):

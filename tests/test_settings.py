@@ -2,13 +2,14 @@
 
 import dataclasses
 import re
+from typing import Any
 
 import pytest
 import torch
 
 import nexwarp as nw
 from nexwarp.data import Scene, View
-from nexwarp.run.evaluate import evaluate
+from nexwarp.run.evaluate import Evaluation, evaluate
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.settings import with_settings
@@ -27,7 +28,7 @@ def scene(tiny_scene: Scene) -> Scene:
 
 
 def make_trainer(scene: Scene, **settings) -> Trainer:
-    values = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
+    values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
     return Trainer(scene, Config(**values), "cpu")
 
 
@@ -73,7 +74,7 @@ def test_unknown_settings_are_refused(name: str) -> None:
         ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
     ],
 )
-def test_values_out_of_range_are_refused(settings: dict, message: str) -> None:
+def test_values_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         with_settings(Config(), settings)
 
@@ -105,6 +106,7 @@ def test_beyond_the_frame_the_photos_edge_goes_on(scene: Scene) -> None:
         left = round(view.camera.cx - shifted.camera.cx)
         top = round(view.camera.cy - shifted.camera.cy)
         assert abs(left) <= 12 and abs(top) <= 9
+        assert shifted.counts is not None and shifted.beyond is not None
         for row in (0, 17, 35):
             for column in (0, 20, 47):
                 r, c = row + top, column + left
@@ -126,6 +128,7 @@ def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
         column = 47 - max(left, 0)  # shows the photo's last column
         if left <= 0:
             continue
+        assert shifted.counts is not None and shifted.beyond is not None
         assert not shifted.beyond[:, column + 1 :].any() and not shifted.counts[:, column:].any()
 
 
@@ -149,10 +152,11 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
     trainer = make_trainer(random)
     seen = [trainer.targets.from_view(0, 1) for _ in range(3)]
-    assert len({tuple(view.background.tolist()) for view in seen}) == 3
+    colors = [torch.as_tensor(view.background) for view in seen]
+    assert len({tuple(color.tolist()) for color in colors}) == 3
     photo = views[0].image.float() / 255
-    for view in seen:
-        expected = photo[:10] + 0.8 * (view.background - 1.0)
+    for view, color in zip(seen, colors, strict=True):
+        expected = photo[:10] + 0.8 * (color - 1.0)
         assert_close(view.photo[:10], expected, kind="value", name="transparent")
         assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
     assert trainer.render_options().background == (1.0, 1.0, 1.0)
@@ -214,7 +218,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
         alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
         if mode == "background":
             assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
-            assert view.counts is None and torch.equal(view.empty, ~mask)
+            assert view.counts is None and view.empty is not None and torch.equal(view.empty, ~mask)
     assert alphas["background"] < 0.75 * alphas["ignore"]
 
 
@@ -226,7 +230,7 @@ def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
     spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
     model = trainer.model()
 
-    def judge(*views: View, mode: str = "ignore") -> dict:
+    def judge(*views: View, mode: str = "ignore") -> Evaluation:
         metrics = ("psnr", "ssim", "flip")
         return evaluate(model, views, mask_mode=mode, metrics=metrics)
 

@@ -140,11 +140,12 @@ def test_points_lie_where_their_features_are(made):
 
 def test_the_report_is_about_the_scene(made):
     report = json.loads((made / "sfm.json").read_text())
-    model = read_model(made, made / "images")
+    cloud = read_model(made, made / "images").cloud
+    assert cloud is not None
     assert report["photos"] == len(report["registered"]) == VIEWS and not report["left_out"] and not report["advice"]
-    assert report["points"] == len(model.cloud.positions)
-    assert report["mean_track_length"] == pytest.approx(model.cloud.track_lengths.mean())
-    assert report["mean_reprojection_error"] == pytest.approx(model.cloud.reprojection_errors.mean(), rel=1e-4)
+    assert report["points"] == len(cloud.positions)
+    assert report["mean_track_length"] == pytest.approx(cloud.track_lengths.mean())
+    assert report["mean_reprojection_error"] == pytest.approx(cloud.reprojection_errors.mean(), rel=1e-4)
     assert report["mean_reprojection_error"] < 0.5
     assert report["pairs"] == VIEWS * (VIEWS - 1) // 2 and report["matching"] == "exhaustive"
     assert [camera["model"] for camera in report["cameras"]] == ["SIMPLE_PINHOLE"]
@@ -188,7 +189,8 @@ def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
     for index, (name, image) in enumerate(arc.images.items()):
         file = folder / f"camera {index % 2}" / Path(name).with_suffix(".JPG")
         file.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(image).save(file, quality=95, **({"exif": exif} if index % 2 else {}))
+        options: dict[str, Any] = {"exif": exif} if index % 2 else {}
+        Image.fromarray(image).save(file, quality=95, **options)
     Image.fromarray(noise(0)).save(folder / "camera 0" / "stray.png")
     command = ["sfm", str(folder), str(tmp_path / "scene"), "--cameras", "folder", "--camera-model", "simple_pinhole"]
     assert cli.main(command) == 0

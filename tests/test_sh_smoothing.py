@@ -75,6 +75,7 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
         out = nw.render(surfels, None, camera, max_hits=0)
         (out.plain * counts)[..., 0].sum().backward()
         shown = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, 3)[:, 0] > 0
+        assert surfels.sh0.grad is not None
         weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / CONSTANT, torch.nan)
         basis = torch.stack([colors(surfels, [v], one(k, surfels))[0, :, 0] for k in range(16)], dim=1)
         expected += weights[:, None] * basis[:, row] * basis[:, column]
@@ -121,8 +122,8 @@ def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch
     basis = torch.stack([colors(surfels, views, one(k, surfels))[:, 0, 0] for k in range(16)], dim=1).double()
     hidden = torch.linalg.svd(basis)[2][3:].sum(0).to(surfels.sh0)
     with torch.no_grad():
-        surfels.sh0 += hidden[None, :1, None]
-        surfels.shN += hidden[None, 1:, None]
+        surfels.sh0.add_(hidden[None, :1, None])
+        surfels.shN.add_(hidden[None, 1:, None])
     again = smooth_sh(nw.Model(surfels, None), views, 0.01)
     for a, b in zip(smooth, again, strict=True):
         assert (a - b)[0].abs().max() < 1e-3 < hidden.abs().max()

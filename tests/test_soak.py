@@ -70,6 +70,7 @@ def test_a_leak_fails_the_command(monkeypatch, capsys):
 
 def test_memory_is_seen(device):
     before = memory(device)
+    kept: mmap.mmap | torch.Tensor
     if device.type == "cpu":  # from the system: the heap may have had room
         mapped = mmap.mmap(-1, 64 * MIB)
         mapped.write(bytes(64 * MIB))

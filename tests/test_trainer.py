@@ -40,12 +40,13 @@ def scene(tiny_scene: Scene) -> Scene:
 
 
 def small(**changes: Any) -> Config:
-    return Config(**({"iterations": 12, "max_surfels": 120, "texture": TEXTURE, "densify": OFTEN} | changes))
+    settings: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE, "densify": OFTEN}
+    return Config(**(settings | changes))
 
 
 def state_of(trainer: Trainer) -> dict[str, torch.Tensor]:
     """Every tensor that the future of a run depends on."""
-    state = dict(trainer._named_parameters())
+    state: dict[str, torch.Tensor] = dict(trainer._named_parameters())
     for name, parameter in list(state.items()):
         state |= {f"adam.{name}.{k}": v for k, v in trainer.optimizer.state[parameter].items()}
     state |= {"errors": trainer.densifier.errors, "generator": trainer.generator.get_state()}
@@ -126,10 +127,10 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
         assert_same_state(other, runs[0])
     first, *others = (trainer.finish() for trainer in runs)
     assert first.exposures is not None and first.detail_limits is not None
-    for other in others:
-        assert other.state_dict().keys() == first.state_dict().keys()
+    for model in others:
+        assert model.state_dict().keys() == first.state_dict().keys()
         for name, value in first.state_dict().items():
-            assert torch.equal(other.state_dict()[name], value), name
+            assert torch.equal(model.state_dict()[name], value), name
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
@@ -170,7 +171,8 @@ def test_it_learns(scene):
 
 
 def test_progress_tells_what_happened(scene):
-    trainer, seen = Trainer(scene, small(), "cpu"), []
+    trainer = Trainer(scene, small(), "cpu")
+    seen: list[nw.StepReport] = []
     trainer.run(seen.append)
     assert [p.iteration for p in seen] == list(range(1, 13))
     assert seen[-1].surfels == len(trainer.surfels)
@@ -380,6 +382,7 @@ def rescaled(scene: Scene, factor: float) -> Scene:
         viewmat = c.viewmat.clone()
         viewmat[:3, 3] *= factor
         camera = nw.Camera(viewmat, c.K, c.width, c.height, near=c.near * factor)
+        assert view.points is not None
         return dataclasses.replace(view, camera=camera, points=view.points * factor)
 
     return dataclasses.replace(
@@ -430,8 +433,8 @@ def test_surfels_settle_with_two_hits(scene):
             trainer.step()
         if iteration < 10:
             assert_same_state(four, two)
-        hits = [t.render_options().max_hits for t in (two, four, early)]
-        assert hits == [2, 2 if iteration < 10 else 4, 4]
+        now = [t.render_options().max_hits for t in (two, four, early)]
+        assert now == [2, 2 if iteration < 10 else 4, 4]
     assert not torch.equal(four.texture.grid, two.texture.grid)
     assert four.finish().options.max_hits == 4
     for hits in (0, 1):

@@ -45,12 +45,14 @@ def test_photo_mask_and_alpha_are_reduced_alike(factor):
         np.testing.assert_allclose(photo.numpy(), expected, atol=1e-6)
         assert photo.shape == (camera.height, camera.width, 3) == (13 // used, 19 // used, 3)
         torch.testing.assert_close(camera.K[:2], K[:2] / used)
+        mask, alpha = mine.mask(index, factor), mine.alpha(index, factor)
         if view.mask is None:
-            assert mine.mask(index, factor) is None and mine.alpha(index, factor) is None
+            assert mask is None and alpha is None
             continue
-        assert np.array_equal(mine.mask(index, factor).numpy(), blocks(view.mask.numpy(), used).all(axis=(1, 3)))
-        alpha = blocks(view.alpha.numpy() / 255.0, used).mean(axis=(1, 3))
-        np.testing.assert_allclose(mine.alpha(index, factor).numpy(), alpha, atol=1e-6)
+        assert mask is not None and alpha is not None and view.alpha is not None
+        assert np.array_equal(mask.numpy(), blocks(view.mask.numpy(), used).all(axis=(1, 3)))
+        expected = blocks(view.alpha.numpy() / 255.0, used).mean(axis=(1, 3))
+        np.testing.assert_allclose(alpha.numpy(), expected, atol=1e-6)
 
 
 def test_what_comes_next_changes_nothing_on_a_cpu():

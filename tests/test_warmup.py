@@ -185,7 +185,9 @@ def test_a_rehearsal_changes_only_what_is_not_compiled_in() -> None:
         (["--device", "gpu"], ("--device", "cuda or cpu", "'gpu'")),
     ],
 )
-def test_bad_input_is_one_line(arguments: list[str], words: tuple[str, ...], capsys: pytest.CaptureFixture) -> None:
+def test_bad_input_is_one_line(
+    arguments: list[str], words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["warmup", *arguments]) == 2
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: ") and err.count("\n") == 1

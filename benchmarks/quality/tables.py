@@ -147,7 +147,7 @@ def differences(results: Results, against: str = DEFAULT.name) -> list[dict[str,
     found = []
     for (size, iterations), rows in sorted(groups.items()):
         base = rows.pop(against, {})
-        shown = []
+        shown: list[dict[str, Any]] = []
         for name, scenes in rows.items():
             both = [scene for scene in scenes if scene in base]
             if len(both) < 2:

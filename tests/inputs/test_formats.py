@@ -65,8 +65,8 @@ def test_observations_go_with_the_frames_that_are_left(demo, tmp_path):
 
     after = {view.name: view.points for view in load_scene(edit(path, change)).train}
     assert [name for name, points in after.items() if points is None] == ["view_005.png"]
-    both = {name for name in after if name in before and after[name] is not None}
-    assert len(both) == 5 and all(torch.equal(after[name], before[name]) for name in both)
+    both = [(points, before[name]) for name, points in after.items() if name in before and points is not None]
+    assert len(both) == 5 and all(old is not None and torch.equal(new, old) for new, old in both)
 
 
 def test_points_beside_a_blender_scene(demo, tmp_path):

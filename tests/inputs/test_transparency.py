@@ -44,6 +44,7 @@ def test_another_background_follows_from_alpha(transparent):
     white, blue = load_scene(path), load_scene(path, background=(0.0, 0.0, 1.0))
     for one, other in zip(white.train, blue.train, strict=True):
         shift = torch.tensor(blue.background) - torch.tensor(white.background)
+        assert one.alpha is not None
         moved = one.image / 255 + (1 - one.alpha[:, :, None] / 255) * shift
         assert (255 * moved - other.image).abs().max() <= 1.0 + 1e-3
 
@@ -71,7 +72,8 @@ def test_other_scenes_drop_alpha_unless_asked(transparent, tmp_path):
     assert scene.background is None and scene.train[0].alpha is None
     assert np.array_equal(scene.train[0].image.numpy(), rgba[..., :3])
     scene = load_scene(path, background="white")
-    assert scene.background == (1.0, 1.0, 1.0) and np.array_equal(scene.train[0].alpha.numpy(), rgba[..., 3])
+    alpha = scene.train[0].alpha
+    assert scene.background == (1.0, 1.0, 1.0) and alpha is not None and np.array_equal(alpha.numpy(), rgba[..., 3])
     assert scene.train[0].image[0, 0].tolist() == [255, 255, 255]
 
 

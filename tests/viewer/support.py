@@ -33,8 +33,9 @@ class Client:
     def __init__(self, viewer: Viewer, **arguments: Any) -> None:
         import viser
         from websockets.sync.client import connect
+        from websockets.typing import Subprotocol
 
-        protocol = f"viser-v{viser.__version__}"
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
         url = viewer.url.replace("http", "ws")
         self.socket = connect(
             url, subprotocols=[protocol], compression=None, max_size=None, max_queue=None, **arguments
@@ -64,6 +65,7 @@ class Client:
         end = time.monotonic() + seconds
         while True:
             raw = self.socket.recv(timeout=max(end - time.monotonic(), 0.01))
+            assert isinstance(raw, bytes)
             length = int.from_bytes(raw[8:16], "little")
             data = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + length]))
             yield from data["messages"]

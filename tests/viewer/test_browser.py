@@ -94,6 +94,7 @@ def test_in_a_browser(model, tmp_path):
         page.mouse.move(320, 430, steps=5)
         page.mouse.up()
         settled()
+        assert session.viewpoint is not None
         assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
         record_and_save(page, session, tmp_path)
         browser.close()

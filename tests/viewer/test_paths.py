@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_a_browsers_camera_is_the_scenes():
     ],
 )
 def test_what_is_no_camera_is_refused(wrong):
-    good = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0, "width": 64, "height": 48}
+    good: dict[str, Any] = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0, "width": 64, "height": 48}
     world = World.around([], torch.zeros(0, 3))
     Viewpoint.of(**good, world=world)
     with pytest.raises(ValueError, match="camera"):

@@ -67,7 +67,7 @@ def test_clients_look_for_themselves_and_come_and_go(model, tmp_path):
             two.send("GuiUpdateMessage", uuid=mode, updates={"value": "alpha"})
             wait_for(lambda: {s.settings.mode for s in sessions} == {"image", "alpha"})
             wait_for(lambda: all(s.drawn_scale == 1.0 and s.drawn_version == s.version for s in sessions))
-            assert {s.viewpoint.width for s in sessions} == {96}
+            assert {s.viewpoint and s.viewpoint.width for s in sessions} == {96}
             wait_for(lambda: len(viewer.thumbnails) == 6)
         wait_for(lambda: not viewer.sessions)
         with Client(viewer) as late:  # finds everything as the first did
@@ -98,6 +98,7 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
         bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": 99})
         wait_for(lambda: session.settings.max_hits == 8)
         assert slider.value == 8 and not slider._impl.removed and session.version == version + 1
+        assert session.viewpoint is not None
         assert session.viewpoint.width == 96 and math.isfinite(session.viewpoint.fov)
         bad.socket.send(b"\xc1 no message at all")
         wait_for(lambda: len(viewer.sessions) == 1)  # it is shown out

@@ -1,5 +1,6 @@
 """A viewer beside a training changes nothing of it and costs little."""
 
+import functools
 import math
 import threading
 import time
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 
 def trainer_of(run: Path, **changes: Any) -> Trainer:
-    settings = {"iterations": 12, "max_surfels": 120, "densify": DensifyConfig(every=3)} | changes
+    settings: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "densify": DensifyConfig(every=3)} | changes
     texture = TextureConfig(levels=4, table_size=2**10, width=16)
     return Trainer(nw.load_scene(run.parent / "tiny"), Config(**settings, texture=texture), "cpu")
 
@@ -39,7 +40,7 @@ def test_looking_changes_nothing_about_a_training(run):
             {"train": {view.name: view.camera for view in scene.train}},
             near=0.01,
             port=0,
-            photos={f"train/{view.name}": lambda view=view: view.image for view in scene.train},
+            photos={f"train/{view.name}": functools.partial(getattr, view, "image") for view in scene.train},
             total=12,
         ) as viewer,
         Client(viewer) as client,
@@ -51,8 +52,12 @@ def test_looking_changes_nothing_about_a_training(run):
         drawn = []
 
         def observe(step: Any) -> None:
+            def describe() -> str:
+                described.append(step.iteration)
+                return "fine"
+
             session.changed_at = -math.inf  # still
-            viewer.between_steps(step.iteration, lambda: described.append(step.iteration) or "fine")
+            viewer.between_steps(step.iteration, describe)
             drawn.append(session.drawn_step)
             if step.iteration == 6:  # paused by somebody, resumed while it waits
                 viewer._toggle_pause()
@@ -65,7 +70,12 @@ def test_looking_changes_nothing_about_a_training(run):
         viewer.finish("done", lambda: finished)
         asked: list[nw.Model] = []
         shown = viewer.model
-        viewer.model = lambda: asked.append(shown()) or shown()
+
+        def show() -> nw.Model:
+            asked.append(shown())
+            return asked[-1]
+
+        viewer.model = show
         start = time.perf_counter()
         viewer.show(
             lambda: (bool(asked) and session.drawn_version == session.version) or time.perf_counter() > start + 20
@@ -84,7 +94,12 @@ def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
         assert time.perf_counter() - start < 0.05, "less than 50 microseconds a step"
         viewer._toggle_pause()
         asked: list[int] = []
-        viewer.between_steps(1, lambda: "paused", stop=lambda: asked.append(1) or len(asked) > 2)
+
+        def stop() -> bool:
+            asked.append(1)
+            return len(asked) > 2
+
+        viewer.between_steps(1, lambda: "paused", stop=stop)
         assert len(asked) == 3
 
 
