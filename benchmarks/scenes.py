@@ -105,7 +105,7 @@ def geometry(scene: SurfelScene) -> Geometry:
     shape = Activated(*(x.clone().requires_grad_() for x in (s.means, s.quats, s.scales, s.opacities, s.gammas)))
     colors = ops.plain_colors((s.sh0, s.shN), s.means, c.position, 3).requires_grad_()
     pinhole = ops.Pinhole(c.K, c.width, c.height, c.near)
-    return Geometry((means, quats, scales, opacities, gammas), colors, c.viewmat, pinhole)
+    return Geometry(shape, colors, c.viewmat, pinhole)
 
 
 def entries(tiles: ops.Tiles) -> int:

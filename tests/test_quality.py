@@ -26,6 +26,7 @@ from benchmarks.timing import ROOT
 from nexwarp.data import Scene
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
+from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
@@ -341,7 +342,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit: its surfels, its texture and its figures."""
-    monkeypatch.setitem(evaluate.METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
+    monkeypatch.setitem(METRIC_FUNCTIONS, "lpips", lambda *_: None)  # it warns where its weights are not
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}

@@ -70,7 +70,6 @@ def table_jobs(
     rows: tuple[Row, ...]
     sizes: tuple[int, ...] = (size,)
     variants: tuple[str, ...] = ("",)
-    rows: tuple[Row, ...]
     if table == "peers":
         rows, sizes = (DEFAULT, PEER), (size, size // 4)
     elif table == "curve":

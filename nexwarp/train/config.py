@@ -52,7 +52,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class TextureConfig:
-    """Shape of the neural texture (paper Sec. 4)."""
+    """Shape of the neural texture (paper Sec. 5)."""
 
     levels: int = 8
     """L, resolution levels."""

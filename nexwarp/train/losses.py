@@ -1,4 +1,4 @@
-"""The training losses of the paper's section "Optimization", one function a term, each a scalar tensor.
+"""The training losses (paper Sec. 4.3), one function a term, each a scalar tensor.
 
 Images are (H, W, 3) with values in [0, 1] (others are allowed). `weights` (H, W, K) holds the blending
 weights W of the K textured hits of each pixel, empty slots 0, and `textured` (H, W, 3) is sum_k W_k T_k.

@@ -28,7 +28,8 @@ def record_and_save(page: Any, session: Session, folder: Path) -> None:
     page.get_by_role("button", name="Add this view").click()
     wait_for(lambda: len(session.keyframes) == 1)
     session.jump("train/4.png")
-    wait_for(lambda: np.allclose(session.viewpoint.pose, camera_to_world(session.cameras["train/4.png"]), atol=1e-3))
+    expected = camera_to_world(session.cameras["train/4.png"])
+    wait_for(lambda: session.viewpoint is not None and np.allclose(session.viewpoint.pose, expected, atol=1e-3))
     page.get_by_role("button", name="Add this view").click()
     wait_for(lambda: len(session.keyframes) == 2)
     with page.expect_download() as path:
