@@ -16,10 +16,9 @@ import torch
 import tyro
 
 import nexwarp as nw
-from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.surfels_ply import save_splats_ply
-from nexwarp.run.folder import CAMERAS_FILE
 from nexwarp.run.metrics import psnr
 
 UNIT_GAMMA = -40.0  # raw: gamma = 1 + exp(raw)

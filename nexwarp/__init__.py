@@ -8,11 +8,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 from nexwarp.camera import Camera
+from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.options import RenderOptions
 from nexwarp.render import Rendering, render
+from nexwarp.representation.detail_limits import DetailLimits
+from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.api import train
@@ -27,6 +30,8 @@ __version__ = "0.2.0"
 __all__ = [
     "Camera",
     "Config",
+    "DetailLimits",
+    "Exposures",
     "Model",
     "NeuralTexture",
     "RenderOptions",
@@ -38,6 +43,7 @@ __all__ = [
     "Trainer",
     "View",
     "load",
+    "load_cameras",
     "load_scene",
     "preset",
     "render",

@@ -1,5 +1,6 @@
 """The cameras of a run as JSON, so that it can be rendered without its photos."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from nexwarp.camera import Camera
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import READ_ERRORS, read_json, write_json
+
+CAMERAS_FILE = "cameras.json"
 
 
 def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> None:
@@ -33,12 +36,22 @@ def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> Non
     write_json(path, data)
 
 
-def load_cameras(path: Path) -> dict[str, dict[str, Camera]]:
-    """Read a file of `save_cameras`: set -> name -> camera, float32 on the CPU.
+def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:
+    """Read the cameras of a run; its photos are not needed.
+
+    Args:
+        path: a run folder, or its `cameras.json`.
+
+    Returns:
+        Set ("train", "test") -> name of the photo -> camera, float32 on the CPU.
 
     Raises:
-        MissingError: no such file. FormatError: the file is damaged or holds something else.
+        FileNotFoundError: no such file.
+        ValueError: the file is damaged or holds something else.
     """
+    path = Path(path)
+    if path.is_dir():
+        path = path / CAMERAS_FILE
     try:
         data = read_json(path)
         return {

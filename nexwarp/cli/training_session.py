@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
@@ -17,7 +17,7 @@ from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, Storag
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
-from nexwarp.run.folder import CAMERAS_FILE, check_room, tidy_run
+from nexwarp.run.folder import check_room, tidy_run
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.health import needed_memory

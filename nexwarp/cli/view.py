@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Host_, Port_, Run_
 from nexwarp.model.model_file import load
-from nexwarp.run.folder import CAMERAS_FILE, keep_camera_path, read_run
+from nexwarp.run.folder import keep_camera_path, read_run
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nexwarp.camera import resized
-from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.folder import CAMERAS_FILE, read_run
+from nexwarp.run.folder import read_run
 
 FORMATS = ("ply", "cameras")
 

@@ -20,7 +20,6 @@ from nexwarp.train.presets import config_from_dict
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
-CAMERAS_FILE = "cameras.json"
 DEMO = "demo"
 
 

@@ -12,7 +12,7 @@ import torch
 
 from nexwarp.buffers import render_buffers, save_buffers
 from nexwarp.camera import Camera, resized
-from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import ellipse, interpolate, spiral
 from nexwarp.errors import RunError, SettingError
@@ -20,7 +20,7 @@ from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure
-from nexwarp.run.folder import CAMERAS_FILE, read_run
+from nexwarp.run.folder import read_run
 
 FRAMES, FPS = 120, 30.0
 
