@@ -96,7 +96,8 @@ def test_expected_depth_is_the_mean_over_all_hits(device: torch.device) -> None:
         fewer = make(count=8, max_hits=max_hits, device=device)
         for name in ("expected_depth", "median_depth", "normals"):
             assert getattr(fewer, name).equal(getattr(full, name)), name
-        assert fewer.top_depth.equal(full.depths[..., 0])
+        # Another kernel computes the same depth, which CUDA's fast math may round otherwise.
+        assert_close(fewer.top_depth, full.depths[..., 0], kind="value", name="top_depth")
 
 
 def test_median_depth_is_where_half_of_the_light_is_left(device: torch.device) -> None:

@@ -233,6 +233,7 @@ def test_own_losses_and_optimizers_are_captured_where_they_can_be(
 
 
 @pytest.mark.cuda
+@pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream does not match:UserWarning")  # of torch, after it
 def test_a_loss_that_cannot_be_captured_warns_and_trains_on(scene: Scene) -> None:
     def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
         return rendering.alpha.mean() * rendering.alpha.max().item()  # waits for the GPU
