@@ -18,6 +18,7 @@ from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
+from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.tiles import (
     depth_keys_kernel,
     list_kernels,
@@ -39,7 +40,9 @@ def all_kernels(
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     yield from thread_kernels(real, storage, tile_size, ssim_lengths=(1, SIMD_WIDTH) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
-    yield antialias_kernels(real).backward  # of trained surfels, which training itself has no use for
+    # What training itself has no use for: the antialiasing of trained surfels, depths and normals.
+    yield antialias_kernels(real).backward
+    yield from (surface_kernel(real, low_pass, tile_size) for low_pass in (False, True))
 
 
 def thread_kernels(
