@@ -5,7 +5,7 @@ A thread is a level, backward a run of levels, of `WIDTH` neighbouring points. R
 point. A launch is split by levels, so that a level's table belongs to one thread.
 
 A whole training step of the demo takes 19 % longer without it (2 cores, Xeon with AVX-512). The scalar form with the
-table read and written by native code, and even without its exponentials, was still 1.6 times as slow in lookups alone.
+table read and written by native code, and even without its exponentials, was still 1.5 times as slow in lookups alone.
 """
 
 import functools
