@@ -189,8 +189,8 @@ def test_file_is_as_large_as_accounted(tmp_path, count):
 
 
 def test_missing_model(tmp_path):
-    refused(FileNotFoundError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a run folder")
-    refused(FileNotFoundError, nw.load, tmp_path / "no", names=tmp_path / "no", match="expected a run folder")
+    refused(FileNotFoundError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="or a run folder with")
+    refused(FileNotFoundError, nw.load, tmp_path / "no", names=tmp_path / "no", match="or a run folder with")
 
 
 @pytest.mark.parametrize("content", [b"", b"not a model at all", b"\xff" * 64, b"{}" * 100])

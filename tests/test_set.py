@@ -144,7 +144,7 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
     expected = "--set: texture.levels: expected 4 as in the run to resume, got 8"
     refused(capsys, [*resume, "--set", "texture.levels=8"], expected)
     refused(capsys, [*resume, "--set", "texture.nope=8"], "--set: texture.nope: expected a setting")
-    refused(capsys, [*resume, "--set", "preset=paper"], "--set: preset: expected --preset alone")
+    refused(capsys, [*resume, "--set", "preset=paper"], "--set: preset: expected --preset instead")
     assert (run / "config.json").read_bytes() == before
 
 
@@ -155,8 +155,8 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
         (["--set", "border"], ["--set: expected KEY=VALUE, got 'border'"]),
         (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
         (["--set", "texture.table_size=1000"], ["table_size", "power of two"]),
-        (["--set", "preset=paper"], ["--set: preset: expected --preset alone"]),
-        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed alone"]),
+        (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
+        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),
         (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
         (["--set", "clamp_texture=true"], ["clamp_texture: expected False with texture.residual"]),
     ],

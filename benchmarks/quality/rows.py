@@ -28,7 +28,7 @@ PAPER = Row("paper", "paper")
 DEFAULT = Row("default")
 PEER = Row(GSPLAT, None)
 NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
-# The ablations of the paper (its section "Ablations").
+# The ablations of the paper.
 REMOVALS = (
     NO_TEXTURE,
     Row("no gamma", settings={"rates.gammas": 0.0}),

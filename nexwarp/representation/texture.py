@@ -34,7 +34,9 @@ class TextureShape(TypedDict):
 
 
 class NeuralTexture(nn.Module):
-    """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5; H of Eq. 2, Delta of Eq. 4).
+    """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5).
+
+    H are hash-grid features (paper Eq. 2), Delta the down-weighting (paper Eq. 4).
 
     Parameters: `grid` (levels, table_size, features), float32; `mlp`, a torch module without biases whose
     `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, a geometric

@@ -109,7 +109,7 @@ def test_unknown_device(scene, refuses):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_no_cuda_when_asked_for(scene, finished, refuses, capsys):
-    refuses(scene, ["--device", "cuda"], "--device", "cuda", "no CUDA device", "--device cpu")
+    refuses(scene, ["--device", "cuda"], "--device", "no CUDA device", "--device cpu")
     for command in ("eval", "render"):
         refused(capsys, [command, str(finished), "--device", "cuda"], "--device", "no CUDA device")
 

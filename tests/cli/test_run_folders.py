@@ -64,7 +64,7 @@ def test_an_empty_folder_may_become_a_run(scene, tmp_path):
 
 @pytest.mark.parametrize("command", ["eval", "render", "info"])
 def test_no_run_there(command, tmp_path, capsys):
-    refused(capsys, [command, str(tmp_path / "no")], str(tmp_path / "no"), "expected a run folder")
+    refused(capsys, [command, str(tmp_path / "no")], str(tmp_path / "no"), "a run folder")
     assert os.listdir(tmp_path) == []
 
 

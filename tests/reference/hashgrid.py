@@ -1,4 +1,4 @@
-"""An unbounded multiresolution hash grid, down-weighted by distance (paper Eq. 2, Eq. 4 and supplement)."""
+"""Hash-grid features H(x) (paper Eq. 2), unbounded, down-weighted by Delta (paper Eq. 4)."""
 
 import itertools
 import math

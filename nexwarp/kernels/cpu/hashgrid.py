@@ -1,4 +1,4 @@
-"""SIMD form of `hashgrid`, for CPUs (paper Eq. 2 and 4).
+"""SIMD form, for CPUs, of the hash-grid features H(x) (paper Eq. 2), down-weighted by Delta (paper Eq. 4).
 
 A thread is a level, backward a run of levels, of `WIDTH` neighbouring points. Read, written and differentiated is what
 `hashgrid` reads, writes and differentiates; a test compares the two. Only reading and writing the table go point by
