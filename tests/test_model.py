@@ -84,20 +84,23 @@ def picture(file: Path) -> torch.Tensor:
 # What is rendered
 
 
+@pytest.mark.parametrize("saved", ["photos", "mean"])
 @pytest.mark.parametrize("flags", [[], ["--buffers"], ["--exposure", "mean"], ["--exposure", "mean", "--buffers"]])
-def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str]) -> None:
-    """To the bit, with exposures, vignetting and detail limits, and the buffers too."""
+def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
+    """To the bit, with exposures, vignetting and detail limits, and the buffers too; by default as the model says."""
     run, cameras = tmp_path / "run", cameras_of()
     create_run(run, SceneSource(str(tmp_path / "scene")), Config(), "cpu")
-    full_model().save(run)
+    full = full_model()
+    full.options = full.options.changed(exposure=saved)
+    full.save(run)
     names = [f"{i}.png" for i in range(len(cameras))]
     save_cameras(run / "cameras.json", {"train": {}, "test": dict(zip(names, cameras, strict=True))})
     assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 0
     model = nw.load(run)
-    exposure: Exposure = "mean" if "mean" in flags else "photos"
+    changes: RenderChanges = {"exposure": "mean"} if "mean" in flags else {}
     for name, camera in zip(names, cameras, strict=True):
         with torch.no_grad():
-            out = model.render(camera, exposure=exposure)
+            out = model.render(camera, **changes)
         assert torch.equal(picture(run / "renders" / "test" / name), to_uint8(out.image)), name
         assert out.image.std() > 0.05
         if "--buffers" in flags:

@@ -54,7 +54,7 @@ class Render:
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
-    exposure: Annotated[str, option("{photos,mean}")] = "photos"
+    exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
     device: Device_ = None

@@ -19,7 +19,7 @@ from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
-from nexwarp.model.options import Exposure
+from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.run.folder import read_run
 
 FRAMES, FPS = 120, 30.0
@@ -56,13 +56,13 @@ class RenderJob:
         pictures: the images, in the order of rendering.
         video: video file to write; None writes none.
         fps: frames per second.
-        exposure: see `RenderOptions`.
+        exposure: see `RenderOptions`; None is that of the model.
     """
 
     pictures: list[PictureJob]
     video: Path | None
     fps: float
-    exposure: Exposure = "photos"
+    exposure: Exposure | None = None
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -81,6 +81,7 @@ class RenderJob:
             done: called after each image.
         """
         frames = [picture for picture in self.pictures if picture.is_frame]
+        changes: RenderChanges = {} if self.exposure is None else {"exposure": self.exposure}
         with ExitStack() as stack:
             append = None
             if self.video is not None:  # before any rendering, which would be lost if the file cannot be written
@@ -89,11 +90,11 @@ class RenderJob:
             for picture in self.pictures:
                 camera = picture.camera
                 if picture.buffers:
-                    buffers = render_buffers(model, camera, exposure=self.exposure)
+                    buffers = render_buffers(model, camera, **changes)
                     save_buffers(picture.file.with_suffix(".exr"), buffers)
                     image = buffers.image
                 else:
-                    image = model.render(camera, exposure=self.exposure).image
+                    image = model.render(camera, **changes).image
                 pixels = to_uint8(image).cpu()
                 save_png(picture.file, pixels)
                 if append is not None and picture.is_frame:
@@ -116,7 +117,7 @@ class RenderOrder:
         buffers: also write the buffers of the still views or, without still views, of the frames.
         size: "WIDTHxHEIGHT" in pixels; None keeps the size of the cameras.
         scale: factor on the size of the cameras.
-        exposure: see `RenderOptions`.
+        exposure: see `RenderOptions`; None is that of the model.
 
     Raises:
         ValueError: the message names the option.
@@ -130,7 +131,7 @@ class RenderOrder:
     buffers: bool = False
     size: str | None = None
     scale: float = 1.0
-    exposure: str = "photos"
+    exposure: str | None = None
 
     def __post_init__(self) -> None:
         if self.views not in SETS:
@@ -145,7 +146,7 @@ class RenderOrder:
             raise SettingError("--frames: expected together with --path or --video, got --set alone")
         if self.fps is not None and self.video is None:
             raise SettingError("--fps: expected together with --video, got no --video")
-        if self.exposure not in get_args(Exposure):
+        if self.exposure not in (None, *get_args(Exposure)):
             raise SettingError(f"--exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r}")
         self._size()
         if self.video is not None:
@@ -174,7 +175,9 @@ class RenderOrder:
                 pictures.append(PictureJob(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
-        return RenderJob(pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure, self.exposure))
+        return RenderJob(
+            pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure | None, self.exposure)
+        )
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
