@@ -10,8 +10,8 @@ from nexwarp import ops
 from nexwarp.finish.detail_limits import measure_detail_limits
 from nexwarp.render import antialiased
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
+from tests.render_support import BACKGROUND, MAX_HITS, assert_alike, assert_same, draw
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.test_laws import BACKGROUND, MAX_HITS, assert_alike, assert_same, draw
 from tests.tolerances import assert_close, assert_finite
 
 

@@ -20,7 +20,7 @@ from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.settings import with_settings
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
-from tests.test_trainer import assert_same_state
+from tests.trainer_support import assert_same_state
 
 pytestmark = pytest.mark.cuda
 

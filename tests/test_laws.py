@@ -1,199 +1,25 @@
-"""What must hold of every render, whatever the scene: laws, and agreement with the dense reference."""
-
-import copy
-from typing import Any
+"""What must hold of every render, whatever the scene."""
 
 import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.render import jitter_factors
-from tests.narrowing import present
-from tests.reference import render as reference
-from tests.scenes import (
-    Scene,
-    layered_scene,
-    make_camera,
-    make_surfels,
-    make_texture,
-    multiply,
-    random_scene,
-    rigid,
+from tests.render_support import (
+    BACKGROUND,
+    BUFFERS,
+    MAX_HITS,
+    assert_alike,
+    assert_same,
+    draw,
+    loss,
+    reference_render,
+    twin,
 )
-from tests.tolerances import FLIPS, assert_close, assert_finite, assert_same_ids
+from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, multiply, random_scene, rigid
+from tests.tolerances import assert_close, assert_finite, assert_same_ids
 
 # On a CPU both forms of the kernels: see `conftest.form`.
 pytestmark = pytest.mark.usefixtures("form")
-
-BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
-BACKGROUND = (0.1, 0.4, 0.7)
-MAX_HITS = 8
-
-
-def draw(scene: Scene, texture: nw.NeuralTexture | None = None, **options: Any) -> Any:
-    """Render `scene` over the test background."""
-    return nw.render(make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options))
-
-
-def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
-    """Fail unless the buffers are the same to the last bit."""
-    for name in buffers:
-        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
-
-
-def assert_alike(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
-    """Fail unless the buffers agree to the tolerance of their dtype."""
-    for name in buffers:
-        assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name)
-
-
-# Agreement with the reference
-
-
-def loss(out: Any) -> torch.Tensor:
-    """Sum of all differentiable buffers with fixed random factors."""
-    generator = torch.Generator().manual_seed(7)
-    total = out.image.new_zeros(())
-    for name in BUFFERS:
-        buffer = getattr(out, name)
-        factors = torch.randn(buffer.shape, generator=generator, dtype=torch.float64)
-        total = total + (buffer * factors.to(buffer)).sum()
-    return total
-
-
-def reference_render(
-    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, **options: Any
-) -> reference.Rendering:
-    """Hand the public objects, in float64 on the CPU, to the reference."""
-    field = None
-    if texture is not None:
-        mlp = list(texture.mlp.parameters())
-        field = reference.Texture(texture.grid, texture.resolutions.double(), mlp, texture.residual)
-    return reference.render(
-        surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas, surfels.sh, field,
-        camera.viewmat, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
-        **options,
-    )  # fmt: skip
-
-
-def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:
-    """Derivative (6,) along the rigid motions applied behind `viewmat`: three turns, three shifts."""
-    generators = torch.zeros(6, 4, 4, dtype=torch.float64)
-    for axis in range(3):
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        generators[axis, b, a], generators[axis, a, b] = 1.0, -1.0
-        generators[axis + 3, axis, 3] = 1.0
-    moved = generators @ viewmat.detach().double().cpu()
-    return (moved * present(viewmat.grad).double().cpu()).sum(dim=(1, 2))
-
-
-def twin(module: torch.nn.Module | None) -> Any:
-    """Copy a module to float64 on the CPU."""
-    return None if module is None else copy.deepcopy(module).double().cpu()
-
-
-CASES = [
-    # scene, textured (True, False or "residual"), max_hits, low_pass, sh_degree, clamp_texture
-    ("random", True, 2, False, 3, False),
-    ("random", True, 1, True, 1, True),
-    ("random", True, 4, False, 2, True),
-    ("random", False, 2, True, 3, False),
-    ("random", True, 0, False, 3, False),
-    ("layered", True, 2, True, 3, False),
-    ("layered", True, 8, False, 0, True),
-    ("layered", False, 1, False, 2, False),
-    ("off_centre", True, 8, True, 2, False),
-    ("off_centre", True, 2, False, 3, True),
-    ("specks", True, 2, True, 3, False),
-    ("specks", False, 4, False, 1, False),
-    ("random", "residual", 2, False, 3, False),
-    ("layered", "residual", 8, True, 1, False),
-    ("off_centre", "residual", 1, False, 2, False),
-    ("random", "residual", 0, False, 3, False),
-]
-
-
-def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
-    if name == "layered":
-        return layered_scene(dtype=dtype, device=device)
-    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
-    if name == "specks":
-        scene["scales"] *= 0.1
-    return scene
-
-
-@pytest.mark.parametrize("row", [torch.float64, torch.float32, torch.float16])
-@pytest.mark.parametrize(("name", "textured", "max_hits", "low_pass", "sh_degree", "clamp_texture"), CASES)
-def test_render_agrees_with_the_reference(
-    name: str,
-    textured: bool | str,
-    max_hits: int,
-    low_pass: bool,
-    sh_degree: int,
-    clamp_texture: bool,
-    row: torch.dtype,
-    device: torch.device,
-) -> None:
-    """Values, and gradients with respect to every parameter, to the feature grid, the MLP and the camera.
-
-    The row float16 is float32 with the texture in half precision, the default on CUDA; its parameters are rounded
-    to half precision first, since those are the ones that are rendered.
-    """
-    half = row == torch.float16
-    if half and (device.type == "cpu" or not textured):
-        pytest.skip("half precision is for textures on CUDA")
-    dtype = torch.float32 if half else row
-    scene = make_scene(name, dtype, device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    residual = textured == "residual"
-    texture = make_texture(dtype=dtype, device=device, residual=residual) if textured else None
-    if texture is not None:
-        texture.half_precision = half
-        if half:
-            texture.half().float()
-    options: dict[str, Any] = {
-        "max_hits": max_hits,
-        "background": BACKGROUND,
-        "sh_degree": sh_degree,
-        "low_pass": low_pass,
-        "clamp_texture": clamp_texture,
-    }
-    flips = 0.0 if dtype == torch.float64 else FLIPS
-
-    surfels64, texture64 = twin(surfels), twin(texture)
-    camera64 = make_camera(scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()})
-    out = nw.render(surfels, texture, camera, **options)
-    expected = reference_render(surfels64, texture64, camera64, **options)
-    loss(out).backward()
-    loss(expected).backward()
-
-    assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
-    for buffer in BUFFERS:
-        values = getattr(out, buffer), getattr(expected, buffer)
-        assert_close(*values, kind="value", name=buffer, precision=row, allow_flips=flips)
-    assert_gradients(surfels, surfels64, row)
-    if texture is not None:
-        assert_gradients(texture, texture64, row)
-    assert_close(
-        rigid_gradient(camera.viewmat),
-        rigid_gradient(camera64.viewmat),
-        kind="gradient",
-        name="viewmat",
-        precision=row,
-    )
-
-
-def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: torch.dtype) -> None:
-    """Fail unless all parameters have the same gradients; one that is missing counts as zero."""
-    parameters = dict(actual.named_parameters())
-    for name, parameter in expected.named_parameters():
-        gradients = [
-            torch.zeros_like(value) if value.grad is None else value.grad for value in (parameters[name], parameter)
-        ]
-        assert_close(*gradients, kind="gradient", name=name, precision=row)
-
-
-# Laws
 
 
 def test_repeated_renders_are_identical(device: torch.device) -> None:
@@ -278,117 +104,6 @@ def test_buffers_follow_their_definition(device: torch.device) -> None:
     assert out.ids.dtype == torch.int32 and out.image.dtype == torch.float32
     behind = (1 - out.alpha)[..., None] * torch.tensor(BACKGROUND, device=device)
     assert_close(out.image, out.plain + out.textured + behind, kind="value", name="image")
-
-
-@pytest.mark.parametrize("max_hits", [0, 2, MAX_HITS])
-def test_a_residual_texture_of_zeros_shows_the_plain_colours(max_hits: int, device: torch.device) -> None:
-    """What no photo looked at: features that the regulariser has taken to 0."""
-    scene = random_scene(device=device)
-    texture = make_texture(device=device, residual=True)
-    torch.nn.init.zeros_(texture.grid)
-    assert_alike(draw(scene, texture, max_hits=max_hits), draw(scene, max_hits=max_hits))
-    absent = draw(scene, make_texture(device=device), max_hits=0)
-    assert_alike(draw(scene, texture, max_hits=max_hits), absent, ("image", "alpha"))
-
-
-def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    with_it, without = (draw(scene, make_texture(device=device, residual=flag)) for flag in (True, False))
-    shift = draw(scene).textured - 0.5 * without.weights.sum(-1, keepdim=True)
-    assert_close(with_it.textured, without.textured + shift, kind="value", name="textured")
-    with pytest.raises(ValueError, match=r"^clamp_texture: expected False with a residual texture, got True$"):
-        draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
-
-
-class Lookups:
-    """A texture's lookups: what `render` asks of it, and the answers."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        colors = nw.NeuralTexture.colors
-        self.positions: list[torch.Tensor] = []
-
-        def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
-            self.positions.append(positions.detach())
-            return colors(texture, positions, *arguments, **options)
-
-        monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
-
-
-@pytest.mark.parametrize("jitter", [0.5, 3.0])
-def test_jitter_moves_lookups_along_their_rays(
-    jitter: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
-    scene = random_scene(width=120, height=90, device=device)
-    texture, lookups = make_texture(device=device), Lookups(monkeypatch)
-    still = draw(scene, texture)
-    torch.manual_seed(3)
-    moved = draw(scene, texture, depth_jitter=jitter)
-    assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
-    assert torch.equal(moved.ids, still.ids)
-    camera, hit = make_camera(scene), still.ids >= 0
-    before, after = (x[hit] - camera.position.detach() for x in lookups.positions)
-    share = after.norm(dim=-1) / before.norm(dim=-1)
-    assert_close(after, before * share[:, None], kind="value", name="along the ray")
-    pixels = (share - 1) * camera.focal
-    assert len(pixels) > 5000
-    error = 5 / len(pixels) ** 0.5  # five standard deviations of what is estimated
-    assert abs(pixels.mean().item()) < error * jitter
-    assert abs(pixels.std().item() - jitter) < error * jitter
-    assert not torch.equal(moved.textured, still.textured)
-    torch.manual_seed(3)
-    assert_same(draw(scene, texture, depth_jitter=jitter), moved)
-    own = [torch.Generator(device).manual_seed(3) for _ in range(2)]
-    assert_same(*(draw(scene, texture, depth_jitter=jitter, generator=generator) for generator in own))
-    assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
-    drawn = jitter_factors(camera, 2, jitter, scene["means"].dtype, own[0].manual_seed(3))
-    assert_same(draw(scene, texture, depth_jitter=drawn), moved)
-
-
-def test_without_jitter_no_random_number_is_drawn(device: torch.device) -> None:
-    scene, texture = random_scene(device=device), make_texture(device=device)
-    torch.manual_seed(3)
-    expected = torch.rand((), device=device)
-    torch.manual_seed(3)
-    assert_same(draw(scene, texture, depth_jitter=0.0), draw(scene, texture))
-    assert torch.rand((), device=device) == expected
-
-
-@pytest.mark.parametrize("max_hits", [1, 2, 4])
-def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -> None:
-    """Values and gradients of what was drawn at random: surfels and camera move the points that are looked up."""
-    scene, jitter = random_scene(dtype=torch.float64, device=device), 2.0
-    surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(dtype=torch.float64, device=device)
-    surfels64, camera64, texture64 = (
-        twin(surfels),
-        make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")}),
-        twin(texture),
-    )
-    options: dict[str, Any] = {"max_hits": max_hits, "background": BACKGROUND}
-    torch.manual_seed(3)
-    drawn = torch.randn(camera.height, camera.width, max_hits, dtype=torch.float64, device=device)
-    shares = (1 + drawn * jitter / camera.focal).cpu()
-    expected = reference_render(surfels64, texture64, camera64, shares=shares, **options)
-    torch.manual_seed(3)
-    out = nw.render(surfels, texture, camera, depth_jitter=jitter, **options)
-    loss(out).backward()
-    loss(expected).backward()
-    for buffer in BUFFERS:
-        assert_close(getattr(out, buffer), getattr(expected, buffer), kind="value", name=buffer)
-    assert_gradients(surfels, surfels64, torch.float64)
-    assert_gradients(texture, texture64, torch.float64)
-    moved = rigid_gradient(camera.viewmat), rigid_gradient(camera64.viewmat)
-    assert_close(*moved, kind="gradient", name="viewmat", precision=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("jitter", "error"),
-    [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError), (torch.ones(2, 3), ValueError)],
-    ids=str,
-)
-def test_jitter_that_cannot_be_is_refused(jitter: Any, error: type[Exception], device: torch.device) -> None:
-    with pytest.raises(error, match=r"^depth_jitter: expected "):
-        draw(random_scene(device=device), make_texture(device=device), depth_jitter=jitter)
 
 
 def test_background_may_be_a_tensor(device: torch.device) -> None:
@@ -494,26 +209,6 @@ def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
     assert_same_ids(out.ids, most.ids[..., :max_hits], name="ids")
     for name in ("weights", "depths"):
         assert_close(getattr(out, name), getattr(most, name)[..., :max_hits], kind="value", name=name)
-
-
-def test_grid_can_be_written_in_place(device: torch.device) -> None:
-    scene, texture = random_scene(device=device), make_texture(device=device)
-    first = draw(scene, texture).textured
-    with torch.no_grad():
-        texture.grid.neg_()
-    assert not torch.equal(draw(scene, texture).textured, first)
-    with torch.no_grad():
-        texture.grid.neg_()
-    assert torch.equal(draw(scene, texture).textured, first)
-
-
-@pytest.mark.parametrize("sh_degree", [0, 1, 2])
-def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None:
-    scene = random_scene(dtype=torch.float64, device=device)
-    texture = make_texture(sh_degree=sh_degree, dtype=torch.float64, device=device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    out = nw.render(surfels, texture, camera)
-    assert_alike(out, reference_render(twin(surfels), twin(texture), camera.to("cpu")))
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9])

@@ -17,7 +17,7 @@ from nexwarp.errors import CheckpointError
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.schedules import OptimizerMaker, ParameterGroup
-from tests.test_trainer import assert_same_state
+from tests.trainer_support import assert_same_state
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

@@ -1,0 +1,85 @@
+"""Helpers render test scenes, hand them to the reference, and compare results."""
+
+import copy
+from typing import Any
+
+import torch
+
+import nexwarp as nw
+from tests.narrowing import present
+from tests.reference import render as reference
+from tests.scenes import Scene, make_camera, make_surfels
+from tests.tolerances import assert_close
+
+BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
+BACKGROUND = (0.1, 0.4, 0.7)
+MAX_HITS = 8
+
+
+def draw(scene: Scene, texture: nw.NeuralTexture | None = None, **options: Any) -> Any:
+    """Render `scene` over the test background."""
+    return nw.render(make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options))
+
+
+def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
+    """Fail unless the buffers are the same to the last bit."""
+    for name in buffers:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+
+
+def assert_alike(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:
+    """Fail unless the buffers agree to the tolerance of their dtype."""
+    for name in buffers:
+        assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name)
+
+
+def loss(out: Any) -> torch.Tensor:
+    """Sum of all differentiable buffers with fixed random factors."""
+    generator = torch.Generator().manual_seed(7)
+    total = out.image.new_zeros(())
+    for name in BUFFERS:
+        buffer = getattr(out, name)
+        factors = torch.randn(buffer.shape, generator=generator, dtype=torch.float64)
+        total = total + (buffer * factors.to(buffer)).sum()
+    return total
+
+
+def reference_render(
+    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, **options: Any
+) -> reference.Rendering:
+    """Hand the public objects, in float64 on the CPU, to the reference."""
+    field = None
+    if texture is not None:
+        mlp = list(texture.mlp.parameters())
+        field = reference.Texture(texture.grid, texture.resolutions.double(), mlp, texture.residual)
+    return reference.render(
+        surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas, surfels.sh, field,
+        camera.viewmat, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
+        **options,
+    )  # fmt: skip
+
+
+def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:
+    """Derivative (6,) along the rigid motions applied behind `viewmat`: three turns, three shifts."""
+    generators = torch.zeros(6, 4, 4, dtype=torch.float64)
+    for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        generators[axis, b, a], generators[axis, a, b] = 1.0, -1.0
+        generators[axis + 3, axis, 3] = 1.0
+    moved = generators @ viewmat.detach().double().cpu()
+    return (moved * present(viewmat.grad).double().cpu()).sum(dim=(1, 2))
+
+
+def twin(module: torch.nn.Module | None) -> Any:
+    """Copy a module to float64 on the CPU."""
+    return None if module is None else copy.deepcopy(module).double().cpu()
+
+
+def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: torch.dtype) -> None:
+    """Fail unless all parameters have the same gradients; one that is missing counts as zero."""
+    parameters = dict(actual.named_parameters())
+    for name, parameter in expected.named_parameters():
+        gradients = [
+            torch.zeros_like(value) if value.grad is None else value.grad for value in (parameters[name], parameter)
+        ]
+        assert_close(*gradients, kind="gradient", name=name, precision=row)

@@ -1,0 +1,131 @@
+"""Every render agrees with the dense reference, in values and gradients."""
+
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from tests.render_support import BACKGROUND, BUFFERS, assert_gradients, loss, reference_render, rigid_gradient, twin
+from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import FLIPS, assert_close, assert_same_ids
+
+# On a CPU both forms of the kernels: see `conftest.form`.
+pytestmark = pytest.mark.usefixtures("form")
+
+CASES = [
+    # scene, textured (True, False or "residual"), max_hits, low_pass, sh_degree, clamp_texture
+    ("random", True, 2, False, 3, False),
+    ("random", True, 1, True, 1, True),
+    ("random", True, 4, False, 2, True),
+    ("random", False, 2, True, 3, False),
+    ("random", True, 0, False, 3, False),
+    ("layered", True, 2, True, 3, False),
+    ("layered", True, 8, False, 0, True),
+    ("layered", False, 1, False, 2, False),
+    ("off_centre", True, 8, True, 2, False),
+    ("off_centre", True, 2, False, 3, True),
+    ("specks", True, 2, True, 3, False),
+    ("specks", False, 4, False, 1, False),
+    ("random", "residual", 2, False, 3, False),
+    ("layered", "residual", 8, True, 1, False),
+    ("off_centre", "residual", 1, False, 2, False),
+    ("random", "residual", 0, False, 3, False),
+]
+
+
+def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
+    if name == "layered":
+        return layered_scene(dtype=dtype, device=device)
+    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
+    if name == "specks":
+        scene["scales"] *= 0.1
+    return scene
+
+
+@pytest.mark.parametrize("row", [torch.float64, torch.float32, torch.float16])
+@pytest.mark.parametrize(("name", "textured", "max_hits", "low_pass", "sh_degree", "clamp_texture"), CASES)
+def test_render_agrees_with_the_reference(
+    name: str,
+    textured: bool | str,
+    max_hits: int,
+    low_pass: bool,
+    sh_degree: int,
+    clamp_texture: bool,
+    row: torch.dtype,
+    device: torch.device,
+) -> None:
+    """Values, and gradients with respect to every parameter, to the feature grid, the MLP and the camera.
+
+    The row float16 is float32 with the texture in half precision, the default on CUDA; its parameters are rounded
+    to half precision first, since those are the ones that are rendered.
+    """
+    half = row == torch.float16
+    if half and (device.type == "cpu" or not textured):
+        pytest.skip("half precision is for textures on CUDA")
+    dtype = torch.float32 if half else row
+    scene = make_scene(name, dtype, device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    residual = textured == "residual"
+    texture = make_texture(dtype=dtype, device=device, residual=residual) if textured else None
+    if texture is not None:
+        texture.half_precision = half
+        if half:
+            texture.half().float()
+    options: dict[str, Any] = {
+        "max_hits": max_hits,
+        "background": BACKGROUND,
+        "sh_degree": sh_degree,
+        "low_pass": low_pass,
+        "clamp_texture": clamp_texture,
+    }
+    flips = 0.0 if dtype == torch.float64 else FLIPS
+
+    surfels64, texture64 = twin(surfels), twin(texture)
+    camera64 = make_camera(scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()})
+    out = nw.render(surfels, texture, camera, **options)
+    expected = reference_render(surfels64, texture64, camera64, **options)
+    loss(out).backward()
+    loss(expected).backward()
+
+    assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
+    for buffer in BUFFERS:
+        values = getattr(out, buffer), getattr(expected, buffer)
+        assert_close(*values, kind="value", name=buffer, precision=row, allow_flips=flips)
+    assert_gradients(surfels, surfels64, row)
+    if texture is not None:
+        assert_gradients(texture, texture64, row)
+    assert_close(
+        rigid_gradient(camera.viewmat),
+        rigid_gradient(camera64.viewmat),
+        kind="gradient",
+        name="viewmat",
+        precision=row,
+    )
+
+
+@pytest.mark.parametrize("max_hits", [1, 2, 4])
+def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -> None:
+    """Values and gradients of what was drawn at random: surfels and camera move the points that are looked up."""
+    scene, jitter = random_scene(dtype=torch.float64, device=device), 2.0
+    surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(dtype=torch.float64, device=device)
+    surfels64, camera64, texture64 = (
+        twin(surfels),
+        make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")}),
+        twin(texture),
+    )
+    options: dict[str, Any] = {"max_hits": max_hits, "background": BACKGROUND}
+    torch.manual_seed(3)
+    drawn = torch.randn(camera.height, camera.width, max_hits, dtype=torch.float64, device=device)
+    shares = (1 + drawn * jitter / camera.focal).cpu()
+    expected = reference_render(surfels64, texture64, camera64, shares=shares, **options)
+    torch.manual_seed(3)
+    out = nw.render(surfels, texture, camera, depth_jitter=jitter, **options)
+    loss(out).backward()
+    loss(expected).backward()
+    for buffer in BUFFERS:
+        assert_close(getattr(out, buffer), getattr(expected, buffer), kind="value", name=buffer)
+    assert_gradients(surfels, surfels64, torch.float64)
+    assert_gradients(texture, texture64, torch.float64)
+    moved = rigid_gradient(camera.viewmat), rigid_gradient(camera64.viewmat)
+    assert_close(*moved, kind="gradient", name="viewmat", precision=torch.float64)

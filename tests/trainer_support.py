@@ -1,0 +1,64 @@
+"""Helpers run short trainings, and compare all that a training's future depends on."""
+
+import dataclasses
+from typing import Any
+
+import torch
+
+import nexwarp as nw
+from nexwarp.data import Scene, View
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.trainer import Trainer
+
+TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
+# Rounds of density control at 3, 6 and 9 of 12 iterations, so that a short run has them all.
+OFTEN = DensifyConfig(every=3)
+
+
+def small(**changes: Any) -> Config:
+    settings: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE, "densify": OFTEN}
+    return Config(**(settings | changes))
+
+
+def state_of(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Every tensor that the future of a run depends on."""
+    state: dict[str, torch.Tensor] = dict(trainer._named_parameters())
+    for name, parameter in list(state.items()):
+        state |= {f"adam.{name}.{k}": v for k, v in trainer.optimizer.state[parameter].items()}
+    state |= {"errors": trainer.densifier.errors, "generator": trainer.generator.get_state()}
+    state |= {"order": torch.tensor(trainer.order), "iteration": torch.tensor(trainer.iteration)}
+    return {name: value.detach().clone() for name, value in state.items()}
+
+
+def assert_same_state(one: Trainer, other: Trainer) -> None:
+    first, second = state_of(one), state_of(other)
+    assert first.keys() == second.keys()
+    different = [name for name, value in first.items() if not torch.equal(value, second[name])]
+    assert not different, different
+
+
+def trained(scene: Scene, config: Config) -> Trainer:
+    trainer = Trainer(scene, config, "cpu")
+    trainer.run()
+    return trainer
+
+
+def rescaled(scene: Scene, factor: float) -> Scene:
+    """The same scene in other units."""
+
+    def moved(view: View) -> View:
+        c = view.camera
+        viewmat = c.viewmat.clone()
+        viewmat[:3, 3] *= factor
+        camera = nw.Camera(viewmat, c.K, c.width, c.height, near=c.near * factor)
+        assert view.points is not None
+        return dataclasses.replace(view, camera=camera, points=view.points * factor)
+
+    return dataclasses.replace(
+        scene,
+        train=[moved(view) for view in scene.train],
+        test=[moved(view) for view in scene.test],
+        points=scene.points * factor,
+        scale=scene.scale * factor,
+    )
