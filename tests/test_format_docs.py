@@ -207,5 +207,9 @@ def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
     shutil.copytree(run, tmp_path / "runs" / "demo")
     monkeypatch.chdir(tmp_path)
     assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
-    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
-    exec(example, {})
+    examples = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
+    assert len(examples) == 2
+    for example in examples:
+        exec(example, {})
+    views = len(list((tmp_path / "runs" / "demo" / "renders" / "test").glob("*.png")))
+    assert len(list(tmp_path.glob("*.npy"))) == len(list(tmp_path.glob("depth_*.png"))) == views > 0
