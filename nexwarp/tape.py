@@ -3,7 +3,7 @@
 Arrays are Warp arrays of one scalar type (float32 or float64) on one device; what is to receive gradients is made with
 `requires_grad=True`. Outputs own gradients. The generated adjoints record themselves, since the calls launch under the
 tape; the hand-structured pairs go through `tape.record_func`. The same kernels serve torch in `nexwarp.ops`. What
-`nexwarp.render` adds for trained models is not here: exposures, and looks from closer or farther than training had.
+`nexwarp.render` adds for trained models is not here: exposures and detail limits.
 
     tape = wp.Tape()
     records, centers, limits = project(tape, ...)

@@ -207,14 +207,14 @@ def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
         trainer.run(until=10)
     seen: dict[str, list[tuple[int, int]]] = {}
     model = one.finish(lambda stage, done, total: seen.setdefault(stage, []).append((done, total)))
-    assert list(seen) == ["smoothing SH", "measuring footprints", "metering exposures"]
+    assert list(seen) == ["smoothing SH", "measuring detail limits", "predicting auto exposure"]
     views = len(scene.train)
     for stage, counts in seen.items():
         assert [done for done, _ in counts] == [*range(1, len(counts) + 1)], stage
-        assert {total for _, total in counts} == {views if stage != "metering exposures" else counts[0][1]}, stage
-    assert len(seen["smoothing SH"]) == len(seen["measuring footprints"]) == views
-    assert len(seen["metering exposures"]) in (views, seen["metering exposures"][0][1])
-    assert seen["metering exposures"][0][1] >= views + PLACES
+        assert {total for _, total in counts} == {views if stage != "predicting auto exposure" else counts[0][1]}, stage
+    assert len(seen["smoothing SH"]) == len(seen["measuring detail limits"]) == views
+    assert len(seen["predicting auto exposure"]) in (views, seen["predicting auto exposure"][0][1])
+    assert seen["predicting auto exposure"][0][1] >= views + PLACES
     assert model.detail_limits is not None and model.exposures is not None
     for trainer in (one, other):
         trainer.run()

@@ -63,12 +63,12 @@ def finish_model(
             sh0, shN = smooth_sh(finished, counted(views, "smoothing SH", observe), settings.smooth_sh)
         finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
     if settings.detail_limits:
-        seen = counted(cameras, "measuring footprints", observe)
+        seen = counted(cameras, "measuring detail limits", observe)
         finished.detail_limits = measure_detail_limits(finished, seen)
     if exposures is not None:
         exposures = copy.deepcopy(exposures)
         if settings.auto_exposure:
-            progress = partial(observe, "metering exposures")
+            progress = partial(observe, "predicting auto exposure")
             exposures = with_auto_exposure(exposures, finished, cameras, progress=progress)
         finished.exposures = exposures.to(model.device)
     finished.meta = model.meta | {"smooth_sh": settings.smooth_sh}
