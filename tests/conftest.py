@@ -96,8 +96,8 @@ def one_torch_thread() -> Iterator[None]:
 def few_looks() -> Iterator[None]:
     """Looks for floaters are few: those at the end of a training take a second, which few tests are about."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(floaters, "LOOKS", 6)
-        patch.setattr(floaters, "LAST_LOOKS", 12)
+        patch.setattr(floaters, "PROBES", 6)
+        patch.setattr(floaters, "LAST_PROBES", 12)
         yield
 
 

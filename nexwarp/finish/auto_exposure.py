@@ -1,8 +1,8 @@
-"""Automatic exposure: what a camera elsewhere would have set, looking at the trained scene.
+"""Auto exposure: predicts the gains of cameras without a photo from the brightness that they see.
 
-A camera with automatic exposure sets its gains by how bright what it sees is. Where the training photos' gains follow
-the brightness that the trained scene has before their cameras, they tell those of other cameras better than the photos
-around do, most where photos are far: there are renderings to meter.
+A camera with automatic exposure sets its gains by the brightness of the scene. If the gains of the training photos
+depend on the brightness of renderings at their cameras, renderings at other cameras predict the gains there. That is
+better than interpolating between photos, above all far from them.
 """
 
 import itertools
@@ -22,11 +22,16 @@ from nexwarp.representation.exposures import (
     NOISES,
     TINY,
     Exposures,
-    _apart,
-    _fit,
-    _matern,
-    _poses,
+    fit_process,
+    matern_kernel,
+    pose_distances,
+    poses_of,
 )
+
+PLACES = 240  # cameras between the training cameras whose gains are predicted, at least
+HEIGHT = 64  # height of the renderings that measure brightness, pixels
+LINEAR = 2.2  # exponent that turns sRGB values into linear light
+DARKEST = 1e-3  # least mean colour; darker ones count as this
 
 
 @one_thread()
@@ -37,42 +42,47 @@ def predict(
     others: Sequence[Camera],
     others_brightness: Callable[[], torch.Tensor],
 ) -> torch.Tensor | None:
-    """Predict other cameras' log gains (M, 3) float64, as automatic exposure has them: by what they see.
+    """Predict the log gains (M, 3) float64 of other cameras from the brightness that they see.
 
-    A process of the pose, as `Exposures`, and beside it linear in the brightness: each channel in those of all three.
-    None where that predicts each photo from the others no better than the pose alone, by Akaike's criterion, corrected
-    for few photos. Channels are not independent there: what goes wrong with a photo (its exposure was set by hand, the
-    scene learnt it by heart) goes wrong with all of them.
+    The prediction is a Gaussian process of the pose, as in `Exposures`, plus a linear function of the brightness: each
+    channel depends on the brightness of all three. It is compared with the process alone by predicting each photo from
+    the others, with Akaike's criterion corrected for few photos. The criterion takes the channels of a photo as
+    dependent, since a photo that is an outlier is one in all of them.
 
     Args:
-        log_gains: (V, 3) of photos.
-        cameras: of those.
-        brightness: (V, 3) float64 on the CPU, logarithms, of what is before them (`brightness`).
-        others: M cameras.
-        others_brightness: gives (M, 3), likewise; not called where there is nothing to predict.
+        log_gains: (V, 3) log gains of photos.
+        cameras: their V cameras.
+        brightness: (V, 3) float64 on the CPU, log brightness at these cameras (`brightness`).
+        others: M other cameras.
+        others_brightness: returns (M, 3) log brightness at the others; called only if it is needed.
+
+    Returns:
+        The log gains; None if brightness does not improve the prediction.
     """
     values = log_gains.cpu().double()
-    here, there = (_poses(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))
-    size, squares = _apart(*here)
+    here, there = (poses_of(torch.stack([c.viewmat.cpu().double() for c in each])) for each in (cameras, others))
+    size, squares = pose_distances(*here)
     seen = brightness - brightness.mean(0)
-    poses = [(_matern(squares, length * size), length * size) for length in LENGTHS]
-    alone = min((_fit(kernel, values, noise) for kernel, _ in poses for noise in NOISES), key=lambda fit: fit[0])
-    # Slopes as large as the process is, a priori.
-    fits = [(*_fit(kernel + seen @ seen.T, values, noise), length) for kernel, length in poses for noise in NOISES]
+    poses = [(matern_kernel(squares, length * size), length * size) for length in LENGTHS]
+    alone = min((fit_process(kernel, values, noise) for kernel, _ in poses for noise in NOISES), key=lambda fit: fit[0])
+    # The slopes' prior variance is that of the process.
+    fits = [
+        (*fit_process(kernel + seen @ seen.T, values, noise), length) for kernel, length in poses for noise in NOISES
+    ]
     _, errors, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
     if not _better(errors, alone[1], seen.shape[1]):
         return None
     points, more = (torch.cat([position, size * direction], 1) for position, direction in (here, there))
-    kernel = _matern(torch.cdist(more, points).square(), length)
+    kernel = matern_kernel(torch.cdist(more, points).square(), length)
     found = mean + (kernel + (others_brightness() - brightness.mean(0)) @ seen.T) @ coefficients
     return found.clamp(values.amin(0), values.amax(0)).round(decimals=DECIMALS)
 
 
 def _better(errors: torch.Tensor, others: torch.Tensor, slopes: int) -> bool:
-    """Whether errors (V, 3), of a fit with so many slopes a channel, are less than others (V, 3) by Akaike's criterion.
+    """Return whether Akaike's criterion prefers a fit with errors (V, 3) and `slopes` per channel to one without.
 
-    Of errors that are normal, and dependent from channel to channel, with the correction for few photos (Bedrick and
-    Tsai 1994, Model selection for multivariate regression in small samples).
+    The criterion is that of normal errors, dependent between channels, corrected for few photos (Bedrick and Tsai 1994,
+    Model selection for multivariate regression in small samples). `others` (V, 3) are the errors without slopes.
     """
     photos, channels = errors.shape
 
@@ -85,12 +95,6 @@ def _better(errors: torch.Tensor, others: torch.Tensor, slopes: int) -> bool:
         return photos * torch.logdet(squares).item() + 2 * parameters * photos / left
 
     return criterion(errors, 1 + slopes) < criterion(others, 1)
-
-
-PLACES = 240  # between the cameras, that are metered, at least
-HEIGHT = 64  # of the renderings that tell brightness, pixels
-LINEAR = 2.2  # sRGB to light, as an exponent
-DARKEST = 1e-3  # mean colour that is told from darker ones
 
 
 @torch.no_grad()

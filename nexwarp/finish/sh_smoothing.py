@@ -1,15 +1,14 @@
-"""Colours of surfels in directions that no photo looked from: smooth, at a small cost in those that photos have.
+"""SH smoothing: makes a surfel's colour smooth in directions that no training view has. Not in the paper.
 
-A surfel's spherical harmonics are learnt from the directions that photos have of it, often few and close to each other.
-What they give elsewhere is an accident of the optimizer's way, and degree 3 strays far: pink and green, where a capture
-has a gap. Once trained, each surfel's coefficients c are therefore taken by ridge regression to
+A surfel's SH are trained only in the directions of the photos that show it, often few and close to each other. In other
+directions the colour is arbitrary, and with degree 3 it can become pink or green. After training, a ridge regression
+replaces each surfel's coefficients c by
 
     argmin over x of  sum_v w_v |Y(d_v) (x - c)|^2 / sum_v w_v  +  strength |D x|^2,
 
-where w_v is the sum of the surfel's blending weights in training view v, its textured hits' included, d_v its direction
-there, Y the harmonics, before colours are limited to >= 0, and D the Laplacian on the sphere, -l (l + 1) for degree l,
-over that of degree 3: what training views show stays almost as it is, and the rest is as even as that allows. Not in
-the paper.
+where w_v is the sum of the surfel's blending weights in training view v, textured hits included; d_v its direction in
+that view; Y the harmonics, before colours are clamped to >= 0; and D the Laplacian on the sphere, -l (l + 1) for degree
+l, divided by that of degree 3. The colours in the training views change little; all others become as even as possible.
 """
 
 from collections.abc import Iterable
@@ -20,21 +19,22 @@ from nexwarp import ops
 from nexwarp.data import View
 from nexwarp.model.model import Model
 
-SURFELS = 2**15  # whose equations are added to and solved at once
-LEAST = 1e-6  # pixels that a surfel has in all views, at least, if it is seen
-MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # beside 0; less would be lost in the harmonics' rounding
+SURFELS = 2**15  # number of surfels whose equations are solved at once
+LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
+MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # 0 is allowed too; less is lost in the harmonics' rounding
 
 
 @torch.no_grad()
 def smooth_sh(model: Model, views: Iterable[View], strength: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the surfels' coefficients, `sh0` (N, 1, 3) and `shN` (N, C - 1, 3), as smooth as training views allow.
+    """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3).
 
-    A surfel that no view shows gets one colour, that of its `sh0`. Coefficients above the degree that is rendered stay.
+    A surfel that no view shows gets one colour for all directions, that of its `sh0`. Coefficients above the rendered
+    degree do not change.
 
     Args:
-        model: its N surfels and options count; they stay as they are.
-        views: all training views, on any device; what their masks leave out tells nothing.
-        strength: `MIN_STRENGTH` to `MAX_STRENGTH`, what smoothness counts; all of a surfel's weight counts 1.
+        model: its N surfels and options are used; it does not change.
+        views: all training views, on any device; masked pixels do not count.
+        strength: factor of the smoothness term, `MIN_STRENGTH` to `MAX_STRENGTH`; the data term has factor 1.
     """
     surfels = model.surfels
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
@@ -62,14 +62,14 @@ def smooth_sh(model: Model, views: Iterable[View], strength: float) -> tuple[tor
 
 @torch.no_grad()
 def seen_directions(model: Model, views: Iterable[View]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return which directions views have of each surfel: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
+    """Return the normal equations of the regression: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
 
-    In float64: what float32 rounds away of a sum of products is more than a weak smoothing adds to it.
+    Both are float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
 
     Args:
-        model: its N surfels and options count; C is the number of their coefficients a channel that are rendered; pairs
-            i <= j are P = C (C + 1) / 2, row by row of a matrix's upper triangle.
-        views: v, on any device; pixels that their masks leave out do not count.
+        model: its N surfels and options are used. With C rendered coefficients per channel there are
+            P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle.
+        views: views v, on any device; masked pixels do not count.
     """
     bare = model.bare()
     surfels = bare.surfels
@@ -96,12 +96,12 @@ def _pairs(count: int, device: torch.device) -> tuple[torch.Tensor, torch.Tensor
 
 
 def _count(model: Model) -> int:
-    """Coefficients a channel that are rendered."""
+    """Return the number of coefficients per channel that are rendered."""
     return min(model.surfels.shN.shape[1] + 1, (model.options.sh_degree + 1) ** 2)
 
 
 def _basis(means: torch.Tensor, position: torch.Tensor, count: int) -> torch.Tensor:
-    """Spherical harmonics (N, C) of the directions to surfels, as their colours have them: the derivative of those."""
+    """Return the harmonics (N, C) of the directions to the surfels, as derivatives of their colours."""
     sh = means.new_zeros(len(means), count, 3).requires_grad_()
     with torch.enable_grad():
         colors = ops.plain_colors(sh, means, position, round(count**0.5) - 1)

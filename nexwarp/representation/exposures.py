@@ -109,12 +109,12 @@ class Exposures(nn.Module):
         """
         viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
         stride = -(-len(cameras) // MOST_PHOTOS)
-        positions, directions = (x[::stride] for x in _poses(viewmats))
+        positions, directions = (x[::stride] for x in poses_of(viewmats))
         gains = log_gains.double()[::stride]
         with one_thread():
-            size, squares = _apart(positions, directions)
-            kernels = [(_matern(squares, length * size), length * size) for length in LENGTHS]
-            fits = [(*_fit(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
+            size, squares = pose_distances(positions, directions)
+            kernels = [(matern_kernel(squares, length * size), length * size) for length in LENGTHS]
+            fits = [(*fit_process(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
             _, _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         return cls(
             gains.float(),
@@ -133,10 +133,10 @@ class Exposures(nn.Module):
     @torch.no_grad()
     def gains(self, camera: Camera) -> torch.Tensor:
         """Return a camera's gains (3,), within the range of the photos' gains; far from all photos, their mean."""
-        position, direction = _poses(camera.viewmat.to(self.positions))
+        position, direction = poses_of(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)
         squares = (self.positions - position).square().sum(1) + turned.square().sum(1)
-        log_gains = self.mean + _matern(squares, self.lengths[1]) @ self.coefficients
+        log_gains = self.mean + matern_kernel(squares, self.lengths[1]) @ self.coefficients
         return log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
 
     @torch.no_grad()
@@ -168,20 +168,20 @@ class Exposures(nn.Module):
         return falloff
 
 
-def _matern(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
+def matern_kernel(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
     """Evaluate the Matern 3/2 kernel at squared distances."""
     r = (3 * squares).sqrt() / length
     return (1 + r) * torch.exp(-r)
 
 
-def _apart(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def pose_distances(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the RMS spread of camera positions (V, 3), and the squared distances (V, V) of poses."""
     size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
     poses = torch.cat([positions, size * directions], 1)
     return size, torch.cdist(poses, poses).square()
 
 
-def _fit(
+def fit_process(
     kernel: torch.Tensor, values: torch.Tensor, noise: float
 ) -> tuple[float, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Fit a process with a kernel matrix (V, V) to values (V, 3).
@@ -197,7 +197,7 @@ def _fit(
     return round(errors.square().sum().item(), 9), errors, coefficients, mean
 
 
-def _poses(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def poses_of(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return positions and viewing directions (..., 3) of world-to-camera matrices (..., 4, 4)."""
     rotation, shift = viewmats[..., :3, :3], viewmats[..., :3, 3:]
     return -(rotation.mT @ shift)[..., 0], rotation[..., 2, :]

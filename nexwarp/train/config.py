@@ -24,23 +24,23 @@ class LearningRates:
     """Adam's learning rates; pairs decay log-linearly over the run."""
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
-    """Times the scene scale."""
+    """First and last learning rate of the centres, times the scene scale."""
     quats: float = 1e-3
-    """Of the raw quaternions."""
+    """Learning rate of the raw quaternions."""
     scales: float = 5e-3
-    """Of the logarithms of the scales."""
+    """Learning rate of the logarithms of the scales."""
     opacities: float = 0.025
-    """Of the logits of the opacities."""
+    """Learning rate of the logits of the opacities."""
     gammas: float = 1e-3
-    """Of the logarithms of gamma - 1."""
+    """Learning rate of the logarithms of gamma - 1."""
     sh0: float = 2.5e-3
-    """Of the plain colours' constant coefficients."""
+    """Learning rate of the plain colours' constant SH coefficients."""
     shN: float = 1.25e-4
-    """Of the other ones."""
+    """Learning rate of the plain colours' other SH coefficients."""
     grid: tuple[float, float] = (1e-3, 1e-5)
-    """Of the hash grid."""
+    """First and last learning rate of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
-    """Of the MLP."""
+    """First and last learning rate of the MLP."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):
@@ -55,21 +55,22 @@ class TextureConfig:
     """Shape of the neural texture (paper Sec. 5)."""
 
     levels: int = 8
-    """L, resolution levels."""
+    """L, number of resolution levels."""
     table_size: int | None = None
-    """T, entries a level, a power of two; None follows the number of the training photos' pixels."""
+    """T, entries per level, a power of two; None derives it from the number of pixels of the training photos."""
     features: int = 4
-    """F, features an entry."""
+    """F, features per entry."""
     min_resolution: float | None = None
-    """Of the coarsest level, cells per world unit; None derives it from the scene's scale."""
+    """Resolution of the coarsest level, cells per world unit; None derives it from the scene scale."""
     max_resolution: float | None = None
-    """Of the finest level; None derives it from the footprint of the training pixels."""
+    """Resolution of the finest level, cells per world unit; None makes its cells as large as the training pixels are at
+    the points that they see."""
     width: int = 64
-    """Of the hidden layers."""
+    """Width of the hidden layers of the MLP."""
     hidden_layers: int = 2
-    """Number of hidden layers."""
+    """Number of hidden layers of the MLP."""
     sh_degree: int | None = None
-    """Highest degree of the texture's colours; None is that of the run."""
+    """SH degree of the texture's colours; None takes that of the run."""
     residual: bool = True
     """Add the texture's colours to the plain ones instead of replacing them."""
     down_weighting: bool = True
@@ -78,51 +79,53 @@ class TextureConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that a run depends on, beside the scene."""
+    """All settings of a training run; run and scene together determine the result."""
 
     preset: str = "default"
-    """Name of the preset that this is, or started from."""
+    """Name of the preset from which the settings started."""
     iterations: int = REFERENCE_ITERATIONS
-    """Training steps, one view each; schedules stretch with them."""
+    """Number of training steps; each renders one view. All schedules stretch with this number."""
     max_surfels: int = 400_000
-    """P, the budget: never exceeded. Half of it at most comes from the point cloud."""
+    """P, the largest number of surfels. At most half as many start from the point cloud."""
     max_hits: int = 2
-    """K: ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
+    """K, the number of ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
     more_hits_from: int = 25_000
-    """Iteration, of a run of 30,000, from which more than 2 hits are textured, where K is more than 2: geometry
-    converges with K = 2, which makes fewer floaters."""
+    """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
+    with K = 2 has fewer floaters."""
     sh_degree: int = 3
-    """SH degree of the surfels' and the texture's colours; one more is unlocked every 1,000 iterations."""
+    """SH degree of the surfels' and the texture's colours. Training starts at degree 0."""
     sh_every: int = 1000
-    """Iterations, of a run of 30,000, between those."""
+    """Iterations, of a run of 30,000, after which the SH degree rises by one."""
     coarse: float = 0.0
-    """Fraction of the run, at its start, that trains on photos of half the size: a quarter of the work a step."""
+    """Fraction of the run, at its start, that trains on photos of half the width and height."""
     background: tuple[float, float, float] | None = None
-    """Colour behind everything; None takes the scene's, or the mean colour of the training photos."""
+    """Background colour; None takes that of the scene, or the mean colour of the training photos."""
     footprints: bool = True
-    """Limit the texture's detail in views from closer or farther away than the training views to what those resolved,
-    and anti-alias surfels in views from farther away. What no training view textured has no detail."""
+    """Detail limits: in views from closer or farther away than the training views, limit the texture's detail to what
+    the training views resolved; in views from farther away, also anti-alias the surfels."""
     smooth_sh: float = 0.01
-    """After training, regularise the surfels' SH towards smoothness, by ridge regression over the training views'
-    directions: the strength. Larger costs more in those directions; 0 keeps the SH as trained."""
+    """Strength of SH smoothing, a ridge regression after training that makes a surfel's colour smooth in directions
+    that no training view has. A larger strength changes the colours in the training views more; 0 keeps the SH as
+    trained."""
     exposures: bool = True
-    """Estimate each photo's exposure and white balance, as gains of red, green and blue, before training; train at the
-    mean exposure; a rendered view gets the gains predicted from nearby photos."""
+    """Estimate each photo's exposure and white balance before training, as gains of red, green and blue, and train at
+    the mean exposure. Rendered views get gains that are predicted from nearby photos."""
     metering: bool = True
-    """With `exposures`: where the photos' gains follow the brightness of what they show, as automatic exposure makes
-    them, predict those of rendered views by that, too."""
+    """Auto exposure, with `exposures`: if the photos' gains depend on the brightness of what they show, predict the
+    gains of rendered views from brightness, too."""
     vignetting: bool = True
-    """With `exposures`: estimate and take out the lens's vignetting, too."""
+    """With `exposures`: estimate the vignetting of the lens, remove it for training, and apply it to rendered views."""
     mask_mode: str = "ignore"
-    """What a photo's mask leaves out: `ignore` learns nothing there, `background` learns that nothing is there."""
+    """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
+    background."""
     border: float = 0.08
-    """Maximum shift, as a fraction of the frame, of border steps, which render beyond a photo's frame, supervised by
-    the photo's repeated edge; 0: no such steps."""
+    """Largest shift of border steps, as a fraction of the frame; 0 does none. A border step renders a window that is
+    shifted beyond the photo's frame; there its target is the photo's repeated edge."""
     border_every: int = 4
-    """Every how many steps one is a border step."""
+    """One of this many steps is a border step."""
     depth_jitter: float = 1.0
-    """Random shifts along the ray of the points at which training looks the texture up: standard deviation, in pixels
-    at that depth."""
+    """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
+    evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     clamp_texture: bool = False
@@ -132,7 +135,7 @@ class Config:
     filter_points: bool = True
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
-    """Lay the initial surfels on planes fitted to the cloud; otherwise their rotations are random."""
+    """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False

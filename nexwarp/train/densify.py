@@ -1,4 +1,4 @@
-"""Adaptive density control (paper Sec. 4.3): split where the blended error is, prune what is transparent."""
+"""Adaptive density control (paper Sec. 4.3): splits surfels of large blended error, prunes transparent ones."""
 
 from dataclasses import dataclass
 
@@ -22,14 +22,14 @@ class DensifyConfig:
     every: int = 100
     """Iterations between rounds."""
     fraction: float = 0.05
-    """Fraction of the surfels that a round splits, as far as the budget allows."""
+    """Fraction of the surfels that a round splits, within the budget."""
     prune_opacity: float = 0.005
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
     floaters: bool = True
-    """Remove floaters: surfels that training views, or views between them, show at less than 0.6 times the depth of the
-    nearest points."""
+    """Remove floaters: surfels that are visible, in training views or views between them, at less than 0.6 times the
+    depth of the nearest points."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)

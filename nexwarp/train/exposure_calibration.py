@@ -17,11 +17,11 @@ from nexwarp.train.config import Config
 # 8-bit values beyond these are clipped, or too dark to tell a ratio.
 CLIPPED = (8, 247)
 
-ROUNDS = 6  # of reweighted least squares
-NOISE = 0.05  # of log colours: larger differences count as outliers
-PRIOR = 0.1  # observations that speak for a gain of 1
-EVEN_PRIOR = 1.0  # observations that speak for an even lens
-FURTHER = 1.3  # how much farther from its axis than points were seen, in squared tangents, a lens is known
+ROUNDS = 6  # rounds of reweighted least squares
+NOISE = 0.05  # noise of log colours; larger differences count as outliers
+PRIOR = 0.1  # weight of the prior for a gain of 1, in observations
+EVEN_PRIOR = 1.0  # weight of the prior for a lens without falloff, in observations
+FURTHER = 1.3  # the falloff is extrapolated to this many times the largest squared tangent of an observed point
 
 
 def photo_gains(
@@ -30,17 +30,21 @@ def photo_gains(
     points: Sequence[torch.Tensor],
     masks: Sequence[torch.Tensor | None] | None = None,
 ) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Estimate log gains (V, 3) float64, mean 0, of photos, and the falloff of their lens, from points that they share.
+    """Estimate the log gains of photos and the falloff of their lens, from points that several photos show.
 
-    A point's colour in a photo is its own times the photo's gain times what the lens leaves of the light there, one
-    function of the angle to the axis for all photos (`Exposures`). Least squares over the logarithms, reweighted so
-    that highlights and occluders do not count; a photo with few points stays near the mean, and so does the lens.
+    A point's colour in a photo is modelled as its own colour, times the photo's gain, times the falloff of the lens, a
+    function of the angle to the optical axis that all photos share (`Exposures`). The logarithms are fitted by least
+    squares, reweighted so that highlights and occluders do not count. Priors keep photos with few points near the mean
+    gain, and the lens near no falloff.
 
     Args:
-        cameras: of the V photos.
+        cameras: cameras of the V photos.
         photos: (H, W, 3) uint8 each.
-        points: (M, 3) each, world positions that were triangulated from the photo; the same point has the same bits.
-        masks: (H, W) bool each, True where the photo counts; None where all of it does.
+        points: (M, 3) each, world positions triangulated from the photo; a shared point has the same bits in each.
+        masks: (H, W) bool each, True where the photo counts; None where all of it counts.
+
+    Returns:
+        Log gains (V, 3) float64 with mean 0, and the falloff (a, b, largest squared tangent) of `Exposures`.
     """
     count = len(cameras)
     view, point, color, squares = _observations(cameras, photos, points, masks)
@@ -71,7 +75,12 @@ def _observations(
     points: Sequence[torch.Tensor],
     masks: Sequence[torch.Tensor | None] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Who sees what how: indices of photo and point (M,), log colours (M, 3), squared tangents to the axis (M,)."""
+    """Return all observations of points in photos.
+
+    Returns:
+        Indices of the photo (M,) and of the point (M,), log colour (M, 3), squared tangent of the angle to the axis
+        (M,).
+    """
     views, places, colors, squares = [], [], [], []
     masks = [None] * len(cameras) if masks is None else masks
     for index, (camera, photo, seen, mask) in enumerate(zip(cameras, photos, points, masks, strict=True)):

@@ -1,4 +1,4 @@
-"""Floaters: surfels that hang in the air close to cameras, where nothing is."""
+"""Finds floaters: surfels in the empty space close to cameras."""
 
 import math
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from nexwarp.data import View
 from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.model.model import Model
 
-LOOKS = 60  # at least so many views between the training views, and one for each
-LAST_LOOKS = 240  # the last time
-LEAST_SHARE = 3e-4  # of a picture
-HEIGHT = 80  # of that, pixels: two or three of them are such a share
-LAST_SHARE = 3e-3  # the last time, when what is behind can no more be learnt
-NEARER = 0.6  # of the depth of the nearest points, which leaves room for what is nearer than these tell
-FEWEST_POINTS = 20  # that tell how near things are to a camera
+PROBES = 60  # views between the training views, at least; at least one for each training view
+LAST_PROBES = 240  # the same for the last search
+LEAST_SHARE = 3e-4  # share of an image that a floater covers, at least
+HEIGHT = 80  # of the images, pixels: the share is two or three of them
+LAST_SHARE = 3e-3  # share in the last search: the surfels behind a removed floater can no longer be trained
+NEARER = 0.6  # share of the nearest points' depth: real surfaces may be somewhat nearer than these points
+FEWEST_POINTS = 20  # points in a view that give its nearest depth, at least
 
 
 @torch.no_grad()
@@ -29,43 +29,44 @@ def floaters(
     *,
     last: bool = False,
 ) -> torch.Tensor:
-    """Return which surfels (N,) bool cover 3 pixels in 10,000 of a picture, or more, from too near.
+    """Return (N,) bool, True for floaters: surfels that cover 3 in 10,000 pixels of an image, or more, from too near.
 
-    The pictures are those of the training cameras and of others on the ways between them (`between`).
-    What a training camera shows is at least as far from it as its nearest points; from another one, at least that
-    less the way between the two, which is at most half of it. Nearer than six tenths of this is too near.
+    The images are those of the training cameras and of random cameras between them (`between`). The surfaces that a
+    training camera sees are at least as far away as its nearest points. For a camera between, this distance is shorter
+    by the distance to its training camera, which is at most half of it. A surfel that is nearer than 0.6 times the
+    distance is too near.
 
     Args:
-        model: its surfels and options count; K = 0 counts as 1.
-        cameras: of the training views, on any device.
-        nearest: for each, its `nearest_depth`.
-        generator: for the places between, on the CPU.
-        last: what is behind will not be learnt: look for those alone that cover 3 pixels in 1,000, or more, but in four
-            times as many views between.
+        model: its surfels and options are used; K = 0 counts as 1.
+        cameras: cameras of the training views, on any device.
+        nearest: the `nearest_depth` of each camera.
+        generator: CPU generator for the cameras between.
+        last: the last search of a run, after which nothing behind a floater can be trained: return surfels that cover
+            3 in 1,000 pixels, or more, and use four times as many cameras between.
     """
     bare = model.bare(max_hits=max(model.options.max_hits, 1))
-    least, count = (LAST_SHARE, LAST_LOOKS) if last else (LEAST_SHARE, LOOKS)
-    looks = [*zip(cameras, nearest, strict=True)]
+    least, count = (LAST_SHARE, LAST_PROBES) if last else (LEAST_SHARE, PROBES)
+    probes = [*zip(cameras, nearest, strict=True)]
     for _ in range(math.ceil(count / len(cameras))):
         moved = between(cameras, [0.5 * depth for depth in nearest], generator)
         for old, new, depth in zip(cameras, moved, nearest, strict=True):
-            looks.append((new, depth - torch.dist(new.position, old.position).item()))
+            probes.append((new, depth - torch.dist(new.position, old.position).item()))
     found = torch.zeros(len(bare.surfels), dtype=torch.bool, device=bare.device)
-    for camera, depth in looks:
+    for camera, depth in probes:
         if depth > 0:
             found |= _shares(bare, camera, NEARER * depth) >= least
     return found
 
 
 def nearest_depth(view: View, points: torch.Tensor) -> float:
-    """Z-depth of the nearest points before a view's camera, world units; 0 when they are too few to tell.
+    """Return the z-depth of the nearest points in front of a view's camera, world units; 0 if they are too few.
 
-    Of the nearest one in a hundred may be wrong. Not only the view's own points count: what is close to one camera may
-    have been triangulated from others alone.
+    It is the first percentile, so that a few wrong points do not matter. All points of the scene count: a surface close
+    to this camera may have been triangulated from other photos only.
 
     Args:
-        view: tells nothing where it has no triangulated points itself.
-        points: (P, 3) of the scene, world frame.
+        view: the view; 0 is returned if no points were triangulated from its photo.
+        points: (P, 3) points of the scene, world frame.
     """
     if view.points is None or not len(view.points):
         return 0.0
@@ -78,7 +79,7 @@ def nearest_depth(view: View, points: torch.Tensor) -> float:
 
 
 def _shares(bare: Model, camera: Camera, nearest: float) -> torch.Tensor:
-    """(N,) of the picture, by the weights of each surfel's textured hits that are nearer than `nearest`."""
+    """Return (N,): each surfel's share of the image, by the weights of its textured hits nearer than `nearest`."""
     camera = reduced(camera, HEIGHT)
     out = bare.render(camera)
     near = (out.weights >= ALPHA_MIN) & (out.depths < nearest)

@@ -1,4 +1,4 @@
-"""What a run starts from: surfels on points of the cloud, and a texture as fine as the photos."""
+"""Makes the initial surfels, on points of the cloud, and chooses the shape of the texture."""
 
 import math
 

@@ -23,22 +23,21 @@ class LossWeights:
     dssim: float = 0.2
     """Share of D-SSIM in the image loss; L1 has the rest."""
     alpha: float = 0.005
-    """Penalty on blending weight that is not textured."""
+    """Factor of the penalty on blending weight that is not textured."""
     alpha_hits: int = 2
-    """Of the textured hits, how many of the heaviest count for that."""
+    """Number of the heaviest textured hits whose weights `alpha` counts."""
     texture: float = 0.5
-    """L1 between the un-premultiplied texture and the photograph."""
+    """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
     opacity: float = 0.01
-    """Mean opacity of the surfels, for sparsity."""
+    """Factor of the surfels' mean opacity; makes them sparse."""
     grid: float = 0.01
-    """Squared values of the hash grid, each level over its resolution cubed."""
-
+    """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
     empty: float = 0.1
-    """Opacity where a mask says that there is nothing."""
+    """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.1
-    """Relative error of the depth at the points of the cloud that were triangulated from the photo."""
+    """Factor of the relative depth error at the points that were triangulated from the photo."""
     border: float = 0.1
-    """Image loss beyond the frame, where the photo's edge goes on."""
+    """Factor of the image loss beyond the frame in border steps, against the photo's repeated edge."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)

@@ -19,8 +19,9 @@ AHEAD = 2  # photos to fetch meanwhile where they do not
 class TrainingViews:
     """Training views on the device they are used on; photos stay 8-bit.
 
-    On a GPU they lie there when they are few. Else they stay in the host's memory as they are, and those that come
-    next are copied while a step runs: by a thread into pinned memory, and from there on a stream of their own.
+    With CUDA, photos are kept on the GPU if they take less than a quarter of its free memory. Otherwise they stay in
+    host memory, and a thread copies the next ones to the GPU while a step runs, through pinned memory and on its own
+    CUDA stream.
     """
 
     def __init__(
@@ -30,7 +31,7 @@ class TrainingViews:
         gains: torch.Tensor | None = None,
         lens: Exposures | None = None,
     ) -> None:
-        """Take the views to a device; their photos, as `get` gives them, are over `gains` (V, 3) and the falloff."""
+        """Move the views to a device; `get` divides photos by their `gains` (V, 3) and by the falloff of `lens`."""
         self.device = device
         self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
         self.lens = None if lens is None else copy.deepcopy(lens).to(device)
@@ -54,7 +55,7 @@ class TrainingViews:
         return len(self.photos)
 
     def fingerprint(self) -> str:
-        """Digest of the names and cameras, to know the same views again."""
+        """Return a digest of the views' names and cameras."""
         digest = hashlib.sha256()
         for name, camera in zip(self.names, self.cameras, strict=True):
             values = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), camera.width, camera.height]
@@ -62,9 +63,9 @@ class TrainingViews:
         return digest.hexdigest()
 
     def get(self, index: int, factor: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
-        """Camera and photo (H, W, 3) float, reduced by a factor; what does not fill a pixel is cut off.
+        """Return camera and photo (H, W, 3) float, reduced by a factor; incomplete blocks of pixels are cropped.
 
-        `ahead` are the indices of the views to come, the next one first: up to two are fetched meanwhile.
+        `ahead` are the indices of the next views, in order; up to two of them are copied in the background.
         """
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
@@ -76,7 +77,7 @@ class TrainingViews:
         return self._camera(index, factor), self._reduce(photo, index, factor)
 
     def mask(self, index: int, factor: int) -> torch.Tensor | None:
-        """Mask (H, W) bool of the photo that `get` gives: a reduced pixel counts where all of its pixels do."""
+        """Return the mask (H, W) bool of the reduced photo, or None; a block counts where all its pixels count."""
         mask = self.masks[index]
         if mask is None:
             return None
@@ -84,7 +85,7 @@ class TrainingViews:
         return share[:, :, 0] == 1.0
 
     def alpha(self, index: int, factor: int) -> torch.Tensor | None:
-        """Alpha (H, W) float in [0, 1] of the photo that `get` gives; None where it is opaque."""
+        """Return alpha (H, W) float in [0, 1] of the reduced photo; None if it is opaque."""
         alpha = self.alphas[index]
         if alpha is None:
             return None
