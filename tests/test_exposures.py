@@ -31,6 +31,7 @@ from nexwarp.train.step_losses import as_taken, step_losses
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews, mean_color
+from tests.exposed import exposure_at, with_exposures
 from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
@@ -355,19 +356,6 @@ def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
     trainer.run()
     model = trainer.finish()
     return model, evaluate(model, scene.test)["psnr"]
-
-
-def exposure_at(view: View) -> float:
-    return 0.75 + 0.08 * view.camera.position[0].item()
-
-
-def with_exposures(scene: Scene) -> Scene:
-    """Return a scene whose photos grow brighter along the capture."""
-
-    def exposed(views: list[View]) -> list[View]:
-        return [dataclasses.replace(view, image=to_uint8(view.image / 255 * exposure_at(view))) for view in views]
-
-    return dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
 
 
 def test_training_takes_exposures_out(tmp_path):
