@@ -12,7 +12,6 @@ from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
-from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
@@ -172,12 +171,8 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         with deterministic(self.config.deterministic and self.device.type == "cuda"):
             self.iteration += 1
-            smoothed = self.config.smoothed_after
-            if self.iteration - 1 == smoothed:
-                self._smooth_sh()
             target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
-            fixed = ("shN",) if smoothed is not None and self.iteration > smoothed else ()
-            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor, fixed)
+            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             if self.graphs is None:
                 result = self._optimize(target)
             else:
@@ -187,11 +182,6 @@ class Trainer:
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
-
-    def _smooth_sh(self) -> None:
-        sh0, shN = smooth_sh(self.model(), self.scene.train, self.config.smooth_sh)
-        self.surfels.sh0.data.copy_(sh0)
-        self.surfels.shN.data.copy_(shN)
 
     def _next_view(self) -> int:
         if not self.order:
@@ -278,8 +268,7 @@ class Trainer:
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         config = self.config
-        strength = config.smooth_sh if config.smoothed_after is None else 0.0
-        settings = FinishSettings(strength, config.footprints, config.metering, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
         return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
     def check(self) -> None:
