@@ -2,7 +2,6 @@
 
 import os
 import random
-import shutil
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,6 +13,7 @@ import safetensors.torch
 import torch
 
 from nexwarp.io.files import write_atomically
+from nexwarp.run.contents import remove_leftovers
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
 from tests.model_file_support import refused
@@ -133,7 +133,8 @@ SYSTEM_CALLS = (
     (os, "replace"),
     (Path, "rename"),
     (Path, "mkdir"),
-    (shutil, "rmtree"),
+    (Path, "touch"),
+    (Path, "rmdir"),
 )
 
 
@@ -192,6 +193,7 @@ def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, befo
                 assert saved_number(run) in (before, before + 1), (moment, at)
             else:
                 assert not has_checkpoint(run) or saved_number(run) == 1
+        remove_leftovers(run)  # as --resume does
         save_number(run, before + 2)
         assert saved_number(run) == before + 2 and kept(run)[0] == before + 2
         moment += 1
