@@ -2,8 +2,6 @@
 
 import os
 import random
-import threading
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from nexwarp.io.files import write_atomically
 from nexwarp.run.contents import remove_leftovers
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
+from tests.faults import Killed, kill_at
 from tests.model_file_support import refused
 
 # Atomic writing
@@ -125,52 +124,6 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
     assert saved_number(tmp_path) == 1
     save_number(tmp_path, 3)
     assert saved_number(tmp_path) == 3 and kept(tmp_path) == [3, 1]
-
-
-SYSTEM_CALLS = (
-    (Path, "write_bytes"),
-    (os, "fsync"),
-    (os, "replace"),
-    (Path, "rename"),
-    (Path, "mkdir"),
-    (Path, "touch"),
-    (Path, "rmdir"),
-)
-
-
-class Killed(BaseException):
-    pass
-
-
-def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
-    """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
-    calls: list[str] = []
-    mine = threading.get_ident()  # other threads, with work for other tests, live on
-
-    def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != mine:
-                return original(*args, **kwargs)
-            calls.append(name)
-            if len(calls) > moment:  # what is dead does nothing any more, not even clean up
-                if len(calls) == moment + 1 and name == "write_bytes":
-                    with open(args[0], "wb") as half:
-                        half.write(args[1][: len(args[1]) // 2])
-                raise Killed
-            return original(*args, **kwargs)
-
-        return call
-
-    for owner, name in SYSTEM_CALLS:
-        patch.setattr(owner, name, dying(name, getattr(owner, name)))
-    unlink = Path.unlink
-
-    def gone(*args: Any, **kwargs: Any) -> None:
-        if len(calls) <= moment or threading.get_ident() != mine:
-            unlink(*args, **kwargs)
-
-    patch.setattr(Path, "unlink", gone)
-    return calls
 
 
 @pytest.mark.parametrize("before", [0, 1, 2, 3])

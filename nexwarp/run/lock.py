@@ -77,9 +77,11 @@ def locked_run(run: Path, warn: Callable[[str], None] = lambda _: None) -> Itera
         finally:
             if number in held:  # else this is a forked child, and the lock its parent's
                 held.remove(number)
-                with suppress(OSError):  # Windows does not delete open files: there the file stays
-                    (run / LOCK_FILE).unlink()
-                os.close(number)
+                try:
+                    with suppress(OSError):  # Windows does not delete open files: there the file stays
+                        (run / LOCK_FILE).unlink()
+                finally:
+                    os.close(number)
     finally:
         remove_empty(created)
 
