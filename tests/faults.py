@@ -1,4 +1,4 @@
-"""A disk that fails at the k-th thing asked of it, below a folder; elsewhere it goes on as ever."""
+"""A disk that fails at the k-th thing asked of it, below a folder; and a process that dies at its k-th call."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import builtins
 import errno
 import io
 import os
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -112,3 +113,49 @@ def failing(disk: Disk) -> Iterator[Disk]:
         patch.setattr(os, "mkdir", asking("mkdir", os.mkdir))
         patch.setattr(OpenEXR, "File", File)
         yield disk
+
+
+SYSTEM_CALLS = (
+    (Path, "write_bytes"),
+    (os, "fsync"),
+    (os, "replace"),
+    (Path, "rename"),
+    (Path, "mkdir"),
+    (Path, "touch"),
+    (Path, "rmdir"),
+)
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
+    """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
+    calls: list[str] = []
+    mine = threading.get_ident()  # other threads, with work for other tests, live on
+
+    def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != mine:
+                return original(*args, **kwargs)
+            calls.append(name)
+            if len(calls) > moment:  # what is dead does nothing any more, not even clean up
+                if len(calls) == moment + 1 and name == "write_bytes":
+                    with open(args[0], "wb") as half:
+                        half.write(args[1][: len(args[1]) // 2])
+                raise Killed
+            return original(*args, **kwargs)
+
+        return call
+
+    for owner, name in SYSTEM_CALLS:
+        patch.setattr(owner, name, dying(name, getattr(owner, name)))
+    unlink = Path.unlink
+
+    def gone(*args: Any, **kwargs: Any) -> None:
+        if len(calls) <= moment or threading.get_ident() != mine:
+            unlink(*args, **kwargs)
+
+    patch.setattr(Path, "unlink", gone)
+    return calls
