@@ -1,7 +1,6 @@
 """Who may open the viewer: Host, Origin and token, by the rules and against a running server."""
 
 import http.client
-from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 import pytest
@@ -110,7 +109,7 @@ def test_the_token_is_in_the_url_or_the_cookie():
     assert LOCAL.cookie("/?token=", headers("localhost")) is None
 
 
-def get(viewer: Viewer, path: str, **send: str) -> tuple[int, Mapping[str, str], str]:
+def get(viewer: Viewer, path: str, **send: str) -> tuple[int, http.client.HTTPMessage, str]:
     """Status, headers and text of a page."""
     url = urlsplit(viewer.url)
     connection = http.client.HTTPConnection(str(url.hostname), url.port, timeout=20)
