@@ -16,7 +16,7 @@ from nexwarp.cli.device import keep_freed_memory, pick_device
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.training_session import TrainingSession
-from nexwarp.cli.view import show_until_interrupted
+from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
@@ -83,7 +83,7 @@ class Train:
     view: bool = False
     """Show the training in the browser, then the result until Ctrl-C (extra `viewer`)."""
     host: Host_ = "127.0.0.1"
-    """Address that --view listens on; 0.0.0.0 allows other machines."""
+    """Address that --view listens on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
     """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
@@ -176,7 +176,7 @@ class Train:
             total=trainer.config.iterations,
             save_path=partial(keep_camera_path, run),
         )
-        console.print(f"viewer: {viewer.url}")
+        print_url(viewer, console)
         return viewer
 
     def _source(self) -> SceneSource:
