@@ -10,8 +10,8 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import StagedCamera
+from nexwarp.errors import needed_memory
 from nexwarp.model.options import RenderOptions
-from nexwarp.train.health import needed_memory
 from nexwarp.train.target import Target
 
 # Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A kind that
@@ -40,7 +40,7 @@ class StepResult(NamedTuple):
 class CaptureError(Exception):
     """A step could not be captured; `memory` says whether memory did not suffice."""
 
-    def __init__(self, cause: RuntimeError) -> None:
+    def __init__(self, cause: MemoryError | RuntimeError) -> None:
         super().__init__(" ".join(str(cause).split()))
         self.memory = needed_memory(cause) is not None
 
@@ -82,7 +82,7 @@ class StepGraphs:
                 if not error.memory:
                     told = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
                     warnings.warn(told, stacklevel=2)
-            except RuntimeError as error:
+            except (MemoryError, RuntimeError) as error:
                 # Graphs keep memory of their own, which may be what is missing.
                 if needed_memory(error) is None or self.keeper is None:
                     raise
@@ -182,7 +182,7 @@ def _capture_errors() -> Iterator[None]:
     """Turn errors of a capture into CaptureError."""
     try:
         yield
-    except RuntimeError as error:
+    except (MemoryError, RuntimeError) as error:
         raise CaptureError(error) from None  # whose traceback would keep what the step had made
 
 

@@ -162,7 +162,7 @@ class Viewer:
                 if scale:
                     self._draw(session, scale)
                     return True
-            except (RuntimeError, ValueError) as error:  # for example out of memory; the other clients continue
+            except (MemoryError, RuntimeError, ValueError) as error:  # the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
                 session.tell("This picture could not be drawn", " ".join(str(error).split())[:300])
         return False
