@@ -184,12 +184,12 @@ def render(
         OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
     _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
-    background = _background(background, surfels.means)
-    _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
-    values = (0, surfels.means.dtype) if texture is None else texture.stored_per_point(sh_degree)
-    ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
-    options = (max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, generator)
     try:
+        background = _background(background, surfels.means)
+        _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
+        values = (0, surfels.means.dtype) if texture is None else texture.stored_per_point(sh_degree)
+        ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
+        options = (max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, generator)
         with torch.autocast(surfels.device.type, enabled=False):
             return _render(surfels, texture, camera, *options, exposures, detail_limits)
     except (MemoryError, RuntimeError) as error:

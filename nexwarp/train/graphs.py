@@ -10,7 +10,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import StagedCamera
-from nexwarp.errors import needed_memory
+from nexwarp.errors import OutOfMemoryError, needed_memory
 from nexwarp.model.options import RenderOptions
 from nexwarp.train.target import Target
 
@@ -43,6 +43,21 @@ class CaptureError(Exception):
     def __init__(self, cause: MemoryError | RuntimeError) -> None:
         super().__init__(" ".join(str(cause).split()))
         self.memory = needed_memory(cause) is not None
+
+
+class UpdateError(OutOfMemoryError):
+    """Memory did not suffice while the parameters were updated: to repeat the step would update some of them twice."""
+
+
+@contextmanager
+def updating() -> Iterator[None]:
+    """Turn memory errors of an update of the parameters into UpdateError."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if (needed := needed_memory(error)) is None:
+            raise
+        raise UpdateError(f"out of memory while the parameters were updated: needed {needed}", needed) from None
 
 
 class StepGraphs:
@@ -84,7 +99,7 @@ class StepGraphs:
                     warnings.warn(told, stacklevel=2)
             except (MemoryError, RuntimeError) as error:
                 # Graphs keep memory of their own, which may be what is missing.
-                if needed_memory(error) is None or self.keeper is None:
+                if needed_memory(error) is None or self.keeper is None or isinstance(error, UpdateError):
                     raise
                 self.chances -= 1
             self.clear()
@@ -166,11 +181,12 @@ class _Stage:
         assert self.graph is not None and self.result is not None and self.losses is not None
         self.graph.replay()
         result = self.result
-        if not ops.fits(result.room):
-            self.state = None
-        # Copies: they may be read after the next replay has overwritten the graph's own.
-        losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
-        return result._replace(losses=losses, image=result.image.clone())
+        with updating():  # the replay has done that
+            if not ops.fits(result.room):
+                self.state = None
+            # Copies: they may be read after the next replay has overwritten the graph's own.
+            losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
+            return result._replace(losses=losses, image=result.image.clone())
 
     def forget(self) -> None:
         """Drop the graph."""

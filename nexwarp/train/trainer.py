@@ -23,7 +23,7 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key
+from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.train.presets import config_from_dict
@@ -205,9 +205,10 @@ class Trainer:
                 errors = (out.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
-            self.optimizer.step()
-            if request is not None and request.sums_after_backward is not None:
-                self.densifier.accumulate(request.sums_after_backward)
+            with updating():
+                self.optimizer.step()
+                if request is not None and request.sums_after_backward is not None:
+                    self.densifier.accumulate(request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
