@@ -31,8 +31,9 @@ class Camera:
 
     Raises:
         TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
-        ValueError: a shape is wrong; a value is not finite; the rotation of `viewmat` is a reflection, or differs from
-            orthonormal by more than 1e-3; `K` has skew or a focal length <= 0; a size is < 1; `near` is < 0.
+        ValueError: a shape or device is wrong; a value is not finite; the rotation of `viewmat` is a reflection, or
+            differs from orthonormal by more than 1e-3; `K` has skew or a focal length <= 0; a size is < 1; `near` is
+            < 0.
     """
 
     viewmat: torch.Tensor
@@ -54,6 +55,8 @@ class Camera:
     def _check(self) -> tuple[float, float, float, float]:
         """Return fx, fy, cx and cy; raise TypeError or ValueError where a field does not fit."""
         viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
+        if self.K.device != self.viewmat.device:
+            raise ValueError(f"K: expected a tensor on {self.viewmat.device} as viewmat is, got one on {self.K.device}")
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int):
@@ -148,6 +151,8 @@ def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
         raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
     if tensor.shape != (size, size):
         raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
+    if tensor.is_meta:
+        raise ValueError(f"{name}: expected a tensor with values, got one on the device meta")
     matrix = tensor.detach().double().cpu()
     if not bool(torch.isfinite(matrix).all()):
         raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")

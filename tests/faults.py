@@ -1,4 +1,4 @@
-"""A disk that fails at the k-th thing asked of it, below a folder; and a process that dies at its k-th call."""
+"""A disk, an allocator and a GPU that fail at the k-th thing asked of them; a process that dies at its k-th call."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+
+from nexwarp.kernels import launch as launching
 
 
 class Disk:
@@ -159,3 +162,57 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
 
     patch.setattr(Path, "unlink", gone)
     return calls
+
+
+class Allocator:
+    """Counts allocations and kernel launches, and fails the `fatal`-th request (from 0) as a GPU without memory does.
+
+    A request is a call of one of torch's functions that make a tensor, or the launch of a kernel, from any thread.
+    """
+
+    def __init__(self, fatal: int | None = None) -> None:
+        self.fatal, self.requests = fatal, 0
+
+    def ask(self) -> None:
+        self.requests += 1
+        if self.requests - 1 == self.fatal:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1 KiB free")
+
+
+MAKERS = ("empty", "zeros", "empty_like", "zeros_like", "randn", "stack", "cat")
+METHODS = ("new_empty", "new_zeros", "new_ones", "new_full", "clone", "contiguous")
+
+
+@contextmanager
+def allocating(allocator: Allocator) -> Iterator[Allocator]:
+    """Let the allocations and launches of a block ask `allocator` first."""
+
+    def asking(original: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            allocator.ask()
+            return original(*args, **kwargs)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for place, names in ((torch, MAKERS), (torch.Tensor, METHODS), (launching, ("launch",))):
+            for name in names:
+                patch.setattr(place, name, asking(getattr(place, name)))
+        yield allocator
+
+
+@contextmanager
+def failing_gpu(fatal: int | None, message: str) -> Iterator[list[str]]:
+    """Fail the `fatal`-th launch of a block (from 0) and all later ones, as a GPU does after a fault; list launches."""
+    launches: list[str] = []
+    original = launching.launch
+
+    def call(kernel: Any, *args: Any, **kwargs: Any) -> None:
+        launches.append(kernel.key)
+        if fatal is not None and len(launches) > fatal:
+            raise RuntimeError(message)
+        original(kernel, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launching, "launch", call)
+        yield launches

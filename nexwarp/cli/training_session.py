@@ -13,7 +13,7 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
-from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, StorageError
+from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError, needed_memory
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
@@ -21,7 +21,6 @@ from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TEST, T
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
-from nexwarp.train.health import needed_memory
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -147,7 +146,7 @@ class TrainingSession:
         except OSError as error:
             raise StorageError(f"{error}; training is complete and saved: --resume finishes the run") from error
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
+            if (needed := needed_memory(error)) is None:
                 raise
             raise OutOfMemoryError(
                 f"out of memory: needed {needed}; training is complete and saved: --resume finishes the run"

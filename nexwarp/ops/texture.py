@@ -41,6 +41,7 @@ def texture(
     """Look points up in the hash grid, apply the MLP and, given directions, evaluate the colours.
 
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
+    `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
 
     Args:
         positions: (n, 3) world.
@@ -95,7 +96,8 @@ class _Texture(torch.autograd.Function):
             arguments,
             [array(encoded, STORAGES[dtype])],
         )
-        *layers, coefficients = _mlp(encoded, matrices)
+        with torch.autocast(grid.device.type, enabled=False):
+            *layers, coefficients = _mlp(encoded, matrices)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         ctx.save_for_backward(
@@ -130,7 +132,8 @@ class _Texture(torch.autograd.Function):
                 coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
             )
         unscale = scale.reciprocal()
-        signal, grad_matrices = _mlp_backward(signal, layers, matrices)
+        with torch.autocast(grad.device.type, enabled=False):
+            signal, grad_matrices = _mlp_backward(signal, layers, matrices)
         grad_matrices = [x * unscale for x in grad_matrices]
         grad_grid, grad_positions, grad_depths = _lookup_backward(
             table, positions, depths, resolutions, focal, signal, unscale, need_positions or need_depths

@@ -107,7 +107,7 @@ class Exposures(nn.Module):
         Returns:
             The exposures, float32 on the CPU.
         """
-        viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
+        viewmats = torch.stack([camera.viewmat.detach().cpu().double() for camera in cameras])
         stride = -(-len(cameras) // MOST_PHOTOS)
         positions, directions = (x[::stride] for x in poses_of(viewmats))
         gains = log_gains.double()[::stride]
@@ -145,6 +145,7 @@ class Exposures(nn.Module):
         gains, light = self.gains(camera), self.falloff_of(camera)
         return gains if light is None else light * gains
 
+    @torch.inference_mode(False)  # a later training may use what is cached
     @torch.no_grad()
     def falloff_of(self, camera: Camera) -> torch.Tensor | None:
         """Return the fraction of light that the lens transmits to each pixel; None for a lens without vignetting.

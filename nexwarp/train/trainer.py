@@ -10,7 +10,7 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
-from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
+from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError, needed_memory
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
@@ -23,8 +23,8 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key
-from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, needed_memory, oom_message
+from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
@@ -167,7 +167,8 @@ class Trainer:
 
     def step(self) -> StepReport:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
-        with deterministic(self.config.deterministic and self.device.type == "cuda"):
+        fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
+        with fixed_order, torch.autocast(self.device.type, enabled=False):
             self.iteration += 1
             target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
@@ -204,9 +205,10 @@ class Trainer:
                 errors = (out.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
-            self.optimizer.step()
-            if request is not None and request.sums_after_backward is not None:
-                self.densifier.accumulate(request.sums_after_backward)
+            with updating():
+                self.optimizer.step()
+                if request is not None and request.sums_after_backward is not None:
+                    self.densifier.accumulate(request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
@@ -266,7 +268,8 @@ class Trainer:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         config = self.config
         settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
-        return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
+        with torch.autocast(self.device.type, enabled=False):
+            return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
