@@ -38,6 +38,7 @@ FIXED_NAMES = {
 }
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits")
+LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 
 def save_model(path: str | os.PathLike[str], model: Model) -> Path:
@@ -145,6 +146,9 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
         farthest = tensors.get(DETAIL_LIMITS["farthest"], surfels.means.new_full((len(surfels),), NEVER))
         limits = DetailLimits(nearest.detach(), farthest.detach())
     parts = _part(tensors, "exposures.")
+    missing = [name for name in BUFFERS if name not in parts and name not in LATER_BUFFERS]
+    if parts and missing:
+        raise ValueError(f"expected the tensor exposures.{missing[0]}, found none")
     exposures = Exposures(**parts) if parts else None
     check_bounds(tensors)
     texture = None

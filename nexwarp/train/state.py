@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from nexwarp.checks import check_finite
 from nexwarp.data import Scene
 from nexwarp.io.json_files import Json
+from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 
@@ -175,6 +177,10 @@ def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:
     wrong = [name for name, x in tensors.items() if name.startswith(FLOATS) and x.dtype != torch.float32]
     if wrong:
         raise ValueError(f"{wrong[0]}: expected float32, got {tensors[wrong[0]].dtype}")
+    for name, x in tensors.items():
+        if name.startswith(FLOATS):
+            check_finite(name, x)
+    check_bounds(tensors)
     for name, good in (
         ("iteration", lambda x: type(x) is int and 0 <= x <= iterations),
         ("seconds", lambda x: type(x) in (int, float) and 0 <= x < math.inf),

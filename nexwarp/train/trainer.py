@@ -317,7 +317,8 @@ class Trainer:
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())  # torch's go over several lines
+            found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            reason = " ".join(found.split())  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def _check_origin(self, snapshot: Snapshot) -> None:
