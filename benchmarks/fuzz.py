@@ -344,7 +344,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--driver", choices=("mutate", "hypothesis", "atheris"), default="mutate")
     parser.add_argument("--failed", type=Path, default=Path("fuzz_failures"), help="where inputs that fail are kept")
     options = parser.parse_args(arguments)
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
     if options.driver == "atheris":
         if len(options.targets) != 1:
             parser.error("--driver atheris: expected one of --targets")

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -272,8 +273,8 @@ def _options(folder: Path) -> list[Files]:
 def _read_options(folder: Path) -> None:
     """Make options of a rendering and settings of a training; their errors name no file."""
     try:
-        data = read_object(folder / "options.json")
-        render = {name: tuple(x) if isinstance(x, list) else x for name, x in dict(data["render"]).items()}
+        data: Any = read_object(folder / "options.json")
+        render: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in dict(data["render"]).items()}
         options = RenderOptions(**render)
         with_settings(Config(), parse_settings(str(x) for x in data["settings"]))
     except KeyError as error:

@@ -24,7 +24,6 @@ DENORMAL = 1e-44
 VALUES = (math.nan, math.inf, -math.inf, 1e30, -1e30, 3e38, 0.0, DENORMAL, -1.0)
 MATRICES = tuple(f"texture.mlp.{index}.weight" for index in (0, 2, 4))
 TENSORS = (*BOUNDS, *MATRICES)
-SIZE = {"width": 16, "height": 12}
 
 # What must be refused: not finite pictures, or a value that the format excludes.
 REFUSED = {
@@ -45,7 +44,7 @@ REFUSED = {
 
 
 def tiny_camera() -> nw.Camera:
-    camera = make_camera(random_scene(12, **SIZE))
+    camera = make_camera(random_scene(12, width=16, height=12))
     return nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height)
 
 
@@ -59,7 +58,7 @@ def tiny_model() -> nw.Model:
         camera.viewmat[:3, 3] += 0.3 * index
     exposures = Exposures.of(0.2 * torch.randn(3, 3), cameras, (-0.3, -0.2, 0.4))
     limits = DetailLimits(torch.full((12,), 0.05), torch.full((12,), 0.2))
-    return nw.Model(make_surfels(random_scene(12, **SIZE)), texture, exposures, limits)
+    return nw.Model(make_surfels(random_scene(12, width=16, height=12)), texture, exposures, limits)
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +167,7 @@ def test_a_number_of_the_metadata_is_refused_or_renders_finite(
 @pytest.mark.parametrize("name", ["x", "f_dc_1", "f_rest_3", "opacity", "scale_0", "rot_2", "gamma_1"])
 def test_a_number_of_a_surfels_ply_is_refused_or_renders_finite(tmp_path: Path, name: str) -> None:
     file = tmp_path / "surfels.ply"
-    save_surfels_ply(file, make_surfels(random_scene(12, **SIZE)))
+    save_surfels_ply(file, make_surfels(random_scene(12, width=16, height=12)))
     content = file.read_bytes()
     start = content.index(b"end_header\n") + len(b"end_header\n")
     names = [line.split()[-1] for line in content[:start].decode().splitlines() if line.startswith("property")]
