@@ -61,6 +61,26 @@ def check_finite(name: str, tensor: torch.Tensor) -> None:
         raise ValueError(f"{name}: expected finite values, got {tensor[where].item()} at index {where}")
 
 
+def check_values(name: str, tensor: torch.Tensor, low: float, high: float) -> None:
+    """Raise ValueError naming the first element of `tensor` that is NaN or not in [low, high]."""
+    if tensor.numel() == 0:
+        return
+    least, most = tensor.aminmax()  # both are NaN if an element is
+    if not (least >= low and most <= high):
+        where = tuple(torch.nonzero(~((tensor >= low) & (tensor <= high)))[0].tolist())
+        raise ValueError(
+            f"{name}: expected values from {low:g} to {high:g}, got {tensor[where].item():g} at index {where}"
+        )
+
+
+def check_version(value: object, known: int) -> None:
+    """Raise ValueError unless a file's format version is an integer from 1 to the newest known one."""
+    if type(value) is not int or not 1 <= value <= known:
+        newer = type(value) is int and value > known
+        reason = "; a newer nexwarp wrote the file, update nexwarp to read it" if newer else ""
+        raise ValueError(f"expected format version {known}, got {value!r:.60}{reason}")
+
+
 def check_range(name: str, value: float, low: float, high: float = float("inf")) -> None:
     """Raise ValueError unless low <= value <= high."""
     if not low <= value <= high:

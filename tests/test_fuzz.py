@@ -16,7 +16,7 @@ from benchmarks.fuzz_inputs import Files
 from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
 DRAWN = ("nerfstudio", "config", "colmap_binary")
-DRIVERS = {"mutate": (100, tuple(TARGETS)), "hypothesis": (40, DRAWN)}
+DRIVERS = {"mutate": (60, tuple(TARGETS)), "hypothesis": (40, DRAWN)}
 
 # In a process of its own: what this one has done with torch's threads would follow the forked readers.
 PROGRAM = """
@@ -71,6 +71,17 @@ def test_the_valid_files_load(tmp_path: Path, name: str) -> None:
     for index, files in enumerate(target.make(tmp_path / "valid")):
         target.write(tmp_path / str(index), files)
         target.read(tmp_path / str(index))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+def test_a_long_run_of_every_reader_finds_nothing(tmp_path: Path) -> None:
+    """As long as NEXWARP_FUZZ_SECONDS says, 600 s without it; what failed is kept in the test's folder."""
+    seconds, seed = os.environ.get("NEXWARP_FUZZ_SECONDS", "600"), os.environ.get("NEXWARP_FUZZ_SEED", "0")
+    command = [sys.executable, "-m", "benchmarks.fuzz", "--seconds", seconds, "--seed", seed, "--failed", str(tmp_path)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 failures," in done.stdout.splitlines()[-1]
 
 
 def _crash(folder: Path) -> None:

@@ -26,6 +26,8 @@ NOISES = (1e-3, 1e-2, 1e-1)  # candidates of the noise variance, relative to tha
 
 TINY = 1e-9  # added to the diagonal of matrices of squared errors, which may be singular
 
+BUFFERS = ("log_gains", "positions", "directions", "coefficients", "mean", "lengths", "falloff")
+
 
 class Exposures(nn.Module):
     """Gaussian process with a Matern 3/2 kernel that predicts gains from camera poses, fitted to V photos.

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from nexwarp.checks import check_version
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
 from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
@@ -22,6 +23,7 @@ from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
 
 DEMO = "demo"
+RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
 
 
 @dataclass(frozen=True)
@@ -180,13 +182,16 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         raise MissingError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
         data = read_json(path)
+        check_version(data.get("format_version", 1), RUN_VERSION)
         scene = data["scene"]
         if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
             raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
         for name in ("images", "masks", "background", "points", "format"):
             if not isinstance(scene.get(name), (str, type(None))):
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
-        return SceneSource(**data["scene"]), config_from_dict(data["config"]), data
+        known = {field.name for field in dataclasses.fields(SceneSource)}
+        source = SceneSource(**{name: value for name, value in scene.items() if name in known})
+        return source, config_from_dict(data["config"]), data
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
@@ -198,6 +203,7 @@ def read_metrics(run: Path) -> dict[str, Json]:
         metrics = read_json(path) if path.is_file() else {}
         if not isinstance(metrics, dict):
             raise ValueError(f"expected an object, got {type(metrics).__name__}")
+        check_version(metrics.get("format_version", 1), RUN_VERSION)
         for name in ("psnr", "ssim"):
             if not isinstance(metrics.get(name, 0.0), (int, float)):
                 raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")

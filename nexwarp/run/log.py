@@ -199,7 +199,7 @@ def _iteration(line: bytes) -> float:
     """Return the iteration of a line; infinity if the line is damaged."""
     try:
         iteration = json.loads(line)["iteration"]
-    except (ValueError, TypeError, KeyError):  # bad UTF-8 is a ValueError
+    except (ValueError, TypeError, KeyError, RecursionError):  # bad UTF-8 is a ValueError
         return math.inf
     return iteration if type(iteration) is int else math.inf
 

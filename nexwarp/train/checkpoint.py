@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
+from nexwarp.checks import check_version
 from nexwarp.errors import CheckpointError, MissingError
-from nexwarp.io.files import is_temporary, sync, temporary_name, write_atomically
+from nexwarp.io.files import check_tensors_header, is_temporary, sync, temporary_name, write_atomically
 from nexwarp.io.json_files import READ_ERRORS, read_json
 
 CHECKPOINT_VERSION = 1
@@ -118,11 +119,10 @@ def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, A
 
     try:
         record = read_json(folder / STATE_FILE)
-        version = record.get("format_version") if isinstance(record, dict) else None
-        if version != CHECKPOINT_VERSION:
-            raise ValueError(f"expected format version {CHECKPOINT_VERSION}, got {version}")
+        check_version(record.get("format_version") if isinstance(record, dict) else None, CHECKPOINT_VERSION)
         if record.pop("sha256", None) != _digest(record):
             raise ValueError("state.json: its checksum does not agree")
+        check_tensors_header(folder / TENSORS_FILE)
         content = (folder / TENSORS_FILE).read_bytes()
         if hashlib.sha256(content).hexdigest() != record.pop("tensors_sha256"):
             raise ValueError("tensors.safetensors: its checksum does not agree")

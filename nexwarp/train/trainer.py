@@ -16,7 +16,7 @@ from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
@@ -35,9 +35,9 @@ from nexwarp.train.state import (
     checkpoint_bytes,
     gather_optimizer,
     gather_random,
+    known_part,
     learned_tensors,
     named_parameters,
-    part,
     restore_optimizer,
     restore_random,
     scene_digest,
@@ -320,7 +320,8 @@ class Trainer:
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())  # torch's go over several lines
+            found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            reason = " ".join(found.split())  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def _check_origin(self, snapshot: Snapshot) -> None:
@@ -361,8 +362,8 @@ class Trainer:
     def load_snapshot(self, snapshot: Snapshot) -> None:
         """Return to a snapshot of this run, which stays as it is; ValueError or RuntimeError where it does not fit."""
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
-        self.surfels = Surfels(part(tensors, "surfels.")).to(self.device)
-        self.texture.load_state_dict(part(tensors, "texture."))
+        self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
+        self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
         self.optimizer = make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer)
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
