@@ -18,7 +18,9 @@ MAX_CONNECTIONS = 128  # TCP connections: clients, pages in transfer, and what h
 MAX_MESSAGE_BYTES = 2**16  # of one message of a browser; the largest that the panels send has a few hundred
 MESSAGES_A_SECOND = 120.0  # of one client, on average; a browser sends 50 while its camera moves
 BURST = 240  # messages of one client that may come at once
+FLOOD_SECONDS = 5.0  # of more messages than that, after which a client is closed
 SEND_SECONDS = 60.0  # in which a client must have read a message
+CLOSE_SECONDS = 2.0  # in which a client must answer a farewell
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "frame-ancestors 'self'",  # no page of another server shows the viewer in a frame
@@ -56,7 +58,8 @@ class Gate:
             handler: Handler, host: str, port: int, *, process_request: Process, **options: object
         ) -> web.serve:
             self.attached = True
-            options |= {"max_size": MAX_MESSAGE_BYTES, "create_connection": partial(Connection, self)}
+            options |= {"max_size": MAX_MESSAGE_BYTES, "close_timeout": CLOSE_SECONDS}
+            options |= {"create_connection": partial(Connection, self)}
             answer = partial(self._answer, process_request)
             return serve(partial(_handle, handler), host, port, process_request=answer, **options)  # type: ignore[arg-type]
 
@@ -99,7 +102,7 @@ async def _handle(handler: Handler, connection: ServerConnection) -> None:
 
 
 class Connection(ServerConnection):
-    """A connection that is read slowly if it sends fast, and closed if it does not read.
+    """A connection that is read slowly if it sends fast, and closed if it goes on to, or does not read.
 
     Attributes:
         sending: number of messages that the client has not taken yet.
@@ -109,7 +112,7 @@ class Connection(ServerConnection):
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
         self.gate = gate
         self.sending = 0
-        self.next_due = 0.0
+        self.next_due = self.in_time = 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take up a TCP connection, or drop it if there are too many."""
@@ -131,6 +134,10 @@ class Connection(ServerConnection):
         self.next_due = max(self.next_due, now - BURST / MESSAGES_A_SECOND) + 1.0 / MESSAGES_A_SECOND
         # At least a zero: the previous message is handled before the next one is taken.
         await asyncio.sleep(max(self.next_due - now, 0.0))
+        if self.next_due <= now:
+            self.in_time = now
+        elif now - self.in_time > FLOOD_SECONDS:
+            self.transport.abort()
         return message
 
     async def send(self, message: bytes, text: bool | None = None) -> None:  # type: ignore[override]

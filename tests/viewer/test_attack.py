@@ -9,15 +9,16 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.viewer import Viewer, pacing
+from nexwarp.viewer import Viewer, connections, pacing
+from nexwarp.viewer.session import Session
 from tests.viewer.attack import attacked, resources
 from tests.viewer.support import Client, serving, wait_for
 from tests.viewer.test_training import trainer_of
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
-FULL = {"iterations": 300, "pixels": pacing.MOST_PIXELS}
-SMALL = {"iterations": 20, "pixels": 2**18}
+FULL = {"iterations": 300, "pixels": pacing.MOST_PIXELS, "flood": connections.FLOOD_SECONDS}
+SMALL = {"iterations": 20, "pixels": 2**18, "flood": 1.0}
 
 
 @pytest.mark.timeout(1800)
@@ -26,6 +27,7 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
     """Clients come and go, send garbage, flood, ask for huge screenshots, and read nothing."""
     pytest.importorskip("viser")
     monkeypatch.setattr(pacing, "MOST_PIXELS", size["pixels"])
+    monkeypatch.setattr(connections, "FLOOD_SECONDS", size["flood"])
     run = tiny_folder.parent / "run"  # beside the scene; it is not there
     start = time.perf_counter()
     alone = trainer_of(run, iterations=size["iterations"])
@@ -83,6 +85,7 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
 @pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.slow)])
 def test_sessions_leave_nothing_behind(model, count, record_property):
     """Files, threads and memory after many sessions: connect, one picture, disconnect."""
+    viser = pytest.importorskip("viser")
     warm = max(count // 10, 10)
     with serving(model, photos={}) as viewer:
 
@@ -106,6 +109,9 @@ def test_sessions_leave_nothing_behind(model, count, record_property):
         print(f"after {warm} sessions {before}, after {count} more {after}")
         server = viewer.server._websock_server
         assert not server._client_state_from_id and not server._live_connections
+        gone = {Session, viser.ClientHandle, connections.Connection}
+        kept = [thing for thing in gc.get_objects() if type(thing) in gone]
+        assert not kept, "nothing refers to a client that has left"
     assert after["files"] <= before["files"] + 2
     assert after["threads"] <= before["threads"] + 32, "viser's pool"
     assert after["bytes"] <= before["bytes"] + 32 * 2**20

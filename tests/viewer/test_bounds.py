@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -65,7 +66,10 @@ def test_screenshots_of_any_window_are_bounded(model, monkeypatch, window):
     assert max(max(size) for size in drawn) <= MOST_SIDE
 
 
-def test_a_flood_of_messages_is_read_at_a_bounded_rate_and_nothing_is_lost(model):
+def test_a_flood_of_messages_is_read_at_a_bounded_rate_and_closed_if_it_goes_on(model, monkeypatch):
+    """A short one loses nothing."""
+    from websockets.exceptions import ConnectionClosed
+
     with serving(model, photos={}) as viewer, Client(viewer) as good, Client(viewer) as flood:
         good.look()
         assert good.picture().ndim == 3
@@ -83,8 +87,15 @@ def test_a_flood_of_messages_is_read_at_a_bounded_rate_and_nothing_is_lost(model
             return not np.allclose(session.viewpoint.pose[:3, 3], eye)
 
         good.look(position=(0.5, 0, -3))
-        assert behind() and good.picture().ndim == 3, "another client is served in the meantime"
+        assert good.picture().ndim == 3, "another client is served in the meantime"
         wait_for(lambda: not behind())
+        monkeypatch.setattr(connections, "FLOOD_SECONDS", 0.2)
+        with suppress(ConnectionClosed):
+            for _ in range(2 * count):
+                flood.look()
+        wait_for(lambda: len(viewer.sessions) == 1)
+        good.look(position=(0.6, 0, -3))
+        assert good.picture().ndim == 3
 
 
 @pytest.fixture
@@ -113,15 +124,15 @@ def test_a_client_that_reads_slowly_gets_few_pictures_and_is_closed(model, monke
             wait_for(lambda: len(viewer.sessions) == 2)
             mine, other = (viewer.sessions[number] for number in sorted(viewer.sessions))
             other.take_screenshot(64)
-            end = time.monotonic() + 1.0
-            while time.monotonic() < end:
+            end = time.monotonic() + 20.0
+            while heavy_pictures.count(mine.client.client_id) < 9:
+                assert time.monotonic() < end
                 for session in (mine, other):
                     session._changed()
                     session.tell("again", "and again")
                 next(good.hear())
                 assert other.waiting() <= session_module.MOST_WAITING + 5
-            pictures = heavy_pictures.count(other.client.client_id)
-            assert pictures <= 5 and heavy_pictures.count(mine.client.client_id) > pictures
+            assert heavy_pictures.count(other.client.client_id) <= 5
             wait_for(lambda: len(viewer.sessions) == 1)
         mine._changed()
         assert good.picture().ndim == 3
@@ -265,11 +276,10 @@ def test_a_screenshot_counts_in_full_for_the_share_of_time(model, monkeypatch):
     with Viewer(lambda: model, ring(), near=0.01, port=0, total=10, photos={}) as viewer, Client(viewer) as client:
         client.look()
         session = session_of(viewer)
-        waits = []
+        counted: list[float] = []
+        monkeypatch.setattr(viewer.share, "spend", lambda _, seconds: counted.append(seconds))
         for _ in range(2):
             wait_for(lambda: not session.waiting())
-            viewer.share.free_at = -math.inf
             session.take_screenshot(64)
             viewer.between_steps(1, lambda: "fine")
-            waits.append(viewer.share.free_at - time.perf_counter())
-        assert 0.3 < waits[0] < 0.5 and 1.1 < waits[1] < 2.5, "four times 0.1 s, and 0.3 s"
+        assert counted[0] == pacing.FIRST_SECONDS and counted[1] >= 0.3
