@@ -21,7 +21,14 @@ from typing import Any, ClassVar
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 from rich.console import Console
 
 from nexwarp.cli.train import Train
@@ -55,9 +62,9 @@ DAMAGED += tuple(f"checkpoint{age}/{file}" for age in ("", ".old") for file in (
 FOREIGN = ("notes.txt", "renders/mine.png", "renders/test/b.png", "export/a.obj", "mine/config.json")
 FOREIGN += ("checkpoint/notes.txt", "checkpoint.old/notes.txt")
 
-names = st.sampled_from("ab")
+names = st.sampled_from("aaab")
 seeds = st.sampled_from([0, 1])
-flags = st.sampled_from(["", "resume", "overwrite"])
+flags = st.sampled_from(["resume", "overwrite", ""])
 
 
 def train(scene: Path, run: Path, seed: int | None, flag: str) -> None:
@@ -120,6 +127,11 @@ class RunFolders(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         shutil.rmtree(self.root)
+
+    @initialize(seed=seeds)
+    def begin_with_a_finished_run(self, seed: int) -> None:
+        shutil.copytree(self.base / f"whole{seed}", self.root / "a")
+        self.slots["a"].finished = True
 
     # Trainings
 
@@ -272,14 +284,15 @@ class RunFolders(RuleBasedStateMachine):
             path.write_bytes({"empty": b"", "half": content[: len(content) // 2], "zeros": bytes(len(content))}[how])
         self.slots[name].damaged.add(file)
 
-    @rule(name=names, file=st.sampled_from(FOREIGN), number=st.integers(0, 9))
-    def add_foreign(self, name: str, file: str, number: int) -> None:
+    @rule(name=names, files=st.lists(st.sampled_from(FOREIGN), min_size=2), number=st.integers(0, 9))
+    def add_foreign(self, name: str, files: list[str], number: int) -> None:
         run = self.root / name
-        if run.is_dir() and not (run / file).exists():
-            (run / file).parent.mkdir(exist_ok=True)
-            content = f"{file} {number}".encode()
-            (run / file).write_bytes(content)
-            self.slots[name].foreign[file] = content
+        for file in files:
+            if run.is_dir() and not (run / file).exists():
+                (run / file).parent.mkdir(exist_ok=True)
+                content = f"{file} {number}".encode()
+                (run / file).write_bytes(content)
+                self.slots[name].foreign[file] = content
 
     @rule(name=names)
     def add_link(self, name: str) -> None:
