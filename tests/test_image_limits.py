@@ -14,6 +14,7 @@ from nexwarp.buffers import render_buffers
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import main as cli
 from nexwarp.errors import NexwarpError, OutOfMemoryError
+from nexwarp.kernels import launch as launching
 from nexwarp.kernels.types import types
 from nexwarp.model.model_file import save_model
 from nexwarp.ops import _interop, memory, tiles
@@ -49,7 +50,7 @@ def no_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any, **__: Any) -> None:
         pytest.fail("a pass was launched")
 
-    monkeypatch.setattr(_interop.launching, "launch", fail)
+    monkeypatch.setattr(launching, "launch", fail)
 
 
 # int32

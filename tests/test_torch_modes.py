@@ -19,8 +19,6 @@ from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small
 
 HALVES = [torch.bfloat16, torch.float16]
-# Enough hits that the texture's columns are shared out in several parts.
-SIZE = {"width": 61, "height": 45}
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +30,7 @@ def fixed_order(device: torch.device) -> Iterator[None]:
 
 def model_of(device: torch.device, *, finished: bool = True) -> tuple[nw.Model, nw.Camera]:
     """A model with texture, exposures with vignetting and detail limits; and a camera."""
-    scene = random_scene(60, device=device, **SIZE)
+    scene = random_scene(60, device=device, width=61, height=45)
     surfels, camera = make_surfels(scene), make_camera(scene)
     if not finished:
         return nw.Model(surfels, make_texture(device=device)), camera
