@@ -36,7 +36,7 @@ class Camera:
         TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
         ValueError: a shape or device is wrong; a value is not finite; the translation of `viewmat` is beyond 1e16; its
             rotation is a reflection, or differs from orthonormal by more than 1e-3; `K` has skew or a focal length
-            below 1e-16; a size is < 1; `near` is < 0.
+            below 1e-16; a size is < 1; `near` is < 0 or beyond 1e16.
     """
 
     viewmat: torch.Tensor
@@ -68,8 +68,7 @@ class Camera:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
         if isinstance(self.near, bool) or not isinstance(self.near, (int, float)):
             raise TypeError(f"near: expected a number, got {type(self.near).__name__}")
-        if not 0 <= self.near < float("inf"):
-            raise ValueError(f"near: expected at least 0 and finite, got {self.near}")
+        check_range("near", self.near, 0, LARGEST_DISTANCE)
         _check_rigid(viewmat)
         _check_intrinsics(intrinsics)
         (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()

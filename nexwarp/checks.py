@@ -85,7 +85,7 @@ def check_range(name: str, value: float, low: float, high: float = float("inf"))
     """Raise ValueError unless low <= value <= high."""
     if not low <= value <= high:
         upper = "" if high == float("inf") else f" and at most {high:g}"
-        raise ValueError(f"{name}: expected at least {low:g}{upper}, got {value}")
+        raise ValueError(f"{name}: expected at least {low:g}{upper}, got {value!s:.60}")
 
 
 def available_memory() -> int:

@@ -1,5 +1,6 @@
 """Every number of a model is refused on load with one line, or gives a finite picture."""
 
+import functools
 import json
 import math
 from collections.abc import Iterator
@@ -43,6 +44,7 @@ REFUSED = {
 }
 
 
+@functools.cache
 def tiny_camera() -> nw.Camera:
     camera = make_camera(random_scene(12, width=16, height=12))
     return nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height)
@@ -53,7 +55,7 @@ def tiny_model() -> nw.Model:
     torch.manual_seed(0)
     texture = nw.NeuralTexture(levels=2, table_size=16, min_resolution=1.0, max_resolution=4.0, width=8, residual=True)
     torch.nn.init.normal_(texture.grid)
-    cameras = [tiny_camera() for _ in range(3)]
+    cameras = [tiny_camera.__wrapped__() for _ in range(3)]
     for index, camera in enumerate(cameras):
         camera.viewmat[:3, 3] += 0.3 * index
     exposures = Exposures.of(0.2 * torch.randn(3, 3), cameras, (-0.3, -0.2, 0.4))
@@ -63,7 +65,17 @@ def tiny_model() -> nw.Model:
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_model(tmp_path_factory.mktemp("model"), tiny_model())
+    """A model file, all in single precision."""
+    file = save_model(tmp_path_factory.mktemp("model"), tiny_model())
+    rewrite(file, lambda tensors, _: tensors.update({name: x.float() for name, x in tensors.items()}))
+    return file
+
+
+def with_number(content: bytes, name: str, value: float) -> bytes:
+    """Replace the first number of a tensor in the content of a safetensors file."""
+    size = int.from_bytes(content[:8], "little")
+    place = 8 + size + json.loads(content[8 : 8 + size])[name]["data_offsets"][0]
+    return content[:place] + torch.tensor([value]).numpy().tobytes() + content[place + 4 :]
 
 
 def check_pictures(model: nw.Model, camera: nw.Camera, name: str) -> None:
@@ -85,13 +97,7 @@ def check_message(error: Exception, file: Path, name: str) -> None:
 @pytest.mark.parametrize("name", TENSORS)
 def test_a_number_is_refused_or_renders_finite(stored: Path, tmp_path: Path, name: str, value: float) -> None:
     file = tmp_path / "model.safetensors"
-    file.write_bytes(stored.read_bytes())
-
-    def change(tensors: dict[str, torch.Tensor], _: dict[str, Any]) -> None:
-        tensors[name] = tensors[name].float()
-        tensors[name].view(-1)[0] = value
-
-    rewrite(file, change)
+    file.write_bytes(with_number(stored.read_bytes(), name, value))
     try:
         model = load(file)
     except ValueError as error:
@@ -114,7 +120,7 @@ def test_bounds_themselves_render_finite(stored: Path, tmp_path: Path, name: str
     file = tmp_path / "model.safetensors"
     file.write_bytes(stored.read_bytes())
     value = torch.nextafter(torch.tensor(BOUNDS[name][end]), torch.tensor(1.0)).item()
-    rewrite(file, lambda tensors, _: tensors.update({name: torch.full_like(tensors[name].float(), value)}))
+    rewrite(file, lambda tensors, _: tensors.update({name: torch.full_like(tensors[name], value)}))
     check_pictures(load(file), tiny_camera(), f"{name} = {value}")
 
 
@@ -139,7 +145,7 @@ def test_numbers_that_fail_together_are_refused(
 
     def apply(tensors: dict[str, torch.Tensor], _: dict[str, Any]) -> None:
         for name, value in change.items():
-            tensors[name] = value if isinstance(value, torch.Tensor) else torch.full_like(tensors[name].float(), value)
+            tensors[name] = value if isinstance(value, torch.Tensor) else torch.full_like(tensors[name], value)
 
     rewrite(file, apply)
     with pytest.raises(ValueError) as caught:
@@ -210,3 +216,14 @@ def test_a_number_of_a_camera_is_refused_or_renders_finite(stored: Path, tmp_pat
             continue
         assert math.isfinite(value) and not (name.endswith("[3]") and abs(value) >= 1e30), name
         check_pictures(model, camera, f"{name} = {value}")
+
+
+def test_integers_that_no_float_can_hold_are_refused() -> None:
+    camera = tiny_camera()
+    with pytest.raises(ValueError, match="near: expected at least 0 and at most 1e\\+16, got 1000"):
+        nw.Camera(camera.viewmat, camera.K, 16, 12, near=10**40)
+    with pytest.raises(
+        ValueError, match="background: expected at least -1e\\+06 and at most 1e\\+06, got 1000"
+    ) as caught:
+        nw.RenderOptions(background=(10**400, 0, 0))
+    assert len(str(caught.value)) < 200

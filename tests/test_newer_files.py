@@ -14,7 +14,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import Scene
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
@@ -178,11 +178,6 @@ def duplicate_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
     return write_frames(folder, 29_000), lambda: nw.load_scene(folder)
 
 
-def many_transforms(folder: Path) -> tuple[Path, Callable[[], object]]:
-    file = write_frames(folder, MANY)
-    return file, lambda: load_transforms(file)
-
-
 def long_path(folder: Path) -> tuple[Path, Callable[[], object]]:
     entries = repeated(json.dumps({"camera_to_world": [x for row in POSE for x in row], "fov": 50}), MANY)
     file = folder / "path.json"
@@ -217,7 +212,6 @@ def many_checkpoint_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
     [
         (many_frames, "expected at most 500,000 lists and objects, got 900,"),
         (duplicate_frames, "expected each photo once, got 1.png twice"),
-        (many_transforms, "expected at most 500,000 lists and objects, got 900,"),
         (long_path, "camera_path: expected at most 30,000 cameras, got 150,000"),
         (many_cameras, "expected at most 500,000 lists and objects, got 1,500,003"),
         (many_tensors, "expected a safetensors header of at most 1,048,576 bytes"),

@@ -32,6 +32,13 @@ NOT_RESUMED = {
 }
 
 
+# By default the commands are tried on the first run, one that is refused, and the last of each version.
+OFTEN = (RUNS[0], *UNREADABLE, *RUNS[-2:])
+EVERY_RUN = pytest.mark.parametrize(
+    "run", [name if name in OFTEN else pytest.param(name, marks=pytest.mark.slow) for name in RUNS], indirect=True
+)
+
+
 @pytest.fixture(params=RUNS)
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of an old run."""
@@ -67,6 +74,7 @@ def test_old_models_render_the_picture_stored_with_them(run: Path) -> None:
     assert_close(rendered(run), expected, kind="value", name=run.name)
 
 
+@EVERY_RUN
 def test_old_runs_serve_every_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert read_run(run)[1].max_surfels == 24
     before = read_metrics(run)
@@ -83,6 +91,7 @@ def test_old_runs_serve_every_command(run: Path, capsys: pytest.CaptureFixture[s
     assert after["psnr"] == pytest.approx(before["psnr"], abs=0.01) and after["surfels"] == before["surfels"]
 
 
+@EVERY_RUN
 def test_old_runs_resume_or_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["train", str(SCENE), "--run", str(run), "--resume", "--device", "cpu"]
     if run.name in NOT_RESUMED:
