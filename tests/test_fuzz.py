@@ -36,19 +36,15 @@ print(json.dumps(results))
 """
 
 
-def fuzzed(folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", PROGRAM, str(folder), json.dumps(DRIVERS)]
-    return subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
-
-
-@pytest.fixture
-def results(background_job: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     pytest.importorskip("hypothesis")
-    assert background_job.returncode == 0, background_job.stderr
-    return json.loads(background_job.stdout.splitlines()[-1])
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path_factory.mktemp("fuzz")), json.dumps(DRIVERS)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", TARGETS)
 def test_readers_load_or_refuse_in_one_line(results: dict[str, Any], name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
@@ -57,7 +53,6 @@ def test_readers_load_or_refuse_in_one_line(results: dict[str, Any], name: str) 
     assert 0 < result["loaded"] < inputs, "inputs are neither all as good as new nor all beyond recognition"
 
 
-@pytest.mark.background_job.with_args(fuzzed)
 @pytest.mark.parametrize("name", DRAWN)
 def test_readers_stand_what_hypothesis_draws(results: dict[str, Any], name: str) -> None:
     result = results[f"hypothesis {name}"]
