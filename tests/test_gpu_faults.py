@@ -13,7 +13,6 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.buffers import PASSES, render_buffers
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.determinism import deterministic
 from nexwarp.errors import DivergedError, OutOfMemoryError
 from nexwarp.train import graphs as step_graphs
@@ -236,26 +235,21 @@ def test_a_gpu_that_is_full_ends_a_training_that_then_goes_on(tiny_scene, cuda_g
 # A fault that ends the GPU's context
 
 
-@pytest.fixture(scope="module")
-def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=4, points=100)
-
-
 def train(scene: Path, run: Path, device: torch.device, *flags: str) -> int:
     return cli.main(["train", str(scene), "--run", str(run), "--device", device.type, *FLAGS, *flags])
 
 
-def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(scene_folder, tmp_path, capsys, device):
+def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(tiny_folder, tmp_path, capsys, device):
     whole = tmp_path / "whole"
     with failing_gpu(None, "") as launches:
-        assert train(scene_folder, whole, device) == 0
+        assert train(tiny_folder, whole, device) == 0
     expected = (whole / "model.safetensors").read_bytes()
     places = random.Random(1).sample(range(len(launches) // 10, len(launches)), 12 if device.type == "cuda" else 3)
     for fatal, message in zip(sorted(places), FAULTS * 4, strict=False):
         run = tmp_path / f"run{fatal}"
         capsys.readouterr()
         with failing_gpu(fatal, message):
-            assert train(scene_folder, run, device) == 3
+            assert train(tiny_folder, run, device) == 3
         line = (
             f"nexwarp: error: the GPU failed ({message.splitlines()[0]}); --resume continues from the last checkpoint\n"
         )
@@ -263,13 +257,13 @@ def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(sc
         assert not list(run.rglob("*.tmp*"))
         if (run / "model.safetensors").exists():  # a fault of the evaluation
             assert (run / "model.safetensors").read_bytes() == expected, fatal
-        assert train(scene_folder, run, device, "--resume") == 0
+        assert train(tiny_folder, run, device, "--resume") == 0
         assert (run / "model.safetensors").read_bytes() == expected, fatal
 
 
-def test_a_fault_of_the_gpu_is_told_of_any_command(scene_folder, tmp_path, capsys, device):
+def test_a_fault_of_the_gpu_is_told_of_any_command(tiny_folder, tmp_path, capsys, device):
     run = tmp_path / "run"
-    assert train(scene_folder, run, device) == 0
+    assert train(tiny_folder, run, device) == 0
     capsys.readouterr()
     with failing_gpu(5, FAULTS[1]):
         assert cli.main(["render", str(run), "--set", "test", "--device", device.type]) == 3
