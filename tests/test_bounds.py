@@ -107,6 +107,24 @@ def test_a_number_is_refused_or_renders_finite(stored: Path, tmp_path: Path, nam
     check_pictures(model, tiny_camera(), f"{name} = {value}")
 
 
+@pytest.mark.cuda
+def test_what_loads_renders_finite_on_cuda(stored: Path, tmp_path: Path) -> None:
+    """There the texture is computed in half precision."""
+    file, camera, failed = tmp_path / "model.safetensors", tiny_camera().to("cuda"), []
+    for name in TENSORS:
+        for value in (*VALUES, *BOUNDS.get(name, (-65504.0, 65504.0))):
+            file.write_bytes(with_number(stored.read_bytes(), name, value))
+            try:
+                model = load(file).to("cuda")
+            except ValueError:
+                continue
+            try:
+                check_pictures(model, camera, f"{name} = {value}")
+            except AssertionError as error:
+                failed.append(str(error))
+    assert failed == []
+
+
 def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
     tensors: dict[str, torch.Tensor] = {}
     rewrite(stored, lambda found, _: tensors.update(found))
