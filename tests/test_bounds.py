@@ -18,6 +18,7 @@ from nexwarp.model.surfels_ply import load_surfels_ply, save_surfels_ply
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from tests.model_file_support import rewrite
+from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_finite
 
@@ -123,6 +124,13 @@ def test_what_loads_renders_finite_on_cuda(stored: Path, tmp_path: Path) -> None
             except AssertionError as error:
                 failed.append(str(error))
     assert failed == []
+
+
+def test_half_precision_is_left_where_it_could_overflow(stored: Path, tmp_path: Path) -> None:
+    file = tmp_path / "model.safetensors"
+    for value, fits in ((1.0, True), (65504.0, False)):
+        file.write_bytes(with_number(stored.read_bytes(), MATRICES[0], value))
+        assert present(load(file).texture).half_precision == fits
 
 
 def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.subprocesses import python_path
+
 ROOT = Path(__file__).parents[1]
 SECONDS = 60  # after which a child hangs
 
@@ -119,7 +121,7 @@ assert os.waitpid(number, 0)[1] == 0
 
 
 def run(script: str) -> str:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | python_path(ROOT)
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3 * SECONDS
     )

@@ -26,6 +26,7 @@ from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.trainer import Trainer
+from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[1]
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--checkpoint-every", "1"]
@@ -87,7 +88,7 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, device: str, count:
     processes: list[subprocess.Popen[bytes]] = []
 
     def start(run: Path, moment: Moment) -> subprocess.Popen[bytes]:
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        environment = os.environ | python_path(ROOT)
         if isinstance(moment, tuple):
             environment[KILL_AT] = f"{moment[1]} {moment[0]}"
         silent = subprocess.DEVNULL

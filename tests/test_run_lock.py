@@ -18,6 +18,7 @@ from nexwarp.cli import main as cli
 from nexwarp.errors import RunError, StorageError
 from nexwarp.run import lock
 from nexwarp.run.lock import locked_run
+from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,7 +38,7 @@ with locked_run(Path(sys.argv[1])):
 def holder(tmp_path_factory) -> Iterator[tuple[Path, subprocess.Popen[str], int]]:
     """A run folder, the process that holds its lock, and a child that it has forked meanwhile."""
     run = tmp_path_factory.mktemp("held") / "run"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | python_path(ROOT)
     command = [sys.executable, "-W", "ignore", "-c", HOLD, str(run)]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

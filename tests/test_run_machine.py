@@ -45,6 +45,7 @@ from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Killed, kill_at
+from tests.subprocesses import python_path
 
 SMALL = Config(
     texture=TextureConfig(levels=2, table_size=2**6, width=8),
@@ -158,7 +159,7 @@ class RunFolders(RuleBasedStateMachine):
             command = [sys.executable, "-c", "from tests.test_run_machine import main; main()"]
             process = subprocess.Popen(
                 [*command, str(self.scene), str(run), str(seed), flag],
-                env=os.environ | {"PYTHONPATH": str(ROOT)},
+                env=os.environ | python_path(ROOT),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
             )

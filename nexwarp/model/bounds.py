@@ -1,6 +1,6 @@
 """Bounds of the values in files of models: within them every picture is finite."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 
@@ -78,11 +78,22 @@ def _check_falloff(a: float, b: float, largest: float) -> None:
 
 def _check_layers(tensors: Mapping[str, torch.Tensor]) -> None:
     """Raise ValueError if the grid's largest feature could make a layer of the MLP overflow."""
+    for name, largest in _largest_outputs(tensors):
+        if largest > LARGEST_OUTPUT:
+            raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
+
+
+def fits_half(tensors: Mapping[str, torch.Tensor]) -> bool:
+    """Whether no layer of the texture's MLP can overflow in half precision; the tensors are those of `check_bounds`."""
+    return all(largest <= LARGEST_HALF for _, largest in _largest_outputs(tensors))
+
+
+def _largest_outputs(tensors: Mapping[str, torch.Tensor]) -> Iterator[tuple[str, float]]:
+    """Yield the name of each matrix of the MLP, and a bound of the magnitude of its layer's outputs."""
     if "texture.grid" not in tensors:
         return
     largest = tensors["texture.grid"].abs().max().item()
     matrices = [name for name in tensors if name.startswith(MATRICES)]
     for name in sorted(matrices, key=lambda name: int(name.split(".")[2])):
-        largest *= tensors[name].abs().sum(1).max().item()
-        if largest > LARGEST_OUTPUT:
-            raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
+        largest *= tensors[name].float().abs().sum(1).max().item()
+        yield name, largest

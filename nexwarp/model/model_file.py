@@ -13,7 +13,7 @@ from nexwarp.checks import check_range, check_tensors, check_version
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import check_tensors_header, one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
-from nexwarp.model.bounds import check_bounds
+from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
@@ -155,6 +155,7 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
     if header.texture is not None:
         texture = NeuralTexture(**header.texture)  # type: ignore[arg-type]  # the constructor checks the types
         texture.load_state_dict(_part(tensors, "texture."))
+        texture.half_precision = fits_half(tensors)
     return Model(surfels, texture, exposures, limits, header.options, header.meta)
 
 

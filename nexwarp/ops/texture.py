@@ -301,6 +301,8 @@ def _lookup_backward(
 
 def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
     """(1,) float64 power of two that makes 2^46 units of the largest gradient: 2^17 of those may meet in one entry."""
+    if grad_encoded.numel() == 0:  # whose norm torch refuses
+        return unscale.new_ones(1, dtype=torch.float64)
     largest = torch.linalg.vector_norm(grad_encoded.float(), float("inf")).double() * unscale.double()
     return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 
