@@ -133,6 +133,22 @@ def test_half_precision_is_left_where_it_could_overflow(stored: Path, tmp_path: 
         assert present(load(file).texture).half_precision == fits
 
 
+def test_half_precision_has_the_same_bounds(stored: Path, tmp_path: Path) -> None:
+    """Sums of a matrix's rows may be larger than half precision holds."""
+    file = tmp_path / "model.safetensors"
+    file.write_bytes(stored.read_bytes())
+
+    def change(tensors: dict[str, torch.Tensor], _: dict[str, Any]) -> None:
+        halves = {name: x.half() for name, x in tensors.items() if "footprints" not in name}
+        tensors.update(halves | {MATRICES[-1]: torch.full_like(halves[MATRICES[-1]], 3e4)})
+
+    rewrite(file, change)
+    check_pictures(load(file), tiny_camera(), "half precision")
+    rewrite(file, lambda tensors, _: tensors.update({MATRICES[0]: torch.full_like(tensors[MATRICES[0]], torch.inf)}))
+    with pytest.raises(ValueError, match=r"texture.mlp.0.weight: expected values from -65504 to 65504, got inf at"):
+        load(file)
+
+
 def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
     tensors: dict[str, torch.Tensor] = {}
     rewrite(stored, lambda found, _: tensors.update(found))

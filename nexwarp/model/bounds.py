@@ -49,6 +49,7 @@ def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
     Args:
         tensors: by their names in a model file, with the shapes of the format; other names are passed over.
     """
+    tensors = {name: x.float() if x.dtype == torch.float16 else x for name, x in tensors.items()}
     for name, tensor in tensors.items():
         bounds = MATRIX_BOUNDS if name.startswith(MATRICES) else BOUNDS.get(name)
         if bounds is not None:

@@ -96,8 +96,8 @@ def load(path: str | os.PathLike[str]) -> Model:
         path = path / MODEL_FILE
     if not path.is_file():
         raise MissingError(f"{path}: expected a model file, or a run folder with a {MODEL_FILE}")
-    check_tensors_header(path)
     try:
+        check_tensors_header(path)
         with safe_open(path, "pt") as file:
             header = _read_header(path, (file.metadata() or {}).get("nexwarp"))
             # Tensors that this version does not know are passed over.
