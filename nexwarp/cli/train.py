@@ -79,7 +79,7 @@ class Train:
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
     """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
-    """Replace the run in --run."""
+    """Replace the run in --run; files that nexwarp did not write stay."""
     view: bool = False
     """Show the training in the browser, then the result until Ctrl-C (extra `viewer`)."""
     host: Host_ = "127.0.0.1"

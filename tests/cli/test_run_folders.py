@@ -3,12 +3,16 @@
 import json
 import os
 import shutil
+from contextlib import nullcontext
 
 import pytest
 
 from nexwarp.cli import main as cli
+from nexwarp.cli import train
+from nexwarp.errors import RunError
 from nexwarp.run.contents import delete_files, list_files
 from nexwarp.run.folder import keep_camera_path
+from nexwarp.run.lock import locked_run
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -123,6 +127,25 @@ def test_overwrite_refuses_what_is_no_run(scene, tmp_path, capsys):
         command = ["train", str(scene), "--run", str(place), *FLAGS, "--overwrite"]
         refused(capsys, command, str(place), "expected a run folder to overwrite", "config.json")
     assert snapshot(precious) == {"thesis.tex": b"years of work"} and file.read_text() == "a file"
+
+
+def test_the_lock_is_free_while_a_viewer_shows_the_result(scene, tmp_path, monkeypatch):
+    """Others may evaluate the run then; during the training they may not."""
+    shown = []
+
+    class Viewer:
+        def between_steps(self, *_: object) -> None:
+            with pytest.raises(RunError, match="no other process writes"), locked_run(tmp_path / "run"):
+                pass
+
+        def finish(self, *_: object) -> None:
+            with locked_run(tmp_path / "run"):
+                shown.append(True)
+
+    monkeypatch.setattr(train.Train, "_viewer", lambda *_: nullcontext(Viewer()))
+    monkeypatch.setattr(train, "show_until_interrupted", lambda *_: None)
+    assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "1"]) == 0
+    assert shown
 
 
 def test_all_files_of_a_run_are_known(finished, scene, tmp_path):
