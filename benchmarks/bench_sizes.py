@@ -95,7 +95,7 @@ def along(axis: str, sweep: Sweep, options: Options) -> list[Measurement]:
         try:
             scene = scene_at(point, scene, sweep, options)
             rows = [replace(m, name=f"{m.name}, by {axis}") for m in at_size(scene, point.hits, sweep, options)]
-        except torch.OutOfMemoryError:
+        except (MemoryError, torch.OutOfMemoryError):
             if not found:
                 raise
             found[-1][-1] = left_out(found[-1][-1], axis, points[i:], "out of memory")

@@ -31,6 +31,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import warp as wp
+
 from benchmarks.fuzz_inputs import Files, damage, strategy
 from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
@@ -258,8 +260,13 @@ def _report(report: Connection, counts: Result) -> None:
 def _limit_memory() -> None:
     import torch
 
-    # Torch's threads do not survive the fork; without this it may wait for them.
+    from nexwarp.kernels import launch
+    from nexwarp.ops import columns
+
+    # Threads do not survive the fork; without this the process may wait for them.
     torch.set_num_threads(1)
+    launch.set_num_threads(1)
+    columns._pool.cache_clear()
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL("libc.so.6").mallopt(M_ARENA_MAX, 1)
@@ -337,6 +344,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--driver", choices=("mutate", "hypothesis", "atheris"), default="mutate")
     parser.add_argument("--failed", type=Path, default=Path("fuzz_failures"), help="where inputs that fail are kept")
     options = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_ERROR
     if options.driver == "atheris":
         if len(options.targets) != 1:
             parser.error("--driver atheris: expected one of --targets")

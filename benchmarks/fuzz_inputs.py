@@ -187,6 +187,8 @@ def _safetensors(rng: random.Random, data: bytes) -> bytes:
     header = data[8 : 8 + length]
     try:
         content = json.loads(header)
+        if rng.random() < 0.5:
+            return data[: 8 + length] + _values(rng, content, data[8 + length :])
         if rng.random() < 0.6:
             meta = content["__metadata__"]["nexwarp"].encode()
             content["__metadata__"]["nexwarp"] = _json(rng, meta).decode("utf-8", "replace")
@@ -234,3 +236,26 @@ def strategy(valid: list[Files], fuzzed: tuple[str, ...]) -> Any:
         return chosen
 
     return files()
+
+
+def _values(rng: random.Random, header: dict[str, Any], body: bytes) -> bytes:
+    """The content of a safetensors file with numbers of some tensors replaced by extreme ones."""
+    kinds = {"F16": ("<e", 65504.0), "F32": ("<f", 3e38), "F64": ("<d", 1e308)}
+    for _ in range(_few(rng)):
+        name = rng.choice(sorted(header.keys() - {"__metadata__"}))
+        first, end = header[name]["data_offsets"]
+        code, largest = kinds.get(header[name]["dtype"], ("<b", 127))
+        size = struct.calcsize(code)
+        if end - first < size:
+            continue
+        value: float = rng.choice((*FLOATS, 3e38, -3e38, 1e-44, largest, -largest))
+        if code == "<b":
+            value = rng.randrange(-128, 128)
+        elif abs(value) > largest and value == value:
+            value = float("inf") if value > 0 else -float("inf")
+        count = (end - first) // size
+        places = range(count) if rng.random() < 0.1 else [rng.randrange(count)]
+        for place in places:
+            at = first + place * size
+            body = body[:at] + struct.pack(code, value) + body[at + size :]
+    return body

@@ -1,17 +1,31 @@
 """The readers of nexwarp's input files, each with small valid files to damage."""
 
+import contextlib
 import dataclasses
+import functools
+import hashlib
 import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.fuzz_inputs import Files
-from nexwarp.camera import Camera
+from benchmarks.fuzz_models import (
+    HEIGHT,
+    VIEWS,
+    WIDTH,
+    check_rendering,
+    some_cameras,
+    some_model,
+    some_surfels,
+    some_trainer,
+    some_viewmats,
+)
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
@@ -19,19 +33,18 @@ from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply, write_ply
-from nexwarp.io.json_files import Json
+from nexwarp.io.json_files import read_object, write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
-from nexwarp.run.folder import SceneSource, create_run, read_run
+from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
+from nexwarp.run.log import keep_lines
+from nexwarp.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.train.config import Config
-
-WIDTH, HEIGHT, VIEWS = 12, 9, 3
+from nexwarp.train.settings import parse_settings, with_settings
+from nexwarp.train.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -66,19 +79,6 @@ def _files(folder: Path) -> Files:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def _viewmats() -> list[np.ndarray]:
-    """(4, 4) world to camera, on an arc around the origin, looking at it."""
-    viewmats = []
-    for index in range(VIEWS):
-        angle = 0.4 * index
-        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = np.stack([[forward[1], -forward[0], 0.0], [0.0, 0.0, -1.0], forward])
-        viewmat[2, 3] = 2.0
-        viewmats.append(viewmat)
-    return viewmats
-
-
 def _photos(folder: Path, mode: str = "RGB") -> list[str]:
     from PIL import Image
 
@@ -88,11 +88,6 @@ def _photos(folder: Path, mode: str = "RGB") -> list[str]:
     for name in names:
         Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, len(mode)), dtype=np.uint8)).save(folder / name)
     return names
-
-
-def _cameras() -> list[Camera]:
-    K = torch.tensor([[10.0, 0.0, 6.0], [0.0, 11.0, 4.5], [0.0, 0.0, 1.0]])
-    return [Camera(torch.from_numpy(viewmat).float(), K, WIDTH, HEIGHT) for viewmat in _viewmats()]
 
 
 def _colmap(text: bool) -> Callable[[Path], list[Files]]:
@@ -110,7 +105,7 @@ def _colmap(text: bool) -> Callable[[Path], list[Files]]:
             scene = pycolmap.Reconstruction()
             camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
             scene.add_camera_with_trivial_rig(camera)
-            for index, (name, viewmat) in enumerate(zip(names, _viewmats(), strict=True)):
+            for index, (name, viewmat) in enumerate(zip(names, some_viewmats(), strict=True)):
                 image = pycolmap.Image(name=name, keypoints=np.ones((6, 2)), camera_id=1, image_id=index + 1)
                 scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3]))
             for index in range(6):
@@ -146,32 +141,21 @@ def _ply(folder: Path) -> list[Files]:
             dtype = np.dtype([(name, order + codes[kind]) for name, kind in zip(names, types, strict=True)])
             body = np.array([7], f"{order}i4").tobytes() + np.array(rows, dtype).tobytes()
         inputs.append({"points.ply": head + body})
-    save_splats_ply(folder / "points.ply", _surfels())
+    save_splats_ply(folder / "points.ply", some_surfels())
     inputs.append(_files(folder))
     known = np.ones(6, np.int32), np.ones(6, np.float32), np.array([[1, 0], [2, 5]])
     write_ply(folder / "points.ply", Cloud(np.eye(6, 3), np.zeros((6, 3), np.uint8), *known))
     return [*inputs, _files(folder)]
 
 
-def _surfels() -> Surfels:
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> torch.Tensor:
-        return torch.rand(shape, generator=generator)
-
-    return Surfels.from_activated(
-        random(5, 3), random(5, 4) + 0.1, random(5, 2) + 0.1, random(5), 1 + random(5, 2), random(5, 4, 3)
-    )
-
-
 def _surfels_ply(folder: Path) -> list[Files]:
-    save_surfels_ply(folder / "a" / "surfels.ply", _surfels())
-    save_surfels_ply(folder / "b" / "surfels.ply", _surfels().double())
+    save_surfels_ply(folder / "a" / "surfels.ply", some_surfels())
+    save_surfels_ply(folder / "b" / "surfels.ply", some_surfels().double())
     return [_files(folder / "a"), _files(folder / "b")]
 
 
 def _nerfstudio(folder: Path) -> list[Files]:
-    cameras = _cameras()
+    cameras = some_cameras()
     inputs = []
     for kind in ("plain", "full", "fisheye"):
         path = folder / kind
@@ -188,14 +172,14 @@ def _nerfstudio(folder: Path) -> list[Files]:
             data |= {"train_filenames": names[:2], "val_filenames": names[2:], "test_filenames": names[2:]}
             for frame, name in zip(data["frames"], names, strict=True):
                 frame["mask_path"] = name.replace("images", "masks")
-            save_splats_ply(path / "points.ply", _surfels())
+            save_splats_ply(path / "points.ply", some_surfels())
         (path / "transforms.json").write_text(json.dumps(data))
         inputs.append(_files(path))
     return inputs
 
 
 def _blender(folder: Path) -> list[Files]:
-    save_transforms(folder / "all.json", {str(i): camera for i, camera in enumerate(_cameras())})
+    save_transforms(folder / "all.json", {str(i): camera for i, camera in enumerate(some_cameras())})
     frames = [frame["transform_matrix"] for frame in json.loads((folder / "all.json").read_text())["frames"]]
     for split in ("train", "test"):
         names = _photos(folder / split, "RGBA")
@@ -209,14 +193,107 @@ def _blender(folder: Path) -> list[Files]:
 
 
 def _model(folder: Path) -> list[Files]:
-    texture = NeuralTexture(levels=2, table_size=16, width=8, hidden_layers=1, sh_degree=1)
-    options = RenderOptions(background=(0.1, 0.2, 0.3), sh_degree=1)
-    surfels, limits = _surfels(), DetailLimits(torch.ones(5), torch.full((5,), 2.0))
-    meta: dict[str, Json] = {"near": 0.01, "scene_scale": 1.5, "preset": "default"}
-    save_model(folder / "a", Model(surfels, texture, options=options, meta=meta))
-    save_model(folder / "b", Model(surfels, texture, detail_limits=limits, options=options))
-    load(folder / "a")  # the first load imports modules for seconds, which no input must pay for
+    full = some_model()
+    save_model(folder / "a", full)
+    save_model(folder / "b", Model(full.surfels, full.texture, options=full.options))
+    _read_model(folder / "a")  # the first reading imports modules and kernels for seconds, which no input must pay for
     return [_files(folder / "a"), _files(folder / "b")]
+
+
+def _read_model(folder: Path) -> None:
+    check_rendering(load(folder))
+
+
+def _read_surfels(folder: Path) -> None:
+    check_rendering(Model(load_surfels_ply(folder / "surfels.ply"), None).float())
+
+
+def _checkpoint(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    _trainer().save(folder)
+    check_rendering(_trainer().model())
+    return [_files(folder)]
+
+
+@functools.cache
+def _trainer() -> Trainer:
+    """Return the trainer that restores checkpoints; to make one takes seconds."""
+    return some_trainer()
+
+
+def _read_checkpoint(folder: Path) -> None:
+    """Restore a checkpoint whose checksums agree, although it is damaged."""
+    state, tensors = (folder / "checkpoint" / name for name in ("state.json", "tensors.safetensors"))
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        record = json.loads(state.read_bytes())
+        if isinstance(record, dict) and "sha256" in record:
+            del record["sha256"]
+            if "tensors_sha256" in record:
+                record["tensors_sha256"] = hashlib.sha256(tensors.read_bytes()).hexdigest()
+            digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+            state.write_text(json.dumps(record | {"sha256": digest}))
+    restored = _trainer()
+    restored.restore(folder)
+    check_rendering(restored.model())
+
+
+def _metrics(folder: Path) -> list[Files]:
+    values = {"psnr": 20.5, "ssim": 0.7, "flip": None}
+    data = {**values, "views": {"a.png": values}, "convention": "x", "preset": "default", "iterations": 3, "surfels": 5}
+    write_json(folder / "metrics.json", data)
+    return [_files(folder)]
+
+
+def _log(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps({"iteration": i, "loss": 0.1, "losses": {"rgb": 0.1}, "psnr": None}) for i in (1, 3, 5)]
+    (folder / "metrics.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    return [_files(folder)]
+
+
+def _read_log(folder: Path) -> None:
+    """Drop what a resumed training drops: damaged lines, and those of later iterations."""
+    file = folder / "metrics.jsonl"
+    before = file.read_bytes() if file.exists() else b""
+    keep_lines(file, 3)
+    after = file.read_bytes() if file.exists() else b""
+    assert all(json.loads(line)["iteration"] <= 3 for line in after.splitlines())
+    if len(after.splitlines()) < 2:
+        raise ValueError(f"{file}: expected two lines up to iteration 3, got {len(before)} bytes of others")
+
+
+def _options(folder: Path) -> list[Files]:
+    render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": True, "clamp_texture": True}
+    render |= {"exposure": "photos", "detail_limits": False}
+    settings = ["border=0.1", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
+    write_json(folder / "options.json", {"render": render, "settings": settings})
+    return [_files(folder)]
+
+
+def _read_options(folder: Path) -> None:
+    """Make options of a rendering and settings of a training; their errors name no file."""
+    try:
+        data: Any = read_object(folder / "options.json")
+        render: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in dict(data["render"]).items()}
+        options = RenderOptions(**render)
+        with_settings(Config(), parse_settings(str(x) for x in data["settings"]))
+    except KeyError as error:
+        raise ValueError(f"{folder}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{folder}: {error}") from None
+    full = some_model()
+    check_rendering(Model(full.surfels, full.texture, full.exposures, full.detail_limits, options))
+
+
+def _read_cameras(folder: Path) -> None:
+    for members in load_cameras(folder / "cameras.json").values():
+        for camera in members.values():
+            check_rendering(some_model(), camera)
+
+
+def _read_camera_path(folder: Path) -> None:
+    for camera in load_camera_path(folder / "path.json").cameras[:4]:
+        check_rendering(some_model(), camera)
 
 
 def _config(folder: Path) -> list[Files]:
@@ -225,13 +302,13 @@ def _config(folder: Path) -> list[Files]:
 
 
 def _run_cameras(folder: Path) -> list[Files]:
-    cameras = {str(i): camera for i, camera in enumerate(_cameras())}
+    cameras = {str(i): camera for i, camera in enumerate(some_cameras())}
     save_cameras(folder / "cameras.json", {"train": cameras, "test": cameras})
     return [_files(folder)]
 
 
 def _camera_path(folder: Path) -> list[Files]:
-    cameras = _cameras()
+    cameras = some_cameras()
     save_camera_path(folder / "a" / "path.json", cameras)
     plain = [
         dataclasses.replace(c, K=torch.tensor([[11.0, 0.0, 6.0], [0.0, 11.0, 4.5], [0.0, 0.0, 1.0]])) for c in cameras
@@ -274,6 +351,25 @@ def _read_images(folder: Path) -> None:
         raise first
 
 
+def _photo_files(folder: Path) -> list[Files]:
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    exif = Image.Exif()
+    exif[MAKE], exif[MODEL] = "maker", "model"
+    exif[274] = 6  # orientation
+    exif.get_ifd(34665)[41989] = 35  # focal length of a 35 mm film
+    for name in ("a.jpg", "b.jpg"):
+        image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+        image.save(folder / name, exif=exif if name == "a.jpg" else Image.Exif())
+    return [{"a.jpg": data} for data in _files(folder).values()]
+
+
+def _read_photo_files(folder: Path) -> None:
+    camera_groups(folder, read_photos(folder, ["a.jpg"], lambda _: None), "auto")
+
+
 def _exr(folder: Path) -> list[Files]:
     rng = np.random.default_rng(0)
     color = torch.from_numpy(rng.random((HEIGHT, WIDTH, 3), np.float32))
@@ -293,13 +389,18 @@ TARGETS = {
         FuzzTarget("colmap_text", _colmap(True), load_scene, (".txt",)),
         FuzzTarget("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
         FuzzTarget("blender", _blender, _masked_scene, (".json",)),
-        FuzzTarget("model", _model, load, (".safetensors",)),
+        FuzzTarget("model", _model, _read_model, (".safetensors",)),
         FuzzTarget("config", _config, read_run, (".json",)),
-        FuzzTarget("cameras", _run_cameras, lambda folder: load_cameras(folder / "cameras.json"), (".json",)),
-        FuzzTarget("camera_path", _camera_path, lambda folder: load_camera_path(folder / "path.json"), (".json",)),
+        FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),
+        FuzzTarget("checkpoint", _checkpoint, _read_checkpoint, (".json", ".safetensors")),
+        FuzzTarget("metrics", _metrics, read_metrics, (".json",)),
+        FuzzTarget("log", _log, _read_log, (".jsonl",)),
+        FuzzTarget("options", _options, _read_options, (".json",)),
+        FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
-        FuzzTarget("surfels_ply", _surfels_ply, lambda folder: load_surfels_ply(folder / "surfels.ply"), (".ply",)),
+        FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
+        FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

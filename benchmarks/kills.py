@@ -23,7 +23,7 @@ from typing import Annotated
 import tyro
 
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.run.folder import CONFIG_FILE
+from nexwarp.run.contents import CONFIG_FILE
 from nexwarp.train.checkpoint import CHECKPOINTS
 
 POLL_SECONDS = 0.002
@@ -78,7 +78,7 @@ def kill_and_resume(
             left.append(json.loads((run / name / "state.json").read_bytes())["iteration"])
         except (OSError, ValueError):
             continue
-    writing = (run / "checkpoint.tmp").exists()
+    writing = any(run.glob(".checkpoint.*.tmp"))
     if resume(run) != 0:
         raise RuntimeError(f"{run}: the training did not resume after a kill at {seconds:.3f} s")
     same = (run / MODEL_FILE).read_bytes() == expected

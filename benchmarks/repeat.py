@@ -22,7 +22,7 @@ import tyro
 
 from benchmarks.suite import Options
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.run.folder import METRICS_FILE
+from nexwarp.run.contents import METRICS_FILE
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""Small training steps and a frame under compute-sanitizer, which checks every access of every kernel.
+"""Small training steps, frames and every kernel under compute-sanitizer, which checks every access.
 
-    python -m benchmarks.sanitize --tool memcheck,racecheck
+    python -m benchmarks.sanitize --tool memcheck,racecheck,initcheck,synccheck --sweep
 
-runs itself under each tool, prints a line for each, and exits with 1 when a tool found an error, with 2 when there is
-no compute-sanitizer. `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by hand.
+runs itself under each tool, all at a time, prints a line for each and the number of errors, and exits with 1 when a
+tool found an error, with 2 when there is no compute-sanitizer. --sweep adds the kernels of the catalogue, forward and
+backward (`benchmarks.kernel_sweep`). `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by
+hand.
 
 The allocators of torch and Warp reuse freed memory, which hides an access beyond the end of an array. This benchmark
 makes each array an allocation of its own.
@@ -16,6 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,6 +27,7 @@ import torch
 import tyro
 import warp as wp
 
+from benchmarks.kernel_sweep import compile_catalogue, sweep
 from nexwarp.run import warmup
 from nexwarp.train.presets import preset
 from nexwarp.train.trainer import Trainer
@@ -50,10 +54,17 @@ class Report:
     Attributes:
         errors: how many; None when the tool printed no summary.
         told: the summary, or the last line in its place.
+        code: exit code of the command.
     """
 
     errors: int | None
     told: str
+    code: int = 0
+
+    @property
+    def clean(self) -> bool:
+        """Whether the tool ran to its end and found no error."""
+        return self.errors == 0 and self.code == 0
 
 
 def parse(output: str) -> Report:
@@ -114,8 +125,8 @@ def isolate_arrays(device: torch.device) -> None:
         wp.set_mempool_enabled(f"cuda:{device.index}", False)
 
 
-def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str] = ()) -> bool:
-    """Run a command under a tool, print its result, and return whether it found no error."""
+def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str] = ()) -> Report:
+    """Run a command under a tool, print its result in one piece, and return it."""
     options = [*(OURS if tool == "racecheck" else ()), *extra]
     environment = os.environ | {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
     run = subprocess.run(
@@ -126,15 +137,15 @@ def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str
         text=True,
         errors="replace",
     )
-    report = parse(run.stdout)
-    clean = report.errors == 0 and run.returncode == 0
+    report = dataclasses.replace(parse(run.stdout), code=run.returncode)
     code = "" if run.returncode == 0 else f", exit code {run.returncode}"
-    print(f"{tool}: {report.told}{code}: {'clean' if clean else 'NOT CLEAN'}", flush=True)
-    if not clean:
+    told = [f"{tool}: {report.told}{code}: {'clean' if report.clean else 'NOT CLEAN'}"]
+    if not report.clean:
         lines = [line for line in run.stdout.splitlines() if line.strip()]
         first = next((i for i, line in enumerate(lines) if line.startswith("========= ") and i), 0)
-        print("\n".join(lines[first : first + SHOWN] if report.errors else lines[-SHOWN:]), flush=True)
-    return clean
+        told += lines[first : first + SHOWN] if report.errors else lines[-SHOWN:]
+    print("\n".join(told), flush=True)
+    return report
 
 
 @dataclass
@@ -145,8 +156,12 @@ class Sanitize:
     """Tools of compute-sanitizer to run this under: memcheck, racecheck, initcheck, synccheck. Default: none."""
     device: Annotated[str, tyro.conf.arg(metavar="{cuda,cpu}")] = "cuda"
     """Where; compute-sanitizer sees CUDA alone."""
+    sweep: bool = False
+    """Also launch every kernel of the catalogue, with K of 0 to 8 and images of odd sizes."""
     extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
     """More options for compute-sanitizer, such as "--report-api-errors no"."""
+    compile_first: bool = False
+    """Compile the kernels of the catalogue first, several at a time."""
 
     def __call__(self) -> int:
         """Run, print, and return the exit code."""
@@ -157,27 +172,40 @@ class Sanitize:
             print("device: expected a CUDA device, found none", file=sys.stderr)
             return 2
         device = torch.device("cuda", torch.cuda.current_device()) if self.device == "cuda" else torch.device("cpu")
+        if self.compile_first:
+            compile_catalogue(device)
         isolate_arrays(device)
         done = work(device)
         print(f"{done['steps']} training steps and {done['frames']} frames on {self.device}", flush=True)
-        return 0
+        if not self.sweep:
+            return 0
+        swept = sweep(device)
+        print(f"{swept.kernels} kernels in {swept.renderings} renderings on {self.device}", flush=True)
+        if swept.missing:
+            print(f"not launched: {', '.join(swept.missing)}", file=sys.stderr)
+        return 1 if swept.missing else 0
 
     def _under(self, tools: list[str]) -> int:
-        if unknown := [tool for tool in tools if tool not in TOOLS]:
-            print(f"--tool: expected some of {', '.join(TOOLS)}, got {unknown[0]!r}", file=sys.stderr)
+        if others := [tool for tool in tools if tool not in TOOLS]:
+            print(f"--tool: expected some of {', '.join(TOOLS)}, got {others[0]!r}", file=sys.stderr)
             return 2
         sanitizer = find_tool()
         if sanitizer is None:
             print("compute-sanitizer: expected on the PATH or in a CUDA toolkit, found none", file=sys.stderr)
             return 2
         command = [sys.executable, "-m", "benchmarks.sanitize", "--device", self.device]
+        command += ["--sweep"] * self.sweep
         # Once without a tool, to compile all kernels and to see that the work runs at all.
-        alone = subprocess.run(command)
+        alone = subprocess.run([*command, *["--compile-first"] * self.sweep])
         if alone.returncode != 0:
             print(f"without a tool it ended with exit code {alone.returncode}", file=sys.stderr)
             return 1
-        clean = [check(tool, sanitizer, command, self.extra.split()) for tool in tools]
-        return 0 if all(clean) else 1
+        with ThreadPoolExecutor(len(tools)) as pool:
+            reports = list(pool.map(lambda tool: check(tool, sanitizer, command, self.extra.split()), tools))
+        unknown = sum(report.errors is None for report in reports)
+        told = f"{sum(report.errors or 0 for report in reports)} errors found by {len(reports) - unknown} tools"
+        print(told + (f"; {unknown} ended without a summary" if unknown else ""), flush=True)
+        return 0 if all(report.clean for report in reports) else 1
 
 
 if __name__ == "__main__":

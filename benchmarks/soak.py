@@ -20,6 +20,7 @@ import tyro
 import warp as wp
 
 import nexwarp as nw
+from nexwarp.buffers import render_buffers
 from nexwarp.cli.device import keep_freed_memory
 from nexwarp.data import Scene, write_demo
 from nexwarp.train.config import Config, TextureConfig
@@ -142,6 +143,36 @@ def cycle(scene: Scene, device: torch.device, seed: int) -> list[nw.Camera]:
         left, top = ((torch.rand(2, generator=generator) * 0.4 - 0.1) * camera.width).int().tolist()
         made.append(camera.crop(left, top, width, height))
     return made
+
+
+def handles() -> dict[str, int]:
+    """Return the number of open files and of threads of this process."""
+    process = psutil.Process()
+    return {"open files": process.num_fds(), "threads": process.num_threads()}
+
+
+def library_calls(
+    file: Path, cameras: Sequence[nw.Camera], count: int, sample: Callable[[int], None], device: torch.device
+) -> None:
+    """Load a model and render it, `count` times: in turns with gradients, without them, and with all buffers.
+
+    Args:
+        file: model file.
+        cameras: of changing sizes, taken in turns.
+        count: how often.
+        sample: called after each, with its number from 1.
+        device: where to render.
+    """
+    for i in range(count):
+        model, camera = nw.load(file).to(device), cameras[i % len(cameras)]
+        if i % 3 == 0:
+            model.render(camera).image.square().sum().backward()
+        elif i % 3 == 1:
+            with torch.inference_mode():
+                model.render(camera)
+        else:
+            render_buffers(model, camera)
+        sample(i + 1)
 
 
 def render_frames(trainer: Trainer, cameras: Sequence[nw.Camera], count: int, sample: Callable[[int], None]) -> None:

@@ -8,6 +8,9 @@ import torch
 from nexwarp.checks import check_range
 
 ROTATION_TOLERANCE = 1e-3
+MAX_CAMERAS = 30_000  # of a file
+LARGEST_DISTANCE = 1e16  # of a camera from the origin, world units: its square is finite in single precision
+SMALLEST_FOCAL = 1e-16  # pixels
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,9 @@ class Camera:
 
     Raises:
         TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
-        ValueError: a shape is wrong; a value is not finite; the rotation of `viewmat` is a reflection, or differs from
-            orthonormal by more than 1e-3; `K` has skew or a focal length <= 0; a size is < 1; `near` is < 0.
+        ValueError: a shape or device is wrong; a value is not finite; the translation of `viewmat` is beyond 1e16; its
+            rotation is a reflection, or differs from orthonormal by more than 1e-3; `K` has skew or a focal length
+            below 1e-16; a size is < 1; `near` is < 0 or beyond 1e16.
     """
 
     viewmat: torch.Tensor
@@ -54,6 +58,8 @@ class Camera:
     def _check(self) -> tuple[float, float, float, float]:
         """Return fx, fy, cx and cy; raise TypeError or ValueError where a field does not fit."""
         viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
+        if self.K.device != self.viewmat.device:
+            raise ValueError(f"K: expected a tensor on {self.viewmat.device} as viewmat is, got one on {self.K.device}")
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int):
@@ -62,8 +68,7 @@ class Camera:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
         if isinstance(self.near, bool) or not isinstance(self.near, (int, float)):
             raise TypeError(f"near: expected a number, got {type(self.near).__name__}")
-        if not 0 <= self.near < float("inf"):
-            raise ValueError(f"near: expected at least 0 and finite, got {self.near}")
+        check_range("near", self.near, 0, LARGEST_DISTANCE)
         _check_rigid(viewmat)
         _check_intrinsics(intrinsics)
         (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
@@ -148,6 +153,8 @@ def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
         raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
     if tensor.shape != (size, size):
         raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
+    if tensor.is_meta:
+        raise ValueError(f"{name}: expected a tensor with values, got one on the device meta")
     matrix = tensor.detach().double().cpu()
     if not bool(torch.isfinite(matrix).all()):
         raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
@@ -165,12 +172,17 @@ def _check_rigid(viewmat: torch.Tensor) -> None:
         raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
     if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
         raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
+    if viewmat[:3, 3].abs().max() > LARGEST_DISTANCE:
+        moved = tuple(viewmat[:3, 3].tolist())
+        raise ValueError(f"viewmat: expected a translation of at most {LARGEST_DISTANCE:g}, got {moved}")
 
 
 def _check_intrinsics(intrinsics: torch.Tensor) -> None:
     (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
     if fx <= 0 or fy <= 0:
         raise ValueError(f"K: expected focal lengths > 0, got fx={fx:g}, fy={fy:g}")
+    if min(fx, fy) < SMALLEST_FOCAL:
+        raise ValueError(f"K: expected focal lengths of at least {SMALLEST_FOCAL:g}, got fx={fx:g}, fy={fy:g}")
     if skew != 0 or shear != 0:
         raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
     if last != [0.0, 0.0, 1.0]:

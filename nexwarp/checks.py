@@ -1,6 +1,7 @@
-"""Argument checks; each message names the argument, the expected value and the given one."""
+"""Argument checks; each message names the argument, the expected value and the given one. And the free memory."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
@@ -60,8 +61,45 @@ def check_finite(name: str, tensor: torch.Tensor) -> None:
         raise ValueError(f"{name}: expected finite values, got {tensor[where].item()} at index {where}")
 
 
+def check_values(name: str, tensor: torch.Tensor, low: float, high: float) -> None:
+    """Raise ValueError naming the first element of `tensor` that is NaN or not in [low, high]."""
+    if tensor.numel() == 0:
+        return
+    least, most = tensor.aminmax()  # both are NaN if an element is
+    if not (least >= low and most <= high):
+        where = tuple(torch.nonzero(~((tensor >= low) & (tensor <= high)))[0].tolist())
+        raise ValueError(
+            f"{name}: expected values from {low:g} to {high:g}, got {tensor[where].item():g} at index {where}"
+        )
+
+
+def check_version(value: object, known: int) -> None:
+    """Raise ValueError unless a file's format version is an integer from 1 to the newest known one."""
+    if type(value) is not int or not 1 <= value <= known:
+        newer = type(value) is int and value > known
+        reason = "; a newer nexwarp wrote the file, update nexwarp to read it" if newer else ""
+        raise ValueError(f"expected format version {known}, got {value!r:.60}{reason}")
+
+
 def check_range(name: str, value: float, low: float, high: float = float("inf")) -> None:
     """Raise ValueError unless low <= value <= high."""
     if not low <= value <= high:
         upper = "" if high == float("inf") else f" and at most {high:g}"
-        raise ValueError(f"{name}: expected at least {low:g}{upper}, got {value}")
+        raise ValueError(f"{name}: expected at least {low:g}{upper}, got {value!s:.60}")
+
+
+def available_memory() -> int:
+    """Free memory for this process in bytes: that of the machine or of its control group, whichever is smaller."""
+    import psutil
+
+    free = int(psutil.virtual_memory().available)
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            used = int((group / "memory.current").read_text())
+            stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
+    except (OSError, ValueError):  # no control groups of version 2
+        pass
+    return max(free, 0)

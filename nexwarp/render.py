@@ -9,9 +9,10 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import Camera
-from nexwarp.checks import check_range, check_tensors
+from nexwarp.checks import check_finite, check_range, check_tensors
+from nexwarp.errors import OutOfMemoryError, needed_memory
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.representation.detail_limits import DetailLimits
+from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
 from nexwarp.representation.texture import NeuralTexture
@@ -159,14 +160,16 @@ def render(
 ) -> Rendering:
     """Render surfels from a camera (paper Sec. 4.2). `Model.render` renders a trained scene.
 
-    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`.
+    Differentiable with respect to the surfels, the texture, `background` and `camera.viewmat`. `torch.autocast` changes
+    nothing: all is computed in the surfels' dtype, and a texture as its `half_precision` says.
 
     Args:
-        surfels: the N surfels, N >= 0.
+        surfels: the N surfels, N >= 0, float32 or float64.
         texture: the neural texture, on the same device; None leaves all hits their plain colours.
         camera: the camera, on the same device.
         max_hits: K, number of hits textured in each pixel, 0 to 8.
-        background: a number, three numbers or a (3,) tensor, weighted by the final transmittance.
+        background: a number, three numbers or a (3,) tensor, weighted by the final transmittance. The values of a CUDA
+            tensor are not checked, which would wait for the GPU.
         sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
@@ -177,11 +180,40 @@ def render(
         detail_limits: detail limits of the N surfels; None limits nothing.
 
     Raises:
-        TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
+        TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
+        OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
     _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
-    background = _background(background, surfels.means)
-    _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
+    try:
+        background = _background(background, surfels.means)
+        _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
+        values = (0, surfels.means.dtype) if texture is None else texture.stored_per_point(sh_degree)
+        ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
+        options = (max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, generator)
+        with torch.autocast(surfels.device.type, enabled=False):
+            return _render(surfels, texture, camera, *options, exposures, detail_limits)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
+            raise
+    # Outside of the handler: the error's traceback would keep alive what has been allocated.
+    raise OutOfMemoryError.of(f"an image of {camera.width}x{camera.height} pixels with K = {max_hits}", needed)
+
+
+def _render(
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    camera: Camera,
+    max_hits: int,
+    background: torch.Tensor,
+    sh_degree: int,
+    low_pass: bool,
+    clamp_texture: bool,
+    depth_jitter: float | torch.Tensor,
+    generator: torch.Generator | None,
+    exposures: Exposures | None,
+    detail_limits: DetailLimits | None,
+) -> Rendering:
+    """Render with arguments that have been checked; see `render`."""
     shape = antialiased(surfels, camera, detail_limits)
     pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
@@ -265,29 +297,11 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
     return Activated(shape.means, shape.quats, *blurred)
 
 
-def limited_depths(
-    ids: torch.Tensor, depths: torch.Tensor, limits: DetailLimits | None, focal: float | torch.Tensor
-) -> torch.Tensor:
-    """Return depths for the texture's down-weighting: the hits' depths, clamped to the range of the training views.
-
-    Args:
-        ids: (H, W, K) surfels of the hits, -1 in empty slots.
-        depths: (H, W, K) z-depths of the hits.
-        limits: detail limits of the surfels; None clamps nothing.
-        focal: focal length in pixels.
-    """
-    if limits is None or not len(limits):
-        return depths
-    indices = ids.clamp_min(0).long()
-    clamped = torch.minimum(depths, focal * limits.farthest[indices])
-    # `nearest` is applied last: where no training view saw the texture, it is NEVER and removes all detail.
-    clamped = torch.maximum(clamped, focal * limits.nearest[indices])
-    return torch.where(ids >= 0, clamped, depths)
-
-
 def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
     """Return the background as a (3,) tensor; a tensor keeps its graph."""
     if isinstance(background, torch.Tensor):
+        if background.device.type == "cpu":
+            check_finite("background", background.detach())
         return background.expand(3) if background.ndim == 0 else background
     values: Sequence[object]
     if isinstance(background, numbers.Real):
@@ -301,6 +315,9 @@ def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
     numbers_ = [float(x) for x in values if isinstance(x, numbers.Real)]
     if len(numbers_) != 3:
         raise TypeError(f"background: expected three numbers or a tensor, got {values}")
+    for x in numbers_:
+        if not abs(x) <= torch.finfo(like.dtype).max:
+            raise ValueError(f"background: expected finite values, got {x}")
     return torch.stack([like.new_full((), x) for x in numbers_])
 
 
@@ -336,6 +353,10 @@ def _check_types(
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
     if surfels.means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {surfels.means.dtype}")
+    if surfels.device.type == "cuda":
+        torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
+    elif surfels.device.type != "cpu":
+        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {surfels.device}")
 
 
 def _check_tensors(
@@ -360,3 +381,5 @@ def _check_tensors(
         expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
         expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
     check_tensors(expected, dtype=surfels.means.dtype, device=surfels.means.device)
+    if camera.K.device != surfels.device:  # of any dtype
+        raise ValueError(f"camera.K: expected a tensor on {surfels.device}, got one on {camera.K.device}")

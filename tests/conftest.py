@@ -1,7 +1,11 @@
-"""Fixtures that every test may use."""
+"""Fixtures that every test may use, and how a run is divided between processes."""
+
+import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # before torch reads it: the cores are shared by processes, not by threads
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,13 +15,26 @@ import torch
 
 import nexwarp as nw
 from nexwarp.data import Scene, write_demo
+from nexwarp.finish import auto_exposure
 from nexwarp.kernels import launch
 from nexwarp.train import floaters, presets
-from tests import background_jobs
+
+MOST_WORKERS = 4  # each takes 1 to 2 GB
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A whole run uses two or more processes; some files, and tests on a GPU with its memory, are for one.
+
+    A process starts in 5 s, most of which torch and Warp take.
+    """
+    named, marks = config.getoption("file_or_dir"), config.getoption("markexpr")
+    if named or ("cuda" in marks and "not cuda" not in marks):
+        return 0
+    return min(os.cpu_count() or 1, MOST_WORKERS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests on CUDA are skipped where there is none; of many tests, those that wait for work beside them come last.
+    """Tests on CUDA are skipped where there is none; long tests come first, so that no worker ends long after others.
 
     The forms of `form` are forms of CPU kernels, so that tests on CUDA run once.
     """
@@ -26,31 +43,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("cuda"):
                 item.add_marker(pytest.mark.skip(reason="no CUDA device"))
-    if len(items) >= background_jobs.MANY:
-        items.sort(key=lambda item: background_jobs.key(item) is not None)
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
 
 
 def _twice_on_cuda(item: pytest.Item) -> bool:
     parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
     return parameters.get("device") == "cuda" and parameters.get("form") == "scalar"
-
-
-@pytest.fixture(scope="session", autouse=True)
-def begun(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[background_jobs.BackgroundJobs]:
-    """Kernels that are not in Warp's cache yet are compiled beside the first tests; then the marked tests' work."""
-    items, compilers = request.session.items, [sys.executable, "-m", "tests.compile_ahead"]
-    with background_jobs.begun(items, tmp_path_factory.mktemp, compilers) as work:
-        yield work
-
-
-@pytest.fixture
-def background_job(request: pytest.FixtureRequest, begun: background_jobs.BackgroundJobs) -> Any:
-    """What the work of the test's mark `background_job` gave."""
-    job = background_jobs.key(request.node)
-    assert job is not None
-    return begun.result(job)
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -94,10 +92,11 @@ def one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def few_looks() -> Iterator[None]:
-    """Looks for floaters are few: those at the end of a training take a second, which few tests are about."""
+    """Looks for floaters and places of predicted exposures are few: they take seconds, which few tests are about."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(floaters, "PROBES", 6)
         patch.setattr(floaters, "LAST_PROBES", 12)
+        patch.setattr(auto_exposure, "PLACES", 12)
         yield
 
 

@@ -1,4 +1,4 @@
-"""A disk that fails at the k-th thing asked of it, below a folder; elsewhere it goes on as ever."""
+"""A disk, an allocator and a GPU that fail at the k-th thing asked of them; a process that dies at its k-th call."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import builtins
 import errno
 import io
 import os
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+
+from nexwarp.kernels import launch as launching
 
 
 class Disk:
@@ -112,3 +116,103 @@ def failing(disk: Disk) -> Iterator[Disk]:
         patch.setattr(os, "mkdir", asking("mkdir", os.mkdir))
         patch.setattr(OpenEXR, "File", File)
         yield disk
+
+
+SYSTEM_CALLS = (
+    (Path, "write_bytes"),
+    (os, "fsync"),
+    (os, "replace"),
+    (Path, "rename"),
+    (Path, "mkdir"),
+    (Path, "touch"),
+    (Path, "rmdir"),
+)
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
+    """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
+    calls: list[str] = []
+    mine = threading.get_ident()  # other threads, with work for other tests, live on
+
+    def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != mine:
+                return original(*args, **kwargs)
+            calls.append(name)
+            if len(calls) > moment:  # what is dead does nothing any more, not even clean up
+                if len(calls) == moment + 1 and name == "write_bytes":
+                    with open(args[0], "wb") as half:
+                        half.write(args[1][: len(args[1]) // 2])
+                raise Killed
+            return original(*args, **kwargs)
+
+        return call
+
+    for owner, name in SYSTEM_CALLS:
+        patch.setattr(owner, name, dying(name, getattr(owner, name)))
+    unlink = Path.unlink
+
+    def gone(*args: Any, **kwargs: Any) -> None:
+        if len(calls) <= moment or threading.get_ident() != mine:
+            unlink(*args, **kwargs)
+
+    patch.setattr(Path, "unlink", gone)
+    return calls
+
+
+class Allocator:
+    """Counts allocations and kernel launches, and fails the `fatal`-th request (from 0) as a GPU without memory does.
+
+    A request is a call of one of torch's functions that make a tensor, or the launch of a kernel, from any thread.
+    """
+
+    def __init__(self, fatal: int | None = None) -> None:
+        self.fatal, self.requests = fatal, 0
+
+    def ask(self) -> None:
+        self.requests += 1
+        if self.requests - 1 == self.fatal:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1 KiB free")
+
+
+MAKERS = ("empty", "zeros", "empty_like", "zeros_like", "randn", "stack", "cat")
+METHODS = ("new_empty", "new_zeros", "new_ones", "new_full", "clone", "contiguous")
+
+
+@contextmanager
+def allocating(allocator: Allocator) -> Iterator[Allocator]:
+    """Let the allocations and launches of a block ask `allocator` first."""
+
+    def asking(original: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            allocator.ask()
+            return original(*args, **kwargs)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for place, names in ((torch, MAKERS), (torch.Tensor, METHODS), (launching, ("launch",))):
+            for name in names:
+                patch.setattr(place, name, asking(getattr(place, name)))
+        yield allocator
+
+
+@contextmanager
+def failing_gpu(fatal: int | None, message: str) -> Iterator[list[str]]:
+    """Fail the `fatal`-th launch of a block (from 0) and all later ones, as a GPU does after a fault; list launches."""
+    launches: list[str] = []
+    original = launching.launch
+
+    def call(kernel: Any, *args: Any, **kwargs: Any) -> None:
+        launches.append(kernel.key)
+        if fatal is not None and len(launches) > fatal:
+            raise RuntimeError(message)
+        original(kernel, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launching, "launch", call)
+        yield launches

@@ -14,7 +14,6 @@ def test_cameras_come_back_exactly(tmp_path):
     cameras = {
         "train": {f"{i}.png": make_camera(random_scene(2, off_centre=i == 1), near=0.1 * i) for i in range(3)},
         "test": {"folder/a b.jpg": make_camera(random_scene(2, seed=5))},
-        "empty": {},
     }
     file = tmp_path / "cameras.json"
     save_cameras(file, cameras)
@@ -46,6 +45,9 @@ CAMERA = {"viewmat": ROWS, "K": [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.
         json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": "text"}}}),
         json.dumps({"train": {"a": CAMERA | {"near": 0.1, "K": ROWS}}}),
         json.dumps({"train": {"a": CAMERA | {"near": 0.1, "width": 0}}}),
+        json.dumps({"train": {"../a": CAMERA | {"near": 0.1}}}),
+        json.dumps({"train": {"C:/a": CAMERA | {"near": 0.1}}}),
+        json.dumps({"validation": {"a": CAMERA | {"near": 0.1}}}),
         json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": [[float("nan")] * 4] * 4}}}),
     ],
 )

@@ -2,9 +2,6 @@
 
 import os
 import random
-import shutil
-import threading
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,8 +11,10 @@ import safetensors.torch
 import torch
 
 from nexwarp.io.files import write_atomically
+from nexwarp.run.contents import remove_leftovers
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
+from tests.faults import Killed, kill_at
 from tests.model_file_support import refused
 
 # Atomic writing
@@ -127,51 +126,6 @@ def test_at_no_time_is_there_no_checkpoint(tmp_path, monkeypatch, stage, after_k
     assert saved_number(tmp_path) == 3 and kept(tmp_path) == [3, 1]
 
 
-SYSTEM_CALLS = (
-    (Path, "write_bytes"),
-    (os, "fsync"),
-    (os, "replace"),
-    (Path, "rename"),
-    (Path, "mkdir"),
-    (shutil, "rmtree"),
-)
-
-
-class Killed(BaseException):
-    pass
-
-
-def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
-    """Die before the given call of the system, or half-way through it if it writes; returns the names of the calls."""
-    calls: list[str] = []
-    mine = threading.get_ident()  # other threads, with work for other tests, live on
-
-    def dying(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != mine:
-                return original(*args, **kwargs)
-            calls.append(name)
-            if len(calls) > moment:  # what is dead does nothing any more, not even clean up
-                if len(calls) == moment + 1 and name == "write_bytes":
-                    with open(args[0], "wb") as half:
-                        half.write(args[1][: len(args[1]) // 2])
-                raise Killed
-            return original(*args, **kwargs)
-
-        return call
-
-    for owner, name in SYSTEM_CALLS:
-        patch.setattr(owner, name, dying(name, getattr(owner, name)))
-    unlink = Path.unlink
-
-    def gone(*args: Any, **kwargs: Any) -> None:
-        if len(calls) <= moment or threading.get_ident() != mine:
-            unlink(*args, **kwargs)
-
-    patch.setattr(Path, "unlink", gone)
-    return calls
-
-
 @pytest.mark.parametrize("before", [0, 1, 2, 3])
 def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, before):
     """Whatever number of saves came before; and the next save, killed at any moment too, starts from what is left."""
@@ -192,6 +146,7 @@ def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, befo
                 assert saved_number(run) in (before, before + 1), (moment, at)
             else:
                 assert not has_checkpoint(run) or saved_number(run) == 1
+        remove_leftovers(run)  # as --resume does
         save_number(run, before + 2)
         assert saved_number(run) == before + 2 and kept(run)[0] == before + 2
         moment += 1

@@ -13,24 +13,19 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def compiled(folder: Path, arch: int, choice: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(folder)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("arch", "least"),
+    ("arch", "choice", "least"),
     [
-        pytest.param(80, 30, marks=pytest.mark.background_job(compiled, 80, "one run")),
-        pytest.param(90, 100, marks=pytest.mark.background_job(compiled, 90, "usual")),
-        *(
-            pytest.param(arch, 150, marks=[pytest.mark.background_job(compiled, arch, "all"), pytest.mark.slow])
-            for arch in (80, 90)
-        ),
+        (80, "one run", 30),
+        (90, "usual", 100),
+        *(pytest.param(arch, "all", 150, marks=pytest.mark.slow) for arch in (80, 90)),
     ],
 )
-def test_kernels_compile_for_cuda(arch: int, least: int, background_job: subprocess.CompletedProcess[str]) -> None:
-    assert background_job.returncode == 0, background_job.stderr
-    sizes = json.loads(background_job.stdout.splitlines()[-1])
+def test_kernels_compile_for_cuda(arch: int, choice: str, least: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    sizes = json.loads(done.stdout.splitlines()[-1])
     assert len(sizes) >= least
     assert all(size > 1000 for size in sizes.values()), "a kernel left no machine code"

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.train.densify import PARAMETERS, Densifier, DensifyConfig, split_surfels
+from nexwarp.representation.surfels import PARAMETERS
+from nexwarp.train.densify import Densifier, DensifyConfig, split_surfels
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 

@@ -30,6 +30,7 @@ from nexwarp.io.files import write_atomically
 from nexwarp.run.folder import SceneSource, prepare_run, read_run
 from nexwarp.run.render_job import RenderOrder
 from nexwarp.train.checkpoint import load_checkpoint
+from tests.subprocesses import python_path
 
 KIN = {
     SettingError: ValueError,
@@ -162,7 +163,7 @@ cli.Info.__call__ = wait
 sys.exit(cli.main(["info", "run"]))
 """
     root = Path(__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": str(root)}
+    environment = os.environ | python_path(root)
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 143 and done.stderr.splitlines()[-1] == "nexwarp: terminated"
     assert os.listdir(tmp_path) == []

@@ -15,6 +15,7 @@ from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.data import Scene
 from nexwarp.io.pictures import load_exr
 from nexwarp.train.config import LearningRates, TextureConfig
+from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -40,7 +41,7 @@ def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory, few_looks
 def run(name: str, *arguments: object) -> str:
     """What an example prints; warnings are errors."""
     command = [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py"), *map(str, arguments)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    environment = os.environ | python_path(ROOT) | {"CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout

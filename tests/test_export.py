@@ -49,7 +49,7 @@ def test_surfels_read_back_bit_for_bit(
     surfels = make_surfels(random_scene(sh_degree=sh_degree, dtype=dtype, device=device))
     with torch.no_grad():
         surfels.raw_quats.mul_(3.0)
-        surfels.means[0] = torch.tensor([-0.0, 1e-42, 3e38])
+        surfels.means[0] = torch.tensor([-0.0, 1e-42, 9e15])
     save_surfels_ply(tmp_path / "new" / "a.ply", surfels)
     after = load_surfels_ply(tmp_path / "new" / "a.ply").state_dict()
     for name, before in surfels.state_dict().items():
@@ -278,7 +278,10 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
             (tmp_path / "splats.ply").read_bytes(),
             "expected the properties of nexwarp surfels, found no gamma_0",
         ),
-        "nan": (good[:nan] + b"\x00\x00\xc0\x7f" + good[nan + 4 :], r"means: expected finite values, got nan at index"),
+        "nan": (
+            good[:nan] + b"\x00\x00\xc0\x7f" + good[nan + 4 :],
+            r"surfels.means: expected values from .*, got nan at index",
+        ),
     }
     for name, (content, message) in bad.items():
         path = tmp_path / f"{name}.ply"

@@ -16,6 +16,7 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
+from nexwarp.model.bounds import BOUNDS, MATRIX_BOUNDS
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from tests.test_docs import DOCS, ROOT, SYMBOLS
@@ -91,6 +92,15 @@ def test_tensors(run):
         else:
             expected[name] = (dtype, [sizes[d.strip()] for d in dimensions.split(",")])
     assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
+
+
+def test_bounds() -> None:
+    rows = re.findall(r"^\| `([a-zA-Z0-9_.]+)` \| (-?\d\S*) \| (\d\S*) \|", section("model.safetensors"), re.M)
+    documented = {name: (float(low), float(high)) for name, low, high in rows}
+    matrices = documented.pop("texture.mlp.I.weight")
+    assert matrices == MATRIX_BOUNDS
+    rounded = {name: (low, float(f"{high:.5g}")) for name, (low, high) in BOUNDS.items()}
+    assert documented == rounded
 
 
 def test_metadata(run):

@@ -13,12 +13,12 @@ import torch
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene, write_demo
-from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
+from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError, needed_memory
 from nexwarp.train import trainer
 from nexwarp.train.checkpoint import save_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.health import LossLog, describe, needed_memory, not_finite
+from nexwarp.train.health import LossLog, describe, not_finite
 from nexwarp.train.schedules import make_optimizer
 from nexwarp.train.step_losses import step_losses
 from nexwarp.train.trainer import Trainer

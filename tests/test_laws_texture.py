@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.determinism import deterministic
 from nexwarp.render import jitter_factors
 from tests.render_support import MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -117,3 +118,14 @@ def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None
     surfels, camera = make_surfels(scene), make_camera(scene)
     out = nw.render(surfels, texture, camera)
     assert_alike(out, reference_render(twin(surfels), twin(texture), camera.to("cpu")))
+
+
+def test_pictures_without_textured_hits_have_gradients(device: torch.device) -> None:
+    """K = 0: no point is looked up, and the grid's gradient is 0, also where sums are deterministic."""
+    scene = random_scene(device=device)
+    surfels, texture = make_surfels(scene), make_texture(device=device)
+    with deterministic(device.type == "cuda"):
+        out = nw.render(surfels, texture, make_camera(scene), max_hits=0)
+        grid, sh = torch.autograd.grad(out.image.sum(), [texture.grid, surfels.sh0])
+    assert (grid == 0).all()
+    assert sh.isfinite().all() and sh.abs().max() > 0

@@ -4,6 +4,7 @@ import json
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import load_scene
 from nexwarp.data.colmap import read_model
-from nexwarp.data.images import read_mask
+from nexwarp.data.images import read_image, read_mask
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
@@ -322,3 +323,13 @@ def test_settings_have_types(changes, match):
 def test_what_files_say_is_told_on_one_line():
     assert one_line("a\nb\tc") == "a b c" and one_line("\x00\ud800é") == "\\x00\\ud800é"
     assert len(one_line("x" * 10**6)) == 300
+
+
+def test_a_jpeg_that_is_read_byte_by_byte_is_refused_at_once(tmp_path):
+    """Between markers PIL reads single bytes: 30 MB took a minute before there was a limit."""
+    photo = tmp_path / "a.jpg"
+    photo.write_bytes(b"\xff\xd8\xff\xe0\x00\x04\x00\x00" + bytes(30_000_000))
+    begun = time.process_time()
+    with pytest.raises(ValueError, match=r"could not decode it: its content needs more than 1,000,000 reads$"):
+        read_image(photo)
+    assert time.process_time() - begun < 5.0

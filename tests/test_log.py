@@ -13,7 +13,8 @@ import torch
 
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene, load_scene, write_demo
-from nexwarp.run.log import LOG_FILE, TENSORBOARD_FOLDER, TrainingLog, keep_lines, peak_memory
+from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
+from nexwarp.run.log import TrainingLog, keep_lines, peak_memory
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.report import StepReport

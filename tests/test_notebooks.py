@@ -36,20 +36,14 @@ def test_there_are_four() -> None:
     assert NAMES == ["01_one_surfel", "02_passes", "03_train", "04_gpu_vs_cpu"]
 
 
-def short_form(folder: Path, name: str) -> tuple[subprocess.CompletedProcess[str], Path]:
-    """What running a notebook's short form gave, and where it is."""
-    command = [sys.executable, "-m", "notebooks", "--short", "--out", str(folder), name]
-    return subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540), folder
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.background_job(short_form, name)) for name in NAMES]
-)
-def test_short_form_runs_from_clean(name: str, background_job: tuple[subprocess.CompletedProcess[str], Path]) -> None:
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_short_form_runs_from_clean(name: str, tmp_path: Path) -> None:
     """Its own assertions hold, nothing is warned of, and every figure of the kept form is drawn."""
-    done, folder = background_job
+    command = [sys.executable, "-m", "notebooks", "--short", "--out", str(tmp_path), name]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=540)
     assert done.returncode == 0, done.stderr
-    kept, run = (nbformat.read(where / f"{name}.ipynb", as_version=4) for where in (FOLDER, folder))
+    kept, run = (nbformat.read(where / f"{name}.ipynb", as_version=4) for where in (FOLDER, tmp_path))
     assert [cell.source for cell in kept.cells] == [cell.source for cell in run.cells]
     assert pictures(kept) == pictures(run)
     assert sum(pictures(run)) >= 3

@@ -118,6 +118,18 @@ def test_what_is_written_is_read(tmp_path, known):
         assert_same_clouds(read_ply(tmp_path / "b.ply"), cloud)
 
 
+def test_a_signalling_nan_is_refused_without_a_warning(tmp_path):
+    """Its conversion to float64 warns; the fuzzer found one."""
+    path = tmp_path / "a.ply"
+    errors = np.array([1.5, 2.5], np.float32)
+    write_ply(path, Cloud(np.eye(2, 3), np.zeros((2, 3), np.uint8), np.ones(2, np.int32), errors))
+    content = path.read_bytes()
+    assert content.count(errors[:1].tobytes()) == 1
+    path.write_bytes(content.replace(errors[:1].tobytes(), struct.pack("<I", 0x7FA00000)))
+    with pytest.raises(ValueError, match=r"reprojection_error: expected finite numbers, got nan \(vertex 0\)"):
+        read_ply(path)
+
+
 def test_an_error_is_colmaps_only_beside_a_track_length(tmp_path):
     body = struct.pack("<3f", 0, 0, 0) + struct.pack("<fh", 0.5, 7)
     for names, expected in ((("error", "track_length"), (7, 0.5)), (("error", "other"), (0, -1))):

@@ -73,14 +73,12 @@ def test_config_survives_json(config):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda d: d | {"surfels": 3},
-        lambda d: d | {"rates": d["rates"] | {"colour": 1.0}},
         lambda d: d | {"texture": 3},
         lambda d: d | {"iterations": "many"},
         lambda _: [],
     ],
 )
-def test_unknown_settings_are_refused(change):
+def test_settings_of_another_kind_are_refused(change):
     with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
         config_from_dict(change(Config().as_dict()))
     assert "\n" not in str(caught.value)

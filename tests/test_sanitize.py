@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import sanitize
+from benchmarks.kernel_sweep import SIZES, Sweep, catalogue, compile_catalogue, sweep
 from benchmarks.sanitize import Sanitize, check, find_tool, parse, work
 
 BANNER = "========= COMPUTE-SANITIZER\n4 training steps and 2 frames on cuda\n"
@@ -62,13 +63,13 @@ def stub(folder: Path, body: str) -> str:
     ],
 )
 def test_a_tool_is_clean_only_when_it_says_so(tmp_path, capsys, body, clean, told):
-    assert check("memcheck", stub(tmp_path, body), ["program"]) == clean
+    assert check("memcheck", stub(tmp_path, body), ["program"]).clean == clean
     assert told in capsys.readouterr().out
 
 
 def test_errors_are_shown(tmp_path, capsys):
     (tmp_path / "output").write_text(BANNER + WRITE + "========= ERROR SUMMARY: 1 error\n")
-    assert not check("memcheck", stub(tmp_path, f"cat {tmp_path}/output"), ["program"])
+    assert not check("memcheck", stub(tmp_path, f"cat {tmp_path}/output"), ["program"]).clean
     assert "Invalid __global__ write" in capsys.readouterr().out
 
 
@@ -92,6 +93,7 @@ def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsy
     assert Sanitize(tool="memcheck,racecheck")() == 1
     out = capsys.readouterr().out
     assert "memcheck: ERROR SUMMARY: 1 error: NOT CLEAN" in out and "(0 errors, 0 warnings): clean" in out
+    assert out.splitlines()[-1] == "1 errors found by 2 tools"
     assert Sanitize(tool="racecheck")() == 0
 
 
@@ -126,3 +128,34 @@ def test_a_missing_tool_is_not_found(tmp_path, monkeypatch):
 
 def test_steps_and_frames_run(device):
     assert work(device) == {"steps": 4, "frames": 2}
+
+
+def test_a_tool_without_a_summary_is_counted(tmp_path, monkeypatch, capsys):
+    path = stub(tmp_path, "exit 3")
+    monkeypatch.setattr(sanitize, "find_tool", lambda: path)
+    monkeypatch.setattr(sys, "executable", "true")
+    assert Sanitize(tool="memcheck,synccheck", sweep=True)() == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "0 errors found by 0 tools; 2 ended without a summary"
+    assert all(line.endswith("--device cuda --sweep 1") for line in (tmp_path / "asked").read_text().splitlines())
+
+
+def test_the_sweep_launches_every_kernel_of_some_k(device):
+    """All K, and all sizes, where kernels are compiled in seconds; see below for the CPU."""
+    hits = range(9) if device.type == "cuda" else (2,)
+    compile_catalogue(device, hits)
+    swept = sweep(device, hits, SIZES if device.type == "cuda" else SIZES[:3])
+    assert not swept.missing and swept.kernels == len(catalogue(device, hits))
+
+
+@pytest.mark.slow
+def test_the_sweep_launches_every_kernel_on_a_cpu(capsys):
+    assert Sanitize(device="cpu", sweep=True)() == 0
+    assert "123 kernels in " in capsys.readouterr().out
+
+
+def test_a_kernel_that_no_rendering_launches_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(sanitize, "work", lambda _: {"steps": 0, "frames": 0})
+    monkeypatch.setattr(sanitize, "sweep", lambda _: Sweep(3, 1, ["compose_1a2b"]))
+    assert Sanitize(device="cpu", sweep=True)() == 1
+    out, err = capsys.readouterr()
+    assert "1 kernels in 3 renderings on cpu" in out and err == "not launched: compose_1a2b\n"

@@ -1,12 +1,27 @@
 """Memory stays as it is over frames and steps; `python -m benchmarks.soak` goes on for longer."""
 
 import mmap
+import threading
 
 import pytest
 import torch
 
 from benchmarks import soak
-from benchmarks.soak import EVERYONES, Soak, judge, memory, spans
+from benchmarks.soak import (
+    EVERYONES,
+    MemorySample,
+    Soak,
+    cycle,
+    handles,
+    judge,
+    library_calls,
+    memory,
+    phase,
+    spans,
+)
+from nexwarp.cli.device import keep_freed_memory
+from nexwarp.train.trainer import Trainer
+from tests.trainer_support import small
 
 MIB = 2**20
 
@@ -88,3 +103,46 @@ def test_frames_and_steps_leave_memory_as_it_is(device, capsys):
     out = capsys.readouterr().out
     assert "8 rounds of density control" in out and "flat: first and last are within 1 % throughout" in out
     assert out.count(": flat") == 2 * len(memory(device).keys() - {EVERYONES})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2000])
+def test_loads_and_renderings_leave_nothing_behind(tiny_scene, tmp_path, device, count):
+    """Neither memory nor open files nor threads, over renderings of 84 cameras with and without gradients."""
+    if device.type == "cpu":
+        keep_freed_memory()
+    trainer = Trainer(tiny_scene, small(max_surfels=60), device)
+    trainer.run(until=3)
+    file = trainer.finish().save(tmp_path / "model.safetensors")
+    del trainer
+    samples: list[MemorySample] = []
+    kept: list[dict[str, int]] = []
+
+    def sample(number: int) -> None:
+        if number % 20 == 0:
+            samples.append((number, memory(device)))
+            kept.append(handles())
+
+    library_calls(file, cycle(tiny_scene, device, 0), count, sample, device)
+    assert phase(f"loads and renderings on {device}", count, samples)
+    assert kept[-1] == kept[len(kept) // 4], (kept[len(kept) // 4], kept[-1])
+    print(kept[-1])
+
+
+def test_open_files_and_threads_are_seen(tmp_path):
+    before = handles()
+    stop = threading.Event()
+    thread = threading.Thread(target=stop.wait)
+    thread.start()
+    with open(tmp_path / "file", "w"):
+        assert handles() == {name: number + 1 for name, number in before.items()}
+    stop.set()
+    thread.join()
+
+
+def test_library_calls_are_of_all_kinds(tiny_scene, tmp_path, device):
+    trainer = Trainer(tiny_scene, small(max_surfels=60), device)
+    file = trainer.model().save(tmp_path / "model.safetensors")
+    numbers: list[int] = []
+    library_calls(file, cycle(tiny_scene, device, 0), 6, numbers.append, device)
+    assert numbers == [1, 2, 3, 4, 5, 6]

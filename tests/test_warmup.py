@@ -70,22 +70,11 @@ def fresh_process(program: str, *arguments: str, cache: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def warmed(folder: Path, device: str) -> tuple[list[str], list[str]]:
-    """What both print."""
-    warm = fresh_process(WARM, device, cache=folder)
-    return warm, fresh_process(USE, str(folder / "tiny"), str(folder / "run"), device, cache=folder)
-
-
-@pytest.mark.parametrize(
-    "device",
-    [
-        pytest.param("cpu", marks=pytest.mark.background_job(warmed, "cpu")),
-        pytest.param("cuda", marks=[pytest.mark.background_job(warmed, "cuda"), pytest.mark.cuda]),
-    ],
-)
-def test_nothing_is_left_to_compile(device: str, background_job: tuple[list[str], list[str]]) -> None:
+@pytest.mark.long
+def test_nothing_is_left_to_compile(device: torch.device, tmp_path: Path) -> None:
     """The list alone is enough for the rehearsal; and after both, no command compiles, not even a second warm-up."""
-    warm, use = background_job
+    warm = fresh_process(WARM, device.type, cache=tmp_path)
+    use = fresh_process(USE, str(tmp_path / "tiny"), str(tmp_path / "run"), device.type, cache=tmp_path)
     at_first, listed, rehearsed = json.loads(warm[-1])
     assert at_first == 0 and listed > 20
     assert rehearsed == listed, "the rehearsal compiled kernels that the catalogue does not list"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.camera import MAX_CAMERAS, Camera
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import Json, JsonObject, read_object
@@ -258,6 +258,8 @@ def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
     entries = data[key]
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
+    if len(entries) > MAX_CAMERAS:
+        raise FormatError(f"{path}: {key}: expected at most {MAX_CAMERAS:,} cameras, got {len(entries):,}")
     objects = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):

@@ -194,3 +194,6 @@ def _common_target(cameras: Sequence[Camera]) -> torch.Tensor | None:
         return None
     viewmats, _ = camera_poses(cameras)
     return target if bool(((viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0).all()) else None
+
+
+PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}

@@ -17,6 +17,7 @@ from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
 from nexwarp.model.model_file import MODEL_FILE, load
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
+from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
 from nexwarp.run.export import export_run
 from nexwarp.run.folder import (
     read_metrics,
@@ -80,7 +81,7 @@ class Render:
         job = order.prepare(self.run)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
-        console.print(f"{len(job)} pictures in {self.run / 'renders'}", soft_wrap=True)
+        console.print(f"{len(job)} pictures in {self.run / RENDERS_FOLDER}", soft_wrap=True)
         if self.video is not None:
             console.print(f"{job.seconds:.2f} s of video in {self.video}", soft_wrap=True)
 
@@ -108,7 +109,7 @@ class Export:
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        for file in export_run(self.run, self.format, self.out or self.run / "export", self.max_extent):
+        for file in export_run(self.run, self.format, self.out or self.run / EXPORT_FOLDER, self.max_extent):
             console.print(str(file), soft_wrap=True)
 
 

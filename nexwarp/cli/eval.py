@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -16,12 +17,10 @@ from nexwarp.errors import SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
+from nexwarp.run.contents import METRICS_FILE, RENDERS_FOLDER
 from nexwarp.run.evaluate import evaluate
-from nexwarp.run.folder import (
-    METRICS_FILE,
-    read_metrics,
-    read_run,
-)
+from nexwarp.run.folder import read_metrics, read_run
+from nexwarp.run.lock import locked_run
 
 
 @dataclass
@@ -40,13 +39,15 @@ class Eval:
     def __call__(self, console: Console) -> None:
         """Evaluate."""
         device = pick_device(self.device)
-        source, config, _ = read_run(self.run)
-        model = load(self.run).to(device)
-        if self.scene is not None:
-            source = dataclasses.replace(source, path=self.scene)
-        with display.loading(console) as progress:
-            scene = source.load(progress)
-        results = evaluate_run(model, scene, self.run, console, mask_mode=config.mask_mode, metrics=self.metrics)
+        read_run(self.run)  # before a lock is written to a foreign folder
+        with locked_run(self.run, partial(display.warn, console)):
+            source, config, _ = read_run(self.run)
+            model = load(self.run).to(device)
+            if self.scene is not None:
+                source = dataclasses.replace(source, path=self.scene)
+            with display.loading(console) as progress:
+                scene = source.load(progress)
+            results = evaluate_run(model, scene, self.run, console, mask_mode=config.mask_mode, metrics=self.metrics)
         rows = figures(results, self.metrics)
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
 
@@ -89,7 +90,7 @@ def evaluate_run(
         raise SceneError(f"{scene.path}: expected test views, found none")
     with display.counting(console, "evaluating", len(scene.test)) as done:
         results = evaluate(
-            model, scene.test, renders=run / "renders", mask_mode=mask_mode, metrics=metrics, progress=done
+            model, scene.test, renders=run / RENDERS_FOLDER, mask_mode=mask_mode, metrics=metrics, progress=done
         )
     entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
     entries |= cast(dict[str, Json], results)

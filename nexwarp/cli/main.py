@@ -16,8 +16,7 @@ from nexwarp.cli.eval import Eval
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
-from nexwarp.errors import NexwarpError
-from nexwarp.train.health import needed_memory
+from nexwarp.errors import NexwarpError, needed_memory
 
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
@@ -73,8 +72,9 @@ def _unboxed(text: str) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
-    0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error. 128 plus the signal's
-    number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129). Every failure prints one line on stderr.
+    0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error, or a fault of the GPU. 128
+    plus the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129). Every failure prints one line on
+    stderr.
 
     Args:
         arguments: command line without the program's name; None takes that of the process.
@@ -103,6 +103,10 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(error, (NexwarpError, ValueError, OSError)):
             _complain(f"error: {error}", trace)
             return 2
+        if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
+            hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
+            _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
+            return 3
         hint = "" if debug else "; --debug shows the traceback"
         _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
         return 3

@@ -1,12 +1,13 @@
 """`nexwarp train`."""
 
 import dataclasses
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import torch
 import tyro
 from rich.console import Console
 
@@ -15,18 +16,11 @@ from nexwarp.cli.device import keep_freed_memory, pick_device
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.training_session import TrainingSession
-from nexwarp.cli.view import show_until_interrupted
+from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
-from nexwarp.run.folder import (
-    DEMO,
-    SceneSource,
-    create_run,
-    keep_camera_path,
-    prepare_run,
-    read_run,
-)
+from nexwarp.run.folder import DEMO, SceneSource, claimed_run, create_run, keep_camera_path, read_run
 from nexwarp.run.log import check_tensorboard
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, preset
@@ -85,11 +79,11 @@ class Train:
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
     """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
-    """Replace the run in --run."""
+    """Replace the run in --run; files that nexwarp did not write stay."""
     view: bool = False
     """Show the training in the browser, then the result until Ctrl-C (extra `viewer`)."""
     host: Host_ = "127.0.0.1"
-    """Address that --view listens on; 0.0.0.0 allows other machines."""
+    """Address that --view listens on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
     """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
@@ -99,16 +93,39 @@ class Train:
         """Train."""
         source = self._source()
         run = self.run or Path("runs") / source.name
-        resume = prepare_run(run, source, resume=self.resume, overwrite=self.overwrite)
-        if resume:
-            source = self._resumed_source(source, run)
-        device = pick_device(self.device)
-        config = self._config(run, resume)
-        self._check()
+        flags = {"resume": self.resume, "overwrite": self.overwrite}
+        with ExitStack() as claim:
+            resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
+            if resume:
+                source = self._resumed_source(source, run)
+            device = pick_device(self.device)
+            config = self._config(run, resume)
+            self._check()
+            trainer = self._trainer(source, config, device, resume, console)
+            session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
+            if resume:
+                session.resume()
+            else:
+                session.check_room()
+                if self.resume:
+                    console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+            with self._viewer(trainer, run, source.name, console) as viewer:
+                if not resume:
+                    _tell_foreign(console, run, create_run(run, source, trainer.config, device.type))
+                session.train(viewer)
+                model = session.finish()
+                claim.close()  # while the viewer shows the result, other commands may write to the run
+                if viewer is not None:
+                    viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
+                    show_until_interrupted(viewer, console)
+
+    def _trainer(
+        self, source: SceneSource, config: Config, device: torch.device, resume: bool, console: Console
+    ) -> Trainer:
+        """Load the scene and return the trainer."""
         console.print(f"{source.name} on {device_name(device)}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = source.load(progress)
-        config = self._with_background(config, scene, resume)
         size = scene.train[0].camera
         console.print(
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
@@ -116,22 +133,7 @@ class Train:
         )
         if device.type == "cpu":
             keep_freed_memory()
-        trainer = Trainer(scene, config, device)
-        session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
-        if resume:
-            session.resume()
-        else:
-            session.check_room()
-            if self.resume:
-                console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
-        with self._viewer(trainer, run, source.name, console) as viewer:
-            if not resume:
-                create_run(run, source, config, device.type)
-            session.train(viewer)
-            model = session.finish()
-            if viewer is not None:
-                viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
-                show_until_interrupted(viewer, console)
+        return Trainer(scene, self._with_background(config, scene, resume), device)
 
     def _check(self) -> None:
         """Raise SettingError for invalid options, before the photos are read."""
@@ -174,7 +176,7 @@ class Train:
             total=trainer.config.iterations,
             save_path=partial(keep_camera_path, run),
         )
-        console.print(f"viewer: {viewer.url}")
+        print_url(viewer, console)
         return viewer
 
     def _source(self) -> SceneSource:
@@ -246,3 +248,10 @@ class Train:
                 flag = f"--{name.replace('_', '-')}"
                 raise SettingError(f"--set: {name}: expected {flag} instead of --set")
         return settings
+
+
+def _tell_foreign(console: Console, run: Path, names: list[str]) -> None:
+    """Say which files an overwritten run folder keeps."""
+    if names:
+        kept = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
+        display.warn(console, f"{run}: not deleted, as nexwarp did not write it: {kept}")

@@ -13,14 +13,14 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
-from nexwarp.errors import DivergedError, NexwarpError, OutOfMemoryError, StorageError
+from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError, needed_memory
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
-from nexwarp.run.folder import check_room, tidy_run
+from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TEST, TRAIN, picture_name, remove_leftovers
+from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
-from nexwarp.train.health import needed_memory
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 CHECKPOINTS_A_RUN = 10
 # Large files on the disk at once: two checkpoints, a third while it is written, and the model.
 FILES_AT_A_TIME = 4
-DIVERGED_FILE = "diverged.json"
 
 
 class TrainingSession:
@@ -63,7 +62,7 @@ class TrainingSession:
     def resume(self) -> None:
         """Restore the run's newest complete checkpoint, if it has one."""
         self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
-        tidy_run(self.run)
+        remove_leftovers(self.run)
         if has_checkpoint(self.run):
             self.trainer.restore(self.run, partial(display.warn, self.console))
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
@@ -147,7 +146,7 @@ class TrainingSession:
         except OSError as error:
             raise StorageError(f"{error}; training is complete and saved: --resume finishes the run") from error
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, NexwarpError) or (needed := needed_memory(error)) is None:
+            if (needed := needed_memory(error)) is None:
                 raise
             raise OutOfMemoryError(
                 f"out of memory: needed {needed}; training is complete and saved: --resume finishes the run"
@@ -158,7 +157,7 @@ class TrainingSession:
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(run, finished)
-        sets = {"train": scene.train, "test": scene.test}
+        sets = {TRAIN: scene.train, TEST: scene.test}
         save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
         model = load(run).to(device)
         rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
@@ -184,8 +183,8 @@ class TrainingSession:
         }
         self.console.print(display.results_table(rows, f"{len(scene.test)} test views"))
         if scene.test:
-            first = Path(scene.test[0].name).with_suffix("")
-            self.console.print(f"photo, render, error: {run / 'renders' / 'compare' / f'{first}.png'}")
+            strip = run / RENDERS_FOLDER / COMPARE / picture_name(scene.test[0].name)
+            self.console.print(f"photo, render, error: {strip}")
         return model
 
 

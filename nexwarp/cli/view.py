@@ -24,7 +24,7 @@ class ViewCommand:
     run: Run_
     """Run folder."""
     host: Host_ = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 allows other machines."""
+    """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
     """Port to listen on; 0 picks a free one."""
     device: Device_ = None
@@ -48,8 +48,13 @@ class ViewCommand:
             show_until_interrupted(viewer, console)
 
 
+def print_url(viewer: "Viewer", console: Console, more: str = "") -> None:
+    """Print the viewer's address on one line, exactly: it may hold a token, or brackets."""
+    console.print(f"viewer: {viewer.url}{more}", soft_wrap=True, markup=False)
+
+
 def show_until_interrupted(viewer: "Viewer", console: Console) -> None:
     """Serve the viewer of a finished model until Ctrl-C."""
-    console.print(f"viewer: {viewer.url} (Ctrl-C ends it)")
+    print_url(viewer, console, " (Ctrl-C ends it)")
     with suppress(KeyboardInterrupt):
         viewer.show()

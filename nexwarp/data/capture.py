@@ -126,15 +126,6 @@ def inside_folder(where: str, path: Path, folder: Path) -> Path:
     return path
 
 
-def check_unique(source: Path, photos: list[Photo]) -> None:
-    """Raise ValueError if two photos have the same name."""
-    seen: set[str] = set()
-    for photo in photos:
-        if photo.name in seen:
-            raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
-        seen.add(photo.name)
-
-
 def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:
     """Raise ValueError naming the first of (P, 3) positions that is not finite or further than 1e15 from the origin."""
     bad = ~(np.abs(positions) <= LARGEST_COORDINATE).all(axis=1)

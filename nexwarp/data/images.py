@@ -23,6 +23,7 @@ MAX_SUM = 2**32 - 1
 MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
 # Larger images are refused above a ratio of pixels to bytes that no photo reaches: (2,000, 16,000 for bilevel images).
 HONEST_PIXELS, HONEST_RATIO = 40_000_000, (2_000, 16_000)
+MAX_READS = 1_000_000  # a second; a GIF file of 100 MB has as many
 WHITE = 128  # threshold of a mask; if no value reaches it, as in a mask of 0 and 1, all values above 0 are used
 
 
@@ -37,15 +38,21 @@ def quiet_pillow() -> Iterator[None]:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that limits each read to the file's size.
+    """A file that limits each read to the file's size, and the number of reads.
 
-    PIL reads lengths that damaged files give, and Python allocates the whole length before reading.
+    PIL reads lengths that damaged files give, and Python allocates the whole length before reading. Between the markers
+    of a damaged JPEG file PIL reads byte by byte.
     """
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size, self._reads = os.fstat(self.fileno()).st_size, 0
+
     def read(self, size: int | None = -1, /) -> bytes:
-        if size is not None and size > os.fstat(self.fileno()).st_size:
-            size = -1
-        return super().read(size)
+        self._reads += 1
+        if self._reads > MAX_READS:
+            raise ValueError(f"its content needs more than {MAX_READS:,} reads")
+        return super().read(-1 if size is not None and size > self._size else size)
 
 
 @contextmanager
@@ -57,7 +64,7 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
         formats = [name for name in FORMATS if name in _registered()]
-        with _Bounded(io.FileIO(path)) as file, Image.open(file, formats=formats) as image:
+        with _Bounded(path) as file, Image.open(file, formats=formats) as image:
             # PIL's own check can be disabled by other libraries.
             pixels = image.width * image.height
             if pixels > MAX_PIXELS:

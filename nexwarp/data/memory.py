@@ -3,26 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from nexwarp.checks import available_memory
+
 GIB = 2**30
 SHARE = 0.9  # largest share of the free memory for photos
 MAX_DOWNSCALE = 64
-
-
-def available_memory() -> int:
-    """Free memory for this process in bytes: that of the machine or of its control group, whichever is smaller."""
-    import psutil
-
-    free = int(psutil.virtual_memory().available)
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        if limit != "max":
-            used = int((group / "memory.current").read_text())
-            stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-            free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
-    except (OSError, ValueError):  # no control groups of version 2
-        pass
-    return max(free, 0)
 
 
 def photos_bytes(sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:

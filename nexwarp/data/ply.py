@@ -120,7 +120,8 @@ def _known(path: Path, vertices: np.ndarray, name: str | None, unknown: float) -
     """(P,) float64 values of a property; `unknown` where the value is negative or the property does not exist."""
     if name is None:
         return np.full(len(vertices), unknown)
-    values = vertices[name].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # signalling NaNs warn when they are converted
+        values = vertices[name].astype(np.float64)
     bad = ~(np.abs(values) <= LARGEST_COORDINATE)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
@@ -130,7 +131,8 @@ def _known(path: Path, vertices: np.ndarray, name: str | None, unknown: float) -
 
 def _pairs(path: Path, observations: np.ndarray, count: int) -> np.ndarray:
     """(M, 2) int64 distinct pairs of photo and point, ascending."""
-    image, vertex = (observations[name].astype(np.int64) for name in PAIR)
+    with np.errstate(invalid="ignore"):
+        image, vertex = (observations[name].astype(np.int64) for name in PAIR)
     if len(image) and (min(image.min(), vertex.min()) < 0 or vertex.max() >= count):
         raise ValueError(
             f"{path}: {OBSERVATION}: expected images from 0 and vertices from 0 to {count - 1}, "

@@ -133,7 +133,7 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
     Returns:
         (min(count, distinct),) int64 indices into `points`. The first one is deterministic but not always 0, since
-        fpsample's `start_idx` refers to the order of its own tree (1.0.2).
+        fpsample's `start_idx` refers to the order of its own tree (0.3.3 and 1.0.2).
     """
     from fpsample import bucket_fps_kdline_sampling
 

@@ -10,12 +10,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from nexwarp.camera import MAX_CAMERAS
 from nexwarp.data.capture import (
     Capture,
     Cloud,
     Photo,
     check_points,
-    check_unique,
     inside_folder,
     safe_name,
     short,
@@ -96,20 +96,24 @@ def _frame_list(file: Path, data: JsonObject) -> list[Json]:
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise ValueError(f"{file}: frames: expected a list of at least one frame, got {short(frames)}")
+    if len(frames) > MAX_CAMERAS:
+        raise ValueError(f"{file}: frames: expected at most {MAX_CAMERAS:,} frames, got {len(frames):,}")
     return frames
 
 
 def _frames(file: Path, data: JsonObject, images: str) -> list[Photo]:
     """The photos in the order of the file."""
     to_original = inverse_applied(file, data)
-    photos = []
+    photos: dict[str, Photo] = {}
     for index, frame in enumerate(_frame_list(file, data)):
         where = f"{file}: frame {index}"
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
-        photos.append(_photo(where, file.parent, data, frame, images, to_original))
-    check_unique(file, photos)
-    return photos
+        photo = _photo(where, file.parent, data, frame, images, to_original)
+        if photo.name in photos:
+            raise ValueError(f"{file}: expected each photo once, got {photo.name} twice")
+        photos[photo.name] = photo
+    return list(photos.values())
 
 
 def _photo(

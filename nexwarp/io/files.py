@@ -1,14 +1,22 @@
-"""Atomic writes: a file exists complete or not at all."""
+"""Atomic writes: a file exists complete or not at all, also after a power failure."""
 
+import errno
 import os
 import re
+import secrets
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nexwarp.errors import StorageError
+from nexwarp.errors import FormatError, StorageError
 
-LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\.[^.]*)?")
+LONGEST_HEADER = 2**20  # bytes; that of a model has about 5,000
+TEMPORARY = re.compile(r"\..+\.(\d{1,9})-[0-9a-f]{16}\.tmp(\.[^.]*)?")
+MAX_STEM = 40  # characters of a file's stem in its temporary name; a file system may limit names to 255 bytes
+STALE_SECONDS = 600.0
+# Errors of fsync on folders of file systems that cannot sync them, and of open on folders that may not be read.
+UNSYNCABLE = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 def one_line(text: object, limit: int = 300) -> str:
@@ -20,12 +28,74 @@ def one_line(text: object, limit: int = 300) -> str:
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
-@contextmanager
-def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, with the same suffix; it is renamed to `path` when the block ends.
+def check_tensors_header(path: Path) -> None:
+    """Raise FormatError if a safetensors file's header is long: parsing one of 100,000 tensors takes seconds."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+    # A file whose header would not fit is damaged, which its reader says.
+    if LONGEST_HEADER < size <= path.stat().st_size:
+        raise FormatError(
+            f"{path}: expected a safetensors header of at most {LONGEST_HEADER:,} bytes, a few tensors, got {size:,}"
+        )
 
-    Missing folders are created. If the block fails, an existing file at `path` stays unchanged, and the temporary file
-    and the folders created for it are removed.
+
+def temporary_name(path: Path) -> Path:
+    """Return an unpredictable name beside `path`, with the same suffix, that tells the process that uses it.
+
+    It is `.STEM.PROCESS-RANDOM.tmp.SUFFIX`. Nobody can create a link of that name in advance.
+    """
+    return path.with_name(f".{path.stem[:MAX_STEM]}.{os.getpid()}-{secrets.token_hex(8)}.tmp{path.suffix}")
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a name is one of `temporary_name`."""
+    return TEMPORARY.fullmatch(name) is not None
+
+
+def is_abandoned(file: Path) -> bool:
+    """Whether the process of a temporary file has probably ended.
+
+    No such process runs here, and the file has not changed for 10 minutes: the process may run on another host.
+    """
+    import psutil
+
+    match = TEMPORARY.fullmatch(file.name)
+    if match is None or time.time() - file.lstat().st_mtime < STALE_SECONDS:
+        return False
+    process = int(match[1])
+    return process == os.getpid() or not psutil.pid_exists(process)
+
+
+def make_folders(folder: Path) -> list[Path]:
+    """Create a folder and those above it, and wait until the disk has stored them; return the new ones, deepest first.
+
+    Raises:
+        OSError: a folder cannot be created; those created before it are removed.
+    """
+    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for new in missing:
+            sync(new.parent)
+    except OSError:
+        remove_empty(missing)
+        raise
+    return missing
+
+
+def remove_empty(folders: list[Path]) -> None:
+    """Remove those of some folders, deepest first, that are empty."""
+    for folder in folders:
+        with suppress(OSError):  # not empty, or not there
+            folder.rmdir()
+
+
+@contextmanager
+def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[Path]:
+    """Yield a temporary file beside `path`, with the same suffix; it is renamed to `path` when the block ends.
+
+    The file is new, empty, and has an unpredictable name. Missing folders are created. If the block fails, an existing
+    file at `path` stays unchanged, and the temporary file and the folders created for it are removed.
 
     Args:
         path: the file to write.
@@ -37,11 +107,11 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Ite
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
-    missing = [folder for folder in path.parents if not folder.exists()]
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    done = False
+    temporary, done = temporary_name(path), False
+    created: list[Path] = []
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        created = make_folders(path.parent)
+        temporary.touch(exist_ok=False)
         yield temporary
         if durable:
             sync(temporary)
@@ -56,55 +126,29 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = False) -> Ite
         raise StorageError.at(path, error) from error
     finally:
         # unlink would raise NotADirectoryError if a parent of `path` were a file.
-        if path.parent.is_dir():
+        if not done and path.parent.is_dir():
             temporary.unlink(missing_ok=True)
         if not done:
-            for folder in missing:
-                try:
-                    folder.rmdir()
-                except OSError:  # not created, or not empty
-                    break
+            remove_empty(created)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file to a temporary name and rename it: it is complete or absent, even after a power failure."""
-    with written_aside(path, durable=True) as temporary:
+    with written_aside(path) as temporary:
         temporary.write_bytes(content)
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has stored the content of a file, or the entries of a folder."""
+    """Wait until the disk has stored the content of a file, or the entries of a folder where that is possible."""
     folder = path.is_dir()
     if folder and os.name == "nt":  # Windows cannot open a folder
         return
-    number = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
     try:
-        os.fsync(number)
-    finally:
-        os.close(number)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files that killed processes left in a folder or its subfolders."""
-    for file in folder.rglob(".*.tmp*"):
-        if is_leftover(file):
-            file.unlink(missing_ok=True)
-
-
-def is_leftover(file: Path) -> bool:
-    """Whether a file is a temporary file of a process that no longer runs."""
-    match = LEFTOVER.fullmatch(file.name)
-    return match is not None and file.is_file() and not _runs(int(match[1]))
-
-
-def _runs(process: int) -> bool:
-    """Whether another process with this id runs."""
-    if process == os.getpid() or os.name == "nt":  # on Windows, os.kill would end the process
-        return False
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
+        number = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+    except OSError as error:
+        if not folder or error.errno not in UNSYNCABLE:
+            raise

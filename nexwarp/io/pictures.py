@@ -50,7 +50,7 @@ def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
     from PIL import Image
 
     pixels = _to_uint8("image", image).numpy()
-    with written_aside(path) as temporary:
+    with written_aside(path, durable=False) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
@@ -88,8 +88,7 @@ def save_exr(
         if not files:
             header[METADATA] = json.dumps({"parts": list(parts), **(metadata or {})})
         files.append(OpenEXR.Part(header, channels, name))
-    with written_aside(path) as temporary:
-        temporary.touch()  # raises an OSError with the reason; OpenEXR gives none
+    with written_aside(path, durable=False) as temporary:
         try:
             OpenEXR.File(files).write(str(temporary))
         except RuntimeError as error:  # for example a full disk

@@ -70,7 +70,6 @@ def video_writer(
     even = (height // 2 * 2, width // 2 * 2)
     count = 0
     with written_aside(path) as temporary:
-        temporary.touch()  # raises an OSError with the reason; FFmpeg gives none
         with av.open(str(temporary), "w", format=container_name, options=container_options) as container:
             rate = Fraction(fps).limit_denominator(1001)
             stream = container.add_stream(encoder, rate=rate, options=options)

@@ -65,6 +65,10 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="nexwarp")
 
 
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+
+
 def chunks(dim: int, align: int = 1, smallest: int = SMALLEST_CHUNK) -> list[tuple[int, int]]:
     """Split [0, dim) into at most CHUNKS ranges of at least `smallest`, at multiples of `align`."""
     size = max(smallest, -(-dim // CHUNKS))

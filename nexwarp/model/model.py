@@ -22,6 +22,9 @@ from nexwarp.representation.texture import NeuralTexture
 class Model(nn.Module):
     """A trained scene: surfels, texture, exposures, detail limits, and the options of its rendering.
 
+    `save` and `nexwarp.load` keep everything. `state_dict` has the tensors only, without `options` and `meta`;
+    `load_state_dict` takes the state of a model with the same parts, and names what is missing or too much.
+
     Attributes:
         surfels: the N surfels, float32.
         texture: the neural texture, float32; None for a model without texture.
@@ -69,6 +72,7 @@ class Model(nn.Module):
         self.detail_limits = detail_limits
         self.options = RenderOptions() if options is None else options
         self.meta: dict[str, Json] = dict(meta or {})
+        self.register_load_state_dict_pre_hook(_report_removed_parts)
 
     @property
     def device(self) -> torch.device:
@@ -168,3 +172,19 @@ class Model(nn.Module):
         from nexwarp.model.model_file import save_model
 
         return save_model(path, self)
+
+
+def _report_removed_parts(
+    model: nn.Module,
+    state: dict[str, torch.Tensor],
+    prefix: str,
+    _metadata: object,
+    strict: bool,
+    _missing: list[str],
+    unexpected: list[str],
+    _errors: list[str],
+) -> None:
+    """Name the tensors of parts that were set to None: torch passes over them when a state dict is loaded."""
+    for part, module in model._modules.items():
+        if strict and module is None:
+            unexpected += [name for name in state if name.startswith(f"{prefix}{part}.")]

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.checks import check_finite, check_range, check_tensors
+from nexwarp.checks import check_range, check_tensors, check_version
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.io.files import one_line, write_atomically
+from nexwarp.io.files import check_tensors_header, one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
+from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import LARGEST_RESOLUTION, NeuralTexture
+from nexwarp.representation.exposures import BUFFERS, Exposures
+from nexwarp.representation.surfels import PARAMETERS, Surfels
+from nexwarp.representation.texture import NeuralTexture, TextureShape
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
@@ -27,11 +28,17 @@ FRAME = "COLMAP world, cameras x right, y down, z forward"
 DTYPES = ("F16", "F32")
 
 LARGEST_LENGTH = 1e15
-ROUNDING = 1 + 1e-6
 # Tensor names in the file of DetailLimits' attributes; the format keeps its first names.
 DETAIL_LIMITS = {"nearest": "footprints", "farthest": "far_footprints"}
+# Names of all tensors but the texture's.
+FIXED_NAMES = {
+    *(f"surfels.{name}" for name in PARAMETERS),
+    *DETAIL_LIMITS.values(),
+    *(f"exposures.{name}" for name in BUFFERS),
+}
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits")
+LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 
 def save_model(path: str | os.PathLike[str], model: Model) -> Path:
@@ -90,10 +97,16 @@ def load(path: str | os.PathLike[str]) -> Model:
     if not path.is_file():
         raise MissingError(f"{path}: expected a model file, or a run folder with a {MODEL_FILE}")
     try:
+        check_tensors_header(path)
         with safe_open(path, "pt") as file:
-            text = (file.metadata() or {}).get("nexwarp")
-            kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in file.keys()}
-            header = _read_header(path, text, kinds)
+            header = _read_header(path, (file.metadata() or {}).get("nexwarp"))
+            # Tensors that this version does not know are passed over.
+            kinds = {
+                name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape())
+                for name in file.keys()
+                if name in FIXED_NAMES or name in header.texture_shapes
+            }
+            _check_kinds(path, kinds, header)
             tensors = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError) as error:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
@@ -110,11 +123,13 @@ class _Header:
     Attributes:
         options: the options of the rendering.
         texture: the arguments of `NeuralTexture`; None for a model without texture.
+        texture_shapes: names and shapes of the texture's tensors.
         meta: the other entries.
     """
 
     options: RenderOptions
     texture: dict[str, Json] | None
+    texture_shapes: dict[str, list[int]]
     meta: dict[str, Json]
 
 
@@ -131,15 +146,16 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
         farthest = tensors.get(DETAIL_LIMITS["farthest"], surfels.means.new_full((len(surfels),), NEVER))
         limits = DetailLimits(nearest.detach(), farthest.detach())
     parts = _part(tensors, "exposures.")
+    missing = [name for name in BUFFERS if name not in parts and name not in LATER_BUFFERS]
+    if parts and missing:
+        raise ValueError(f"expected the tensor exposures.{missing[0]}, found none")
     exposures = Exposures(**parts) if parts else None
-    for name, x in tensors.items():
-        check_finite(name, x)
+    check_bounds(tensors)
     texture = None
     if header.texture is not None:
         texture = NeuralTexture(**header.texture)  # type: ignore[arg-type]  # the constructor checks the types
         texture.load_state_dict(_part(tensors, "texture."))
-        check_range("texture.resolutions", float(texture.resolutions.min()), 0.0)
-        check_range("texture.resolutions", float(texture.resolutions.max()), 0.0, LARGEST_RESOLUTION * ROUNDING)
+        texture.half_precision = fits_half(tensors)
     return Model(surfels, texture, exposures, limits, header.options, header.meta)
 
 
@@ -148,8 +164,8 @@ def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.T
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
 
 
-def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, list[int]]]) -> _Header:
-    """Read the metadata; check the tensors' dtypes and shapes against it before anything is allocated."""
+def _read_header(path: Path, text: str | None) -> _Header:
+    """Read the metadata; allocate nothing of the sizes that it gives."""
     if text is None:
         raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     try:
@@ -158,31 +174,39 @@ def _read_header(path: Path, text: str | None, kinds: Mapping[str, tuple[str, li
         meta = None
     if not isinstance(meta, dict):
         raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {text[:40]!r}")
-    if meta.get("format_version") != FORMAT_VERSION:
-        raise FormatError(
-            f"{path}: expected format version {FORMAT_VERSION}, got {one_line(meta.get('format_version'))}"
-        )
+    try:
+        check_version(meta.get("format_version"), FORMAT_VERSION)
+    except ValueError as error:
+        raise FormatError(f"{path}: {error}") from None
     try:
         options = _read_options(meta)
-        texture = meta.pop("texture")
+        texture, shapes = meta.pop("texture"), {}
         if not isinstance(texture, (dict, type(None))):
             raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
-        expected = {}
         if texture is not None:
+            texture = {name: value for name, value in texture.items() if name in TextureShape.__annotations__}
             with torch.device("meta"):  # allocates nothing, even if the metadata gives huge sizes
                 state = NeuralTexture(**texture).state_dict()
-            expected = {f"texture.{name}": list(x.shape) for name, x in state.items()}
+            shapes = {f"texture.{name}": list(x.shape) for name, x in state.items()}
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise _no_model(path, error) from None
+    return _Header(options, texture, shapes, meta)
+
+
+def _check_kinds(path: Path, kinds: Mapping[str, tuple[str, list[int]]], header: _Header) -> None:
+    """Check the dtypes of all tensors and the shapes of the texture's before anything is allocated."""
+    try:
         for name, (dtype, shape) in kinds.items():
             if dtype not in DTYPES:
                 raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
-            if name.startswith("texture.") and expected.get(name) != shape:
-                raise ValueError(f"{name}: expected shape {expected.get(name)}, got {shape}")
-        missing = sorted(expected.keys() - kinds.keys())
+            expected = header.texture_shapes.get(name, shape)
+            if expected != shape:
+                raise ValueError(f"{name}: expected shape {expected}, got {shape}")
+        missing = sorted(header.texture_shapes.keys() - kinds.keys())
         if missing:
             raise ValueError(f"expected the tensor {missing[0]}, found none")
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+    except ValueError as error:
         raise _no_model(path, error) from None
-    return _Header(options, texture, meta)
 
 
 def _no_model(path: Path, error: Exception) -> FormatError:

@@ -68,7 +68,7 @@ class RenderOptions:
         for value in self.background:
             if isinstance(value, bool) or not isinstance(value, numbers.Real):
                 raise TypeError(f"background: expected three numbers, got {self.background!r:.60}")
-            check_range("background", float(value), -LARGEST_COLOR, LARGEST_COLOR)
+            check_range("background", value, -LARGEST_COLOR, LARGEST_COLOR)
 
     def changed(self, **changes: Unpack["RenderChanges"]) -> "RenderOptions":
         """Return a copy with some fields changed; a TypeError or ValueError names the field."""

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.checks import check_finite, check_range
+from nexwarp.checks import check_range
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line, written_aside
+from nexwarp.model.bounds import check_bounds
 from nexwarp.model.splats import Pieces, split_large
 from nexwarp.representation.surfels import Surfels
 
@@ -124,7 +125,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file has another format, is damaged, or holds values that are not finite.
+        ValueError: the file has another format, is damaged, or holds values that cannot be rendered.
     """
     path = Path(path)
     if not path.is_file():
@@ -157,14 +158,11 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         "sh0": take(_names("f_dc", 3))[:, None],
     }
     try:
-        for name, x in raw.items():
-            check_finite(name, x)
-        coefficients = take(_names("f_rest", rest))
-        check_finite("f_rest", coefficients)
         if rest % 3:
             raise ValueError(f"f_rest: expected a multiple of 3 properties, got {rest}")
-        shN = coefficients.reshape(count, 3, rest // 3).mT.contiguous()
-        return Surfels({**{name: x.contiguous() for name, x in raw.items()}, "shN": shN})
+        raw["shN"] = take(_names("f_rest", rest)).reshape(count, 3, rest // 3).mT
+        check_bounds({f"surfels.{name}": x for name, x in raw.items()})
+        return Surfels({name: x.contiguous() for name, x in raw.items()})
     except (TypeError, ValueError) as error:
         raise FormatError(f"{path}: expected nexwarp surfels ({one_line(error)})") from None
 

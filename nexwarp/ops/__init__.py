@@ -5,6 +5,7 @@ from nexwarp.ops.antialias import antialias
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.graphs import captured
+from nexwarp.ops.memory import check_image
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
@@ -24,6 +25,7 @@ __all__ = [
     "activate",
     "antialias",
     "captured",
+    "check_image",
     "collect",
     "compose",
     "fits",

@@ -1,6 +1,7 @@
 """The torch <-> Warp boundary: arrays, types, devices and streams."""
 
 import functools
+import os
 import threading
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -10,6 +11,7 @@ import warp as wp
 
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.native.fixed_point import HIGH, LOW
+from nexwarp.kernels.tiles import LARGEST_INT
 
 # What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.
 Argument: TypeAlias = object
@@ -49,6 +51,10 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     if layout is None:
         if len(_layouts) >= _MOST_LAYOUTS:
             _layouts.clear()
+        # Warp keeps the bytes from one row to the next as int32.
+        steps = (step for step, size in zip(tensor.stride(), tensor.shape, strict=True) if size > 1)
+        if max(steps, default=0) * tensor.itemsize > LARGEST_INT:
+            raise ValueError(f"expected a tensor with rows of at most {LARGEST_INT:,} bytes, got {tuple(tensor.shape)}")
         owner: Any = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         # Without what it keeps alive.
         layout = _layouts[key] = type(owner).from_buffer_copy(owner)
@@ -89,6 +95,11 @@ def stream_on(stream: torch.cuda.Stream) -> wp.Stream:
 
 # Warp's own sorts and scans go to its current stream, which is one for all threads: who sets it holds this.
 warp_streams = threading.RLock()
+if hasattr(os, "register_at_fork"):
+    # Otherwise a child that is forked while another thread holds it would wait forever.
+    os.register_at_fork(
+        before=warp_streams.acquire, after_in_parent=warp_streams.release, after_in_child=warp_streams.release
+    )
 
 
 def launch(

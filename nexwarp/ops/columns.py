@@ -5,6 +5,7 @@ are fixed, and each is worked on by one thread of torch and its BLAS.
 """
 
 import functools
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +20,11 @@ SMALLEST_PART, ALIGN = 2048, 16
 
 def share_columns(count: int, part: Callable[[int, slice], None]) -> None:
     """Call `part(index, columns)` for fixed parts of `count` columns, several at a time, without gradients."""
+    # A mode of torch holds in one thread alone.
+    inference = torch.is_inference_mode_enabled()
 
     def work(numbered: tuple[int, slice]) -> None:
-        with torch.no_grad():
+        with torch.inference_mode(inference), torch.no_grad():
             part(*numbered)
 
     for _ in _pool(launching.get_num_threads()).map(work, enumerate(_parts(count))):
@@ -56,3 +59,16 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     started.wait()
     torch.set_num_threads(before)
     return pool
+
+
+def _after_fork() -> None:
+    """Forget the parent's threads, which do not survive a fork, and let torch do without them.
+
+    OpenMP, which shares out torch's own loops, waits forever in the child of a process that has used it.
+    """
+    _pool.cache_clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

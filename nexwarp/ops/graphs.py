@@ -35,7 +35,10 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
             try:
                 graph.capture_end()
             except RuntimeError:
-                with suppress(RuntimeError):  # some versions of torch leave their allocator capturing
+                # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
+                with suppress(RuntimeError):
                     torch._C._cuda_endAllocateToPool(stream.device_index, pool)
+                generator = torch.cuda.default_generators[stream.device_index]
+                generator.graphsafe_set_state(generator.clone_state())
             raise
     torch.cuda.current_stream(stream.device).wait_stream(stream)

@@ -55,5 +55,6 @@ def surface(
     outputs = [array(x.view(-1), real) for x in (expected, median, top)]
     outputs.append(array(normals.view(-1, 3), types(real).vec3))
     launch_walk(records, surface_kernel(real, low_pass, tiles.tile_size), tiles, inputs, outputs)
-    normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
+    with torch.autocast(normals.device.type, enabled=False):
+        normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
     return Surface(expected, median, top, normals)

@@ -41,6 +41,7 @@ def texture(
     """Look points up in the hash grid, apply the MLP and, given directions, evaluate the colours.
 
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
+    `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
 
     Args:
         positions: (n, 3) world.
@@ -95,7 +96,8 @@ class _Texture(torch.autograd.Function):
             arguments,
             [array(encoded, STORAGES[dtype])],
         )
-        *layers, coefficients = _mlp(encoded, matrices)
+        with torch.autocast(grid.device.type, enabled=False):
+            *layers, coefficients = _mlp(encoded, matrices)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         ctx.save_for_backward(
@@ -130,7 +132,8 @@ class _Texture(torch.autograd.Function):
                 coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
             )
         unscale = scale.reciprocal()
-        signal, grad_matrices = _mlp_backward(signal, layers, matrices)
+        with torch.autocast(grad.device.type, enabled=False):
+            signal, grad_matrices = _mlp_backward(signal, layers, matrices)
         grad_matrices = [x * unscale for x in grad_matrices]
         grad_grid, grad_positions, grad_depths = _lookup_backward(
             table, positions, depths, resolutions, focal, signal, unscale, need_positions or need_depths
@@ -298,6 +301,8 @@ def _lookup_backward(
 
 def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
     """(1,) float64 power of two that makes 2^46 units of the largest gradient: 2^17 of those may meet in one entry."""
+    if grad_encoded.numel() == 0:  # whose norm torch refuses
+        return unscale.new_ones(1, dtype=torch.float64)
     largest = torch.linalg.vector_norm(grad_encoded.float(), float("inf")).double() * unscale.double()
     return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 

@@ -18,12 +18,15 @@ from nexwarp.kernels.tiles import (
 )
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, uses_simd, warp_streams
+from nexwarp.ops.memory import check_memory
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
 SHARING = 8
+# Of the arrays that `intersect_tiles` makes.
+BYTES_AN_ENTRY = 24
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,8 @@ def intersect_tiles(
             exact number would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
 
     Raises:
-        ValueError: there are more than MAX_ENTRIES entries; on CUDA only when that is noticed without a wait.
+        ValueError, OutOfMemoryError: there are more than MAX_ENTRIES entries, or more than memory holds; on CUDA only
+            when that is noticed without a wait.
     """
     if tile_size % 8 or tile_size < 8:
         raise ValueError(f"tile_size: expected a multiple of 8, got {tile_size}")
@@ -204,7 +208,9 @@ def _scan(counts: torch.Tensor) -> None:
 
 
 def _total(ends: torch.Tensor, tiles: int) -> int:
-    return check_entries(int(ends[-1]), len(ends), tiles) if len(ends) else 0
+    total = check_entries(int(ends[-1]), len(ends), tiles) if len(ends) else 0
+    check_memory(BYTES_AN_ENTRY * total, ends.device, f"a list of {total:,} (tile, surfel) entries")
+    return total
 
 
 @dataclass
@@ -245,7 +251,8 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
         # A scene that grew by splitting has at least the needs it had: one view may show little of it.
         if fewer := _needs.get((ends.device.index, bits - 1, *kind)):
             room = max(room, fewer.room)
-        total = torch.empty(1, dtype=torch.int32, pin_memory=True)
+        with torch.inference_mode(False):  # later renderings write to it in any mode
+            total = torch.empty(1, dtype=torch.int32, pin_memory=True)
         need = _needs[key] = _Need(room, total, torch.cuda.Event())
     elif arrived:
         need.room = max(need.room, _with_margin(int(need.total)))

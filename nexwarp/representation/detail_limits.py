@@ -35,3 +35,23 @@ class DetailLimits(nn.Module):
 
     def __len__(self) -> int:
         return len(self.nearest)
+
+
+def limited_depths(
+    ids: torch.Tensor, depths: torch.Tensor, limits: DetailLimits | None, focal: float | torch.Tensor
+) -> torch.Tensor:
+    """Return depths for the texture's down-weighting: the hits' depths, clamped to the range of the training views.
+
+    Args:
+        ids: (H, W, K) surfels of the hits, -1 in empty slots.
+        depths: (H, W, K) z-depths of the hits.
+        limits: detail limits of the surfels; None clamps nothing.
+        focal: focal length in pixels.
+    """
+    if limits is None or not len(limits):
+        return depths
+    indices = ids.clamp_min(0).long()
+    clamped = torch.minimum(depths, focal * limits.farthest[indices])
+    # `nearest` is applied last: where no training view saw the texture, it is NEVER and removes all detail.
+    clamped = torch.maximum(clamped, focal * limits.nearest[indices])
+    return torch.where(ids >= 0, clamped, depths)

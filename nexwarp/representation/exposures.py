@@ -26,6 +26,8 @@ NOISES = (1e-3, 1e-2, 1e-1)  # candidates of the noise variance, relative to tha
 
 TINY = 1e-9  # added to the diagonal of matrices of squared errors, which may be singular
 
+BUFFERS = ("log_gains", "positions", "directions", "coefficients", "mean", "lengths", "falloff")
+
 
 class Exposures(nn.Module):
     """Gaussian process with a Matern 3/2 kernel that predicts gains from camera poses, fitted to V photos.
@@ -107,7 +109,7 @@ class Exposures(nn.Module):
         Returns:
             The exposures, float32 on the CPU.
         """
-        viewmats = torch.stack([camera.viewmat.cpu().double() for camera in cameras])
+        viewmats = torch.stack([camera.viewmat.detach().cpu().double() for camera in cameras])
         stride = -(-len(cameras) // MOST_PHOTOS)
         positions, directions = (x[::stride] for x in poses_of(viewmats))
         gains = log_gains.double()[::stride]
@@ -145,6 +147,7 @@ class Exposures(nn.Module):
         gains, light = self.gains(camera), self.falloff_of(camera)
         return gains if light is None else light * gains
 
+    @torch.inference_mode(False)  # a later training may use what is cached
     @torch.no_grad()
     def falloff_of(self, camera: Camera) -> torch.Tensor | None:
         """Return the fraction of light that the lens transmits to each pixel; None for a lens without vignetting.

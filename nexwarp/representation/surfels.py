@@ -11,6 +11,8 @@ from nexwarp.checks import check_finite, check_tensors
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
 END = 1e-6
 
+PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
+
 
 class Activated(NamedTuple):
     """Activated geometry of N surfels, as the kernels take it; differentiable.

@@ -43,7 +43,7 @@ class NeuralTexture(nn.Module):
     series.
 
     On CUDA, lookup and MLP use half-precision copies of the float32 parameters, made for each call; gradients are
-    summed in float32. Set `half_precision` to False to compute in float32.
+    summed in float32. Set `half_precision` to False to compute in float32. `torch.autocast` changes neither.
     """
 
     resolutions: torch.Tensor
@@ -113,6 +113,20 @@ class NeuralTexture(nn.Module):
     def device(self) -> torch.device:
         """Device of the parameters."""
         return self.grid.device
+
+    def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
+        """Return how many values an evaluation keeps for each point (features, hidden layers, output), and their dtype.
+
+        Args:
+            sh_degree: SH degree of the evaluation.
+        """
+        *hidden, _ = self.mlp.parameters()
+        features = self.grid.shape[0] * self.grid.shape[2]
+        dtype = torch.float16 if self._in_half() else self.grid.dtype
+        return features + sum(map(len, hidden)) + 3 * (min(sh_degree, self.sh_degree) + 1) ** 2, dtype
+
+    def _in_half(self) -> bool:
+        return self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32
 
     def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
         """Return the field's SH coefficients.
@@ -190,7 +204,7 @@ class NeuralTexture(nn.Module):
             directions=directions,
             offset=0.0 if self.residual else 0.5,
             clamp=clamp,
-            half=self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32,
+            half=self._in_half(),
         )
 
 

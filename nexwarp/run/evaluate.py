@@ -10,6 +10,7 @@ import torch
 from nexwarp.data import View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
+from nexwarp.run.contents import COMPARE, TEST, picture_name
 from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
 
 
@@ -73,13 +74,12 @@ def evaluate(
             photo, mask = torch.where(mask[..., None], photo, background), None
         results[view.name] = {name: METRICS[name](picture, photo, mask) for name in metrics}
         if renders is not None:
-            stem = Path(view.name).with_suffix("")
-            save_png(renders / "test" / f"{stem}.png", picture)
+            save_png(renders / TEST / picture_name(view.name), picture)
             strip = side_by_side(
                 [photo, picture, error_map(picture, photo)],
                 captions=["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"],
             )
-            save_png(renders / "compare" / f"{stem}.png", strip)
+            save_png(renders / COMPARE / picture_name(view.name), strip)
         if progress is not None:
             progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}

@@ -9,6 +9,7 @@ from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
+from nexwarp.run.contents import CAMERA_PATH_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
 from nexwarp.run.folder import read_run
 
 FORMATS = ("ply", "cameras")
@@ -36,7 +37,7 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     source, _, _ = read_run(run)
     if kind == "ply":
         model = load(run)
-        files = [folder / "surfels.ply", folder / "splats.ply"]
+        files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
         save_surfels_ply(files[0], model.surfels)
         # A training that stopped early leaves a model, but no cameras file.
         groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
@@ -53,7 +54,7 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
         raise RunError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
-    files = [folder / "transforms.json", folder / "camera_path.json"]
+    files = [folder / TRANSFORMS_FILE, folder / CAMERA_PATH_FILE]
     save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])

@@ -1,26 +1,29 @@
 """Run folders: creating, checking and reading them.
 
 A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `metrics.jsonl`,
-`renders/` and `checkpoint/`; docs/format.md describes them.
+`renders/` and `checkpoint/`; `nexwarp.run.contents` has the names, and docs/format.md describes the files.
 """
 
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from nexwarp.checks import check_version
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
-from nexwarp.io.files import is_leftover, one_line, remove_leftovers, write_atomically, written_aside
+from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json
+from nexwarp.run.contents import CAMERA_PATH, CONFIG_FILE, LOCK_FILE, METRICS_FILE, delete_files
+from nexwarp.run.lock import locked_run
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
 
-CONFIG_FILE = "config.json"
-METRICS_FILE = "metrics.json"
 DEMO = "demo"
+RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,24 @@ class SceneSource:
         return load_scene(demo_folder() if folder == DEMO else folder, **options)
 
 
+@contextmanager
+def claimed_run(
+    run: Path, source: SceneSource, *, resume: bool, overwrite: bool, warn: Callable[[str], None] = lambda _: None
+) -> Iterator[bool]:
+    """Check and lock a run folder for a training; yields what `prepare_run` returns, whose errors it raises.
+
+    Args:
+        run: run folder.
+        source: the scene.
+        resume: whether to resume the run.
+        overwrite: whether to overwrite the run.
+        warn: see `locked_run`.
+    """
+    prepare_run(run, source, resume=resume, overwrite=overwrite)  # before a lock is written to a foreign folder
+    with locked_run(run, warn):
+        yield prepare_run(run, source, resume=resume, overwrite=overwrite)  # another process may have changed it
+
+
 def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> bool:
     """Check that a run folder may be created, resumed or overwritten; change nothing.
 
@@ -67,33 +88,51 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
 
     Raises:
         ValueError: the folder exists and neither flag is given; both flags are given; the folder to overwrite is not a
-            run; or the folder contains the scene.
+            run, or its config is damaged; or the folder contains the scene.
         FileNotFoundError: the folder to resume is not a run.
     """
     if resume and overwrite:
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
         raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
-    exists = run.exists() and (not run.is_dir() or any(run.iterdir()))
-    if resume:
-        if (run / CONFIG_FILE).is_file():
-            return True
-        if not run.is_dir() or any(not is_leftover(file) for file in run.iterdir()):
-            raise MissingError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
-    elif exists and not overwrite:
-        raise RunError(
-            f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
-        )
-    elif exists and not (run / CONFIG_FILE).is_file():
-        raise RunError(f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; nothing was deleted")
+    if resume and (run / CONFIG_FILE).is_file():
+        return True
+    # A process that is killed before it has written the config leaves a lock and temporary files.
+    empty = run.is_dir() and all(file.name == LOCK_FILE or is_temporary(file.name) for file in run.iterdir())
+    if resume and not empty:
+        raise MissingError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
+    if run.exists() and not empty and not resume:
+        if not overwrite:
+            raise RunError(
+                f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
+            )
+        _check_replaceable(run)
     return False
 
 
-def create_run(run: Path, source: SceneSource, config: Config, device: str) -> None:
+def _check_replaceable(run: Path) -> None:
+    """Raise RunError unless a folder holds the config of a run."""
+    try:
+        read_run(run)
+    except MissingError:
+        raise RunError(
+            f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; nothing was deleted"
+        ) from None
+    except FormatError as error:
+        raise RunError(
+            f"{run}: expected a run folder to overwrite, but its {CONFIG_FILE} is damaged or not of a run, and nothing "
+            f"was deleted; give another --run, or delete the folder yourself ({error})"
+        ) from None
+
+
+def create_run(run: Path, source: SceneSource, config: Config, device: str) -> list[str]:
     """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
 
-    The new config is on the disk before anything is deleted, and replaces the old config last. An interruption at any
-    point thus leaves a folder that is still a run.
+    The new config is on the disk before anything is deleted, and replaces the old config last, when the disk has stored
+    the deletions. An interruption at any point thus leaves a folder that is still a run.
+
+    Returns:
+        Names of the files and folders that nexwarp did not write; they stay.
     """
     scene = dataclasses.asdict(source)
     if source.path != DEMO:
@@ -101,19 +140,12 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str) -> N
     if source.points is not None:
         scene["points"] = str(Path(source.points).resolve())
     data = {"scene": scene, "device": device, "config": config.as_dict()}
-    with written_aside(run / CONFIG_FILE, durable=True) as temporary:
+    with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(data, indent=2) + "\n").encode())
-        for file in sorted(run.iterdir()):
-            if file.is_dir() and not file.is_symlink():
-                shutil.rmtree(file)
-            elif file.name not in (temporary.name, CONFIG_FILE):
-                file.unlink()
-
-
-def tidy_run(run: Path) -> None:
-    """Remove the incomplete files that killed processes left in a run folder."""
-    shutil.rmtree(run / "checkpoint.tmp", ignore_errors=True)
-    remove_leftovers(run)
+        sync(temporary)
+        foreign = delete_files(run, keep=(CONFIG_FILE, LOCK_FILE, temporary.name))
+        sync(run)
+    return foreign
 
 
 def check_room(run: Path, size: int) -> None:
@@ -150,13 +182,16 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         raise MissingError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
     try:
         data = read_json(path)
+        check_version(data.get("format_version", 1), RUN_VERSION)
         scene = data["scene"]
         if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
             raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
         for name in ("images", "masks", "background", "points", "format"):
             if not isinstance(scene.get(name), (str, type(None))):
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
-        return SceneSource(**data["scene"]), config_from_dict(data["config"]), data
+        known = {field.name for field in dataclasses.fields(SceneSource)}
+        source = SceneSource(**{name: value for name, value in scene.items() if name in known})
+        return source, config_from_dict(data["config"]), data
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
@@ -168,6 +203,7 @@ def read_metrics(run: Path) -> dict[str, Json]:
         metrics = read_json(path) if path.is_file() else {}
         if not isinstance(metrics, dict):
             raise ValueError(f"expected an object, got {type(metrics).__name__}")
+        check_version(metrics.get("format_version", 1), RUN_VERSION)
         for name in ("psnr", "ssim"):
             if not isinstance(metrics.get(name, 0.0), (int, float)):
                 raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
@@ -179,7 +215,12 @@ def read_metrics(run: Path) -> dict[str, Json]:
 def keep_camera_path(run: Path, content: bytes) -> str:
     """Write a camera path (JSON) into a run under the next free name; return the command that renders it."""
     number = 1
-    while (path := run / f"camera_path_{number}.json").exists():
-        number += 1
-    write_atomically(path, content)
-    return f"nexwarp render {run} --path {path}"
+    while True:
+        path = run / CAMERA_PATH.format(number)
+        try:
+            path.touch(exist_ok=False)  # another viewer may look for a name at the same time
+        except FileExistsError:
+            number += 1
+            continue
+        write_atomically(path, content)
+        return f"nexwarp render {run} --path {path}"

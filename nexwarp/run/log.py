@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO, TypedDict
@@ -10,14 +11,12 @@ from typing import TYPE_CHECKING, TextIO, TypedDict
 import torch
 
 from nexwarp.io.files import written_aside
+from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
-
-LOG_FILE = "metrics.jsonl"
-TENSORBOARD_FOLDER = "tensorboard"
 
 # Iterations between two lines, fewer in short runs, which get about MIN_LINES lines.
 EVERY = 100
@@ -111,7 +110,7 @@ class TrainingLog:
             # TensorBoard hides older events of iterations that are trained again after the checkpoint.
             purge = self.trainer.iteration + 1 if self.trainer.iteration else None
             self.writer = SummaryWriter(str(self.run / TENSORBOARD_FOLDER), purge_step=purge)
-        self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
+        self.file = _open_log(self.run / LOG_FILE)
         self.written = time.perf_counter()
         return self
 
@@ -129,7 +128,7 @@ class TrainingLog:
         assert self.file is not None
         self.file.close()
         keep_lines(self.run / LOG_FILE, self.trainer.iteration)
-        self.file = (self.run / LOG_FILE).open("a", encoding="utf-8")
+        self.file = _open_log(self.run / LOG_FILE)
         self.last, self.written = self.trainer.iteration, time.perf_counter()
 
     def __call__(self, step: StepReport) -> None:
@@ -176,6 +175,15 @@ def learning_rates(trainer: Trainer) -> dict[str, float]:
     return rates
 
 
+def _open_log(path: Path) -> TextIO:
+    """Open a log to append to it. A link at its place is refused: it may lead to a file that is not ours."""
+
+    def no_link(name: str, flags: int) -> int:
+        return os.open(name, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+    return open(path, "a", encoding="utf-8", opener=no_link)
+
+
 def keep_lines(path: Path, iteration: int) -> None:
     """Drop lines of later iterations, and incomplete lines, from a log; the file need not exist."""
     if not path.exists():
@@ -191,7 +199,7 @@ def _iteration(line: bytes) -> float:
     """Return the iteration of a line; infinity if the line is damaged."""
     try:
         iteration = json.loads(line)["iteration"]
-    except (ValueError, TypeError, KeyError):  # bad UTF-8 is a ValueError
+    except (ValueError, TypeError, KeyError, RecursionError):  # bad UTF-8 is a ValueError
         return math.inf
     return iteration if type(iteration) is int else math.inf
 

@@ -14,19 +14,18 @@ from nexwarp.buffers import render_buffers, save_buffers
 from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path
-from nexwarp.cameras.paths import ellipse, interpolate, spiral
+from nexwarp.cameras.paths import PATHS
 from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.run.contents import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, frame_name, picture_name
 from nexwarp.run.folder import read_run
 
 FRAMES, FPS = 120, 30.0
 
-PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
-
-SETS = {"test": ("test",), "train": ("train",), "all": ("train", "test"), None: ()}
+SETS = {"test": (TEST,), "train": (TRAIN,), "all": (TRAIN, TEST), None: ()}
 
 LARGEST_SIDE = 16384  # pixels
 
@@ -161,10 +160,10 @@ class RenderOrder:
         size = self._size()
         read_run(run)
         cameras = load_cameras(run / CAMERAS_FILE)
-        renders, pictures = run / "renders", []
+        renders, pictures = run / RENDERS_FOLDER, []
         for group in SETS[self.views]:
             for name, camera in cameras.get(group, {}).items():
-                file = renders / group / f"{Path(name).with_suffix('')}.png"
+                file = renders / group / picture_name(name)
                 pictures.append(PictureJob(file, size(camera), False, self.buffers))
         fps = FPS
         if self.path is not None and self.frames != 0:
@@ -172,7 +171,7 @@ class RenderOrder:
             first = size(path[0])
             for i, camera in enumerate(path):
                 camera = resized(size(camera), first.width, first.height)
-                pictures.append(PictureJob(folder / f"{i:04d}.png", camera, True, self.buffers and self.views is None))
+                pictures.append(PictureJob(folder / frame_name(i), camera, True, self.buffers and self.views is None))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
         return RenderJob(
@@ -188,11 +187,11 @@ class RenderOrder:
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
             path = load_camera_path(file, near)
-            return renders / f"path_{file.stem}", path.cameras, path.fps or FPS
+            return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
-        views = cameras.get("train", {})
+        views = cameras.get(TRAIN, {})
         if self.path == "interpolate":
-            views = dict(sorted((views | cameras.get("test", {})).items()))
+            views = dict(sorted((views | cameras.get(TEST, {})).items()))
         try:
             return renders / self.path, PATHS[self.path](list(views.values()), count), FPS
         except ValueError as error:

@@ -2,21 +2,23 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from nexwarp.checks import check_version
 from nexwarp.errors import CheckpointError, MissingError
-from nexwarp.io.files import sync, write_atomically
+from nexwarp.io.files import check_tensors_header, is_temporary, sync, temporary_name, write_atomically
 from nexwarp.io.json_files import READ_ERRORS, read_json
 
 CHECKPOINT_VERSION = 1
 
 # Newest first. The last one is there only while others are renamed.
 CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
+TENSORS_FILE, STATE_FILE = CHECKPOINT_FILES = ("tensors.safetensors", "state.json")
 
 
 def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, object]) -> None:
@@ -30,30 +32,55 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
     from safetensors.torch import save
 
     newest, old, older = (run / name for name in CHECKPOINTS)
-    aside = run / "checkpoint.tmp"
-    shutil.rmtree(aside, ignore_errors=True)
+    aside = temporary_name(newest)
     try:
         aside.mkdir()
         content = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()})
-        write_atomically(aside / "tensors.safetensors", content)
+        write_atomically(aside / TENSORS_FILE, content)
         record = {**state, "format_version": CHECKPOINT_VERSION, "tensors_sha256": hashlib.sha256(content).hexdigest()}
-        write_atomically(aside / "state.json", json.dumps({**record, "sha256": _digest(record)}).encode())
+        write_atomically(aside / STATE_FILE, json.dumps({**record, "sha256": _digest(record)}).encode())
         if newest.exists():  # else a kill came between the renames, and the others are all there is
             if old.exists():
-                shutil.rmtree(older, ignore_errors=True)
+                _make_way(older)
                 old.rename(older)
             newest.rename(old)
         aside.rename(newest)
         sync(run)
     except BaseException:  # whatever comes next may need the room
-        shutil.rmtree(aside, ignore_errors=True)
+        _delete(aside)
         raise
-    shutil.rmtree(older, ignore_errors=True)
+    _delete(older)
+
+
+def _delete(folder: Path) -> None:
+    """Delete a checkpoint. Files in its folder that are not ours stay, and so does the folder then."""
+    with suppress(OSError):
+        if folder.is_symlink():
+            folder.unlink()
+        for file in folder.iterdir():
+            if file.name in CHECKPOINT_FILES or is_temporary(file.name):
+                file.unlink()
+        folder.rmdir()
+
+
+def _make_way(folder: Path) -> None:
+    """Delete a checkpoint; rename what is left of its folder."""
+    _delete(folder)
+    number = 1
+    while folder.exists():
+        kept = folder.with_name(f"{CHECKPOINTS[0]}.kept_{number}")
+        if not kept.exists():
+            folder.rename(kept)
+        number += 1
 
 
 def has_checkpoint(run: Path) -> bool:
     """Whether there is a checkpoint, whole or not."""
-    return any((run / name).is_dir() for name in CHECKPOINTS)
+    return any(_is_checkpoint(run / name) for name in CHECKPOINTS)
+
+
+def _is_checkpoint(folder: Path) -> bool:
+    return any((folder / name).exists() for name in CHECKPOINT_FILES)
 
 
 def load_checkpoint(
@@ -71,7 +98,7 @@ def load_checkpoint(
     """
     damaged: list[CheckpointError] = []
     for folder in (run / name for name in CHECKPOINTS):
-        if not folder.is_dir():
+        if not _is_checkpoint(folder):
             continue
         try:
             tensors, state = _read_checkpoint(folder)
@@ -91,13 +118,12 @@ def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, A
     from safetensors.torch import load
 
     try:
-        record = read_json(folder / "state.json")
-        version = record.get("format_version") if isinstance(record, dict) else None
-        if version != CHECKPOINT_VERSION:
-            raise ValueError(f"expected format version {CHECKPOINT_VERSION}, got {version}")
+        record = read_json(folder / STATE_FILE)
+        check_version(record.get("format_version") if isinstance(record, dict) else None, CHECKPOINT_VERSION)
         if record.pop("sha256", None) != _digest(record):
             raise ValueError("state.json: its checksum does not agree")
-        content = (folder / "tensors.safetensors").read_bytes()
+        check_tensors_header(folder / TENSORS_FILE)
+        content = (folder / TENSORS_FILE).read_bytes()
         if hashlib.sha256(content).hexdigest() != record.pop("tensors_sha256"):
             raise ValueError("tensors.safetensors: its checksum does not agree")
         del record["format_version"]

@@ -6,9 +6,7 @@ import torch
 from torch import nn
 
 from nexwarp.checks import check_range
-from nexwarp.representation.surfels import Surfels
-
-PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
+from nexwarp.representation.surfels import PARAMETERS, Surfels
 
 
 @dataclass(frozen=True)

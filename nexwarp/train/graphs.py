@@ -10,8 +10,8 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import StagedCamera
+from nexwarp.errors import OutOfMemoryError, needed_memory
 from nexwarp.model.options import RenderOptions
-from nexwarp.train.health import needed_memory
 from nexwarp.train.target import Target
 
 # Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A kind that
@@ -40,9 +40,24 @@ class StepResult(NamedTuple):
 class CaptureError(Exception):
     """A step could not be captured; `memory` says whether memory did not suffice."""
 
-    def __init__(self, cause: RuntimeError) -> None:
+    def __init__(self, cause: MemoryError | RuntimeError) -> None:
         super().__init__(" ".join(str(cause).split()))
         self.memory = needed_memory(cause) is not None
+
+
+class UpdateError(OutOfMemoryError):
+    """Memory did not suffice while the parameters were updated: to repeat the step would update some of them twice."""
+
+
+@contextmanager
+def updating() -> Iterator[None]:
+    """Turn memory errors of an update of the parameters into UpdateError."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if (needed := needed_memory(error)) is None:
+            raise
+        raise UpdateError(f"out of memory while the parameters were updated: needed {needed}", needed) from None
 
 
 class StepGraphs:
@@ -82,9 +97,9 @@ class StepGraphs:
                 if not error.memory:
                     told = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
                     warnings.warn(told, stacklevel=2)
-            except RuntimeError as error:
+            except (MemoryError, RuntimeError) as error:
                 # Graphs keep memory of their own, which may be what is missing.
-                if needed_memory(error) is None or self.keeper is None:
+                if needed_memory(error) is None or self.keeper is None or isinstance(error, UpdateError):
                     raise
                 self.chances -= 1
             self.clear()
@@ -166,11 +181,12 @@ class _Stage:
         assert self.graph is not None and self.result is not None and self.losses is not None
         self.graph.replay()
         result = self.result
-        if not ops.fits(result.room):
-            self.state = None
-        # Copies: they may be read after the next replay has overwritten the graph's own.
-        losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
-        return result._replace(losses=losses, image=result.image.clone())
+        with updating():  # the replay has done that
+            if not ops.fits(result.room):
+                self.state = None
+            # Copies: they may be read after the next replay has overwritten the graph's own.
+            losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
+            return result._replace(losses=losses, image=result.image.clone())
 
     def forget(self) -> None:
         """Drop the graph."""
@@ -182,7 +198,7 @@ def _capture_errors() -> Iterator[None]:
     """Turn errors of a capture into CaptureError."""
     try:
         yield
-    except RuntimeError as error:
+    except (MemoryError, RuntimeError) as error:
         raise CaptureError(error) from None  # whose traceback would keep what the step had made
 
 

@@ -1,7 +1,6 @@
 """Health of a training: numbers that are not finite, going back from them, and memory that does not suffice."""
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,15 +14,6 @@ from nexwarp.train.report import StepReport
 from nexwarp.train.state import Snapshot
 
 LOWERED_RATES = 0.5
-
-ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
-
-# Of CUDA's own calls, and of its libraries, which do not say how much they wanted.
-EXHAUSTED = re.compile(
-    r"CUDA (driver )?error:? .*out of memory|_ALLOC_FAILED|cudaErrorMemoryAllocation|bad_alloc", re.I
-)
-
-UNKNOWN = "more than there is"
 
 
 class LossLog:
@@ -101,25 +91,6 @@ def describe(name: str, tensor: torch.Tensor) -> str:
     bad = (~torch.isfinite(tensor.detach())).nonzero()
     where = tuple(bad[0].tolist())
     return f"{name}: {len(bad):,} of {tensor.numel():,} values, the first {tensor[where].item()} at index {where}"
-
-
-def needed_memory(error: BaseException) -> str | None:
-    """Return what an error of torch or Warp says of the memory that it did not get; None for other errors."""
-    if not isinstance(error, (MemoryError, RuntimeError)):
-        return None
-    match = ALLOCATION.search(str(error))
-    if match is not None:
-        return _readable(match[1])
-    exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
-    return UNKNOWN if exhausted else None
-
-
-def _readable(amount: str) -> str:
-    match = re.fullmatch(r"(\d+) ?bytes", amount, re.I)
-    if match is None:
-        return amount
-    size = int(match[1])
-    return f"{size / 2**30:.2f} GiB" if size >= 2**30 else f"{size / 2**20:.2f} MiB"
 
 
 def check_health(losses: LossLog, tensors: Mapping[str, torch.Tensor], facts: StepFacts) -> None:

@@ -38,6 +38,8 @@ Part = TypeVar("Part", LossWeights, LearningRates, TextureConfig, DensifyConfig)
 
 def _part(base: Part, data: Mapping[str, object], where: str) -> Part:
     """A part of the settings: those of `base`, changed by what `data` holds."""
+    known = {field.name for field in dataclasses.fields(base)}
+    data = {name: value for name, value in data.items() if name in known}
     return dataclasses.replace(base, **_checked(type(base), _tuples(data), where))
 
 
@@ -106,14 +108,16 @@ def preset(name: str) -> Config:
 
 
 def config_from_dict(data: Mapping[str, Any]) -> Config:
-    """Rebuild a config from `Config.as_dict`; ValueError names an unknown key.
+    """Rebuild a config from `Config.as_dict`; ValueError names a value of another type or out of range.
 
-    Settings that an older version did not write are those of the preset that the run started from.
+    Settings that an older version did not write are those of the preset that the run started from. Those that a newer
+    version wrote and this one does not know are passed over.
     """
     try:
         preset = data.get("preset")
         base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else Config()
-        data = {k: _part(getattr(base, k), v, k) if k in PARTS else v for k, v in data.items()}
+        known = {field.name for field in dataclasses.fields(Config)}
+        data = {k: _part(getattr(base, k), v, k) if k in PARTS else v for k, v in data.items() if k in known}
         return dataclasses.replace(base, **_checked(Config, _tuples(data), "config"))
     except (TypeError, AttributeError, KindError) as error:
         raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 
 from nexwarp.model.options import RenderOptions
-from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
-from nexwarp.train.densify import PARAMETERS, DensifyConfig
+from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" and "mlp"; `lr`, the

@@ -56,7 +56,7 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
     for text in texts:
         name, equals, value = (x.strip() for x in text.partition("="))
         if not (name and equals and value):
-            raise ValueError(f"expected KEY=VALUE, got {text!r}")
+            raise ValueError(f"expected KEY=VALUE, got {text!r:.60}")
         if name in settings:
             raise ValueError(f"{name}: expected it once, got it twice")
         try:

@@ -4,20 +4,23 @@ import hashlib
 import math
 import random
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from nexwarp.checks import check_finite
 from nexwarp.data import Scene
 from nexwarp.io.json_files import Json
+from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
+ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
 HEADERS = 2**20  # bytes of a checkpoint beside its parameters, at most
-OTHER_TYPES = ("rng.", "optimizer.")  # of tensors that need not be float32
+FLOATS = ("surfels.", "texture.", "adam.", "densify.")  # of tensors that are float32
 
 
 class Snapshot(NamedTuple):
@@ -47,6 +50,11 @@ def learned_tensors(surfels: Surfels, texture: NeuralTexture) -> dict[str, torch
 def part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Return the tensors whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
+
+
+def known_part(tensors: Mapping[str, torch.Tensor], prefix: str, names: Collection[str]) -> dict[str, torch.Tensor]:
+    """Return those of `part` whose names are known; a newer version may have written others."""
+    return {name: x for name, x in part(tensors, prefix).items() if name in names}
 
 
 def gather_optimizer(
@@ -94,7 +102,7 @@ def restore_optimizer(
         raise ValueError(f"its optimizer is {kind}, expected {type(optimizer).__name__}")
     for name, parameter in parameters.items():
         prefix = f"{_prefix(optimizer)}{name}."
-        entries = part(tensors, prefix)
+        entries = part(tensors, prefix) if record is not None else known_part(tensors, prefix, ADAM_STATE)
         if record is None:
             wrong = [k for k, x in entries.items() if x.shape != (() if k == "step" else parameter.shape)]
             if wrong:
@@ -166,9 +174,13 @@ def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:
         iterations: of the whole training.
     """
     tensors, state = snapshot
-    wrong = [name for name, x in tensors.items() if not name.startswith(OTHER_TYPES) and x.dtype != torch.float32]
+    wrong = [name for name, x in tensors.items() if name.startswith(FLOATS) and x.dtype != torch.float32]
     if wrong:
         raise ValueError(f"{wrong[0]}: expected float32, got {tensors[wrong[0]].dtype}")
+    for name, x in tensors.items():
+        if name.startswith(FLOATS):
+            check_finite(name, x)
+    check_bounds(tensors)
     for name, good in (
         ("iteration", lambda x: type(x) is int and 0 <= x <= iterations),
         ("seconds", lambda x: type(x) in (int, float) and 0 <= x < math.inf),

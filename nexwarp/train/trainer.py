@@ -10,21 +10,21 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
-from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
+from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError, needed_memory
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key
-from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, needed_memory, oom_message
+from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
@@ -35,9 +35,9 @@ from nexwarp.train.state import (
     checkpoint_bytes,
     gather_optimizer,
     gather_random,
+    known_part,
     learned_tensors,
     named_parameters,
-    part,
     restore_optimizer,
     restore_random,
     scene_digest,
@@ -169,7 +169,8 @@ class Trainer:
 
     def step(self) -> StepReport:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
-        with deterministic(self.config.deterministic and self.device.type == "cuda"):
+        fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
+        with fixed_order, torch.autocast(self.device.type, enabled=False):
             self.iteration += 1
             target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
@@ -207,9 +208,10 @@ class Trainer:
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
-            self.optimizer.step()
-            if request is not None and request.sums_after_backward is not None:
-                self.densifier.accumulate(request.sums_after_backward)
+            with updating():
+                self.optimizer.step()
+                if request is not None and request.sums_after_backward is not None:
+                    self.densifier.accumulate(request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
@@ -269,7 +271,8 @@ class Trainer:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         config = self.config
         settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
-        return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
+        with torch.autocast(self.device.type, enabled=False):
+            return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
@@ -320,7 +323,8 @@ class Trainer:
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())  # torch's go over several lines
+            found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            reason = " ".join(found.split())  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def _check_origin(self, snapshot: Snapshot) -> None:
@@ -361,8 +365,8 @@ class Trainer:
     def load_snapshot(self, snapshot: Snapshot) -> None:
         """Return to a snapshot of this run, which stays as it is; ValueError or RuntimeError where it does not fit."""
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
-        self.surfels = Surfels(part(tensors, "surfels.")).to(self.device)
-        self.texture.load_state_dict(part(tensors, "texture."))
+        self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
+        self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
         self.optimizer = make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer)
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)

@@ -1,6 +1,6 @@
 """Display modes of the viewer: each shows one buffer of a rendering as a picture, with a legend."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -143,9 +143,9 @@ def draw(
             return None
         out = model.render(camera, **changes)
         parts.append(_values(out, model.surfels, camera, settings))
-    colours, span = _colours(torch.cat(parts), settings.mode)
-    pixels = (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    return Picture(pixels.cpu().numpy(), span)
+    span = _span(parts, settings.mode)
+    # Band by band: temporary tensors of a large picture would need several times its memory.
+    return Picture(np.concatenate([_eight_bit(_colours(part, span)) for part in parts]), span)
 
 
 def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
@@ -173,14 +173,22 @@ def _where_any(there: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return torch.where(there, values, values.new_tensor(torch.nan))
 
 
-def _colours(values: torch.Tensor, mode: str) -> tuple[torch.Tensor, tuple[float, float] | None]:
-    """(H, W, 3) colours in [0, 1], black where values are NaN; and the span of the colour scale, if there is one."""
-    if values.ndim == 3:
-        return values, None
-    span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
+def _span(parts: Sequence[torch.Tensor], mode: str) -> tuple[float, float] | None:
+    """Values at the two ends of the colour scale; None for a mode that shows colours."""
+    if parts[0].ndim == 3:
+        return None
     if mode == "depth":
-        span = _span(values[~values.isnan()])
-    return _scale(values, *span) * ~values.isnan()[..., None], span
+        return _depth_span(torch.cat([part[~part.isnan()] for part in parts]))
+    return (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
+
+
+def _colours(values: torch.Tensor, span: tuple[float, float] | None) -> torch.Tensor:
+    """(H, W, 3) colours in [0, 1]: the values, or those of a colour scale, black where values are NaN."""
+    return values if span is None else _scale(values, *span) * ~values.isnan()[..., None]
+
+
+def _eight_bit(colours: torch.Tensor) -> np.ndarray:
+    return (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
 
 
 def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
@@ -190,7 +198,7 @@ def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
     return torch.where(behind, -normals, normals)
 
 
-def _span(depths: torch.Tensor) -> tuple[float, float]:
+def _depth_span(depths: torch.Tensor) -> tuple[float, float]:
     """The 2nd and 98th percentile of depths (n,), from a sample of at most twice `QUANTILE_SAMPLES`."""
     if depths.numel() == 0:
         return 0.0, 1.0

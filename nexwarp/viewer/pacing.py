@@ -7,9 +7,17 @@ SMALLEST = 32  # pixels along the shorter side
 MOVING_SECONDS = 0.08  # target time of a picture while the camera moves
 TRAINING_SECONDS = 0.4  # largest time of a picture between two steps of a training
 BAND_SECONDS = 0.2  # target time of a band of rows
-MOST_PIXELS = 3840 * 2160
-LONGEST_WAIT = 1.0  # seconds of one picture that `Share` counts at most
+MOST_PIXELS = 3840 * 2160  # of a picture, screenshots included
+MOST_SIDE = 8192  # pixels, of a picture
+FIRST_PIXELS = 2**18  # at most, of the first picture of a kind
+BAND_PIXELS = 2**20  # at most, of a band of rows, unless 16 rows have more: bounds the memory of a rendering
+FIRST_SECONDS = 1.0  # of the first picture of a kind that `Share` counts at most: it includes compilation
 STILL_AFTER = 0.2  # seconds without a change after which a picture is refined
+
+
+def limited(scale: float, width: int, height: int) -> float:
+    """Reduce the scale of a picture of a window so that it has at most `MOST_PIXELS`, and `MOST_SIDE` a side."""
+    return min(scale, math.sqrt(MOST_PIXELS / (width * height)), MOST_SIDE / max(width, height))
 
 
 class Pace:
@@ -32,17 +40,21 @@ class Pace:
         return self.seconds_per_pixel.get(kind, 0.0) * pixels
 
     def bands(self, kind: object, pixels: float) -> int:
-        """Number of bands of a picture, each of about `BAND_SECONDS`; a picture can be cancelled between two bands."""
-        return max(math.ceil(self.seconds(kind, pixels) / BAND_SECONDS), 1)
+        """Number of bands of a picture, each of about `BAND_SECONDS` and of at most `BAND_PIXELS`.
+
+        A picture can be cancelled between two bands.
+        """
+        return max(math.ceil(self.seconds(kind, pixels) / BAND_SECONDS), math.ceil(pixels / BAND_PIXELS), 1)
 
     def scale(self, kind: object, width: int, height: int, limit: float) -> float:
         """Largest scale of 1, 0.71, 0.5, ... at which a picture of a window should take at most `limit` seconds.
 
-        The scale is 0.25 for a kind that was never drawn. The shorter side has at least `SMALLEST` pixels.
+        The scale is at most 0.25, and the picture has at most `FIRST_PIXELS`, for a kind that was never drawn. The
+        shorter side has at least `SMALLEST` pixels.
         """
         floor = min(SMALLEST / max(min(width, height), 1), 1.0)
         if kind not in self.seconds_per_pixel:
-            return max(0.25, floor)
+            return max(min(0.25, math.sqrt(FIRST_PIXELS / (width * height))), floor)
         scale = 1.0
         while scale > floor and self.seconds(kind, width * height * scale**2) > limit:
             scale *= STEP

@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 from nexwarp.kernels.types import MAX_HITS
@@ -65,7 +65,7 @@ class Actions(Protocol):
     def remove_keyframe(self) -> None:
         """Remove the path's last keyframe."""
 
-    def play(self, seconds: float, closed: bool) -> None:
+    async def play(self, seconds: float, closed: bool) -> None:
         """Start or stop moving along the path."""
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
@@ -150,14 +150,14 @@ class Panel:
 
         gui = self.gui
         reset = gui.add_button("Back to the start", icon=Icon.HOME)
-        reset.on_click(lambda _: self.actions.reset())
+        self._on_click(reset, self.actions.reset)
         if not names:
             gui.add_markdown("This run has no cameras.")
             return
         jump = gui.add_dropdown("Go to", tuple(names), hint="Go to the camera of a photo")
         self._on(jump, self.actions.jump)
         again = gui.add_button("Go there", icon=Icon.CAMERA)
-        again.on_click(lambda _: self.actions.jump(jump.value))
+        self._on_click(again, lambda: self.actions.jump(jump.value))
         visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
         size = gui.add_slider("Size", 0.1, 4.0, 0.1, 1.0, hint="Of the frustums")
 
@@ -174,23 +174,22 @@ class Panel:
         gui.add_markdown("**Screenshot** of the current view, as PNG")
         height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
         shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
-        shot.on_click(lambda _: self.actions.take_screenshot(int(_within(height.value, SCREENSHOT_HEIGHTS))))
+        self._on_click(shot, lambda: self.actions.take_screenshot(int(_within(height.value, SCREENSHOT_HEIGHTS))))
         gui.add_divider()
         gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
         self.keyframes = gui.add_html("")
-        gui.add_button("Add this view", icon=Icon.PLUS).on_click(lambda _: self.actions.add_keyframe())
-        gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray").on_click(
-            lambda _: self.actions.remove_keyframe()
-        )
+        self._on_click(gui.add_button("Add this view", icon=Icon.PLUS), self.actions.add_keyframe)
+        remove = gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray")
+        self._on_click(remove, self.actions.remove_keyframe)
         seconds = gui.add_number("Seconds", 6.0, min=0.1, max=600.0, step=0.1)
         fps = gui.add_number("Frames/s", 30, min=1, max=120, step=1)
         width = gui.add_number("Width", size[0], min=16, max=8192, step=2)
         rows = gui.add_number("Height ", size[1], min=16, max=8192, step=2)
         closed = gui.add_checkbox("Closed", False, hint="Return to the first view")
         self.play = gui.add_button("Play", icon=Icon.PLAYER_PLAY, color="gray")
-        self.play.on_click(lambda _: self.actions.play(_within(seconds.value, (0.1, 600.0)), bool(closed.value)))
+        self._on_click(self.play, lambda: self.actions.play(_within(seconds.value, (0.1, 600.0)), bool(closed.value)))
         save = gui.add_button("Save path", icon=Icon.DOWNLOAD)
-        save.on_click(
+        save.on_click(  # on a thread of viser's pool: it writes a file
             lambda _: self.actions.save_path(
                 int(_within(width.value, (16, 8192))),
                 int(_within(rows.value, (16, 8192))),
@@ -237,9 +236,24 @@ class Panel:
         _set(self._controls[name], "value", getattr(self.actions.settings, name))
         self.show(None, None)
 
+    # Coroutines run on viser's event loop, one after another. Functions would wait for a thread of its pool, in a queue
+    # without a limit.
+
     @staticmethod
     def _on(control: "viser.GuiInputHandle[T]", act: Callable[[T], None]) -> None:
-        control.on_update(lambda event: act(event.target.value))
+        async def updated(event: "viser.GuiEvent[viser.GuiInputHandle[T]]") -> None:
+            act(event.target.value)
+
+        control.on_update(updated)
+
+    @staticmethod
+    def _on_click(button: "viser.GuiButtonHandle", act: Callable[[], Awaitable[None] | None]) -> None:
+        async def clicked(_: object) -> None:
+            done = act()
+            if done is not None:
+                await done
+
+        button.on_click(clicked)
 
 
 def set_value(control: Control[T], value: T) -> None:

@@ -5,60 +5,116 @@ import errno
 import importlib.util
 import io
 import logging
+import math
 import socket
 import warnings
+from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+
+from nexwarp.viewer.access import Access
 
 if TYPE_CHECKING:
     import viser
     import viser.infra
 
-LOOPBACK = {"127.0.0.1", "::1", "localhost"}
+    from nexwarp.viewer.connections import Gate
+
 # Messages of the panels and the canvas. viser's client knows others, such as uploads and public tunnels.
 ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"}
+# Numbers that a camera message must hold, by field: None is one number, otherwise the length of a list.
+CAMERA_FIELDS = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3} | dict.fromkeys(
+    ("fov", "image_width", "image_height")
+)
 log = logging.getLogger(__name__)
 
 
-def start_server(host: str, port: int) -> "viser.ViserServer":
-    """Start viser on exactly this address.
+@dataclass(frozen=True)
+class Server:
+    """A running server.
+
+    Attributes:
+        viser: the server.
+        url: address to open, with the token if it needs one.
+        gate: admits connections.
+    """
+
+    viser: "viser.ViserServer"
+    url: str
+    gate: "Gate"
+
+    def open(self) -> None:
+        """Answer requests from now on; earlier ones are refused."""
+        self.gate.is_open = True
+
+    def waiting(self, client_id: int) -> int:
+        """Number of messages that a client has not taken yet; 0 for one that has left."""
+        from nexwarp.viewer.connections import Connection
+
+        server = self.viser._websock_server
+        state, connection = server._client_state_from_id.get(client_id), server._live_connections.get(client_id)
+        if state is None or connection is None:
+            return 0
+        assert isinstance(connection, Connection)
+        return len(state.message_buffer.message_from_id) + connection.sending
+
+    def stop(self) -> None:
+        """Disconnect all browsers and stop."""
+        with contextlib.redirect_stdout(io.StringIO()):  # drops its message
+            self.viser.stop()
+
+
+def start_server(host: str, port: int) -> Server:
+    """Start viser on exactly this address; it refuses all requests until `Server.open` is called.
 
     Args:
-        host: name or address of an interface of this machine. On a loopback address only pages of this server may
-            connect, since any page that is open in a browser can reach it.
+        host: name or address of an interface of this machine. `nexwarp.viewer.access` says who may connect.
         port: 1 to 65535, or 0 for any free port.
 
     Raises:
         ValueError: viser is not installed, or the address cannot be used; the message gives the reason.
     """
-    check_server(host, port)
+    address = check_server(host, port)
     import viser
+
+    from nexwarp.viewer.connections import Gate
 
     # Broken connections and invalid messages are errors of the page: they are not logged.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab was closed
-    with contextlib.redirect_stdout(io.StringIO()):  # drops its banner
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+    gate = Gate(Access.to(address))
+    with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():  # drops its banner
+        server = viser.ViserServer(host=address, port=port, verbose=False)
+    if not gate.attached:
+        server.stop()
+        raise ValueError(f"the viewer needs viser as in constraints.txt, found {viser.__version__}")
     if port and server.get_port() != port:  # the port was taken after the check; viser chose the next one
         server.stop()
         raise _in_use(host, port)
-    _guard(server, host)
-    return server
+    _accept_only_known(server)
+    return Server(server, _url(address, server.get_port(), gate.access.token), gate)
 
 
-def check_server(host: str, port: int) -> None:
-    """Raise ValueError if viser is missing or the address cannot be used; viser itself would try other ports."""
+def check_server(host: str, port: int) -> str:
+    """Return the numeric address of a host, an IPv4 one if it has several; viser would resolve it again.
+
+    Raises:
+        ValueError: viser is missing, or the address cannot be used; viser itself would try other ports.
+    """
     if importlib.util.find_spec("viser") is None:
         raise ValueError("the viewer needs the package viser, found none; pip install 'nexwarp[viewer]'")
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: expected 0 to 65535, got {port}")
     try:
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        for family, kind, protocol, _, address in addresses:
-            with socket.socket(family, kind, protocol) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-                probe.listen()
+        family, kind, protocol, _, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            probe.listen()
+        return socket.getnameinfo(address, socket.NI_NUMERICHOST | socket.NI_NUMERICSERV)[0]
+    except UnicodeError as error:  # a name that DNS cannot hold
+        raise ValueError(f"--host: expected an address of this machine, got {host!r} ({error})") from None
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise _in_use(host, port) from None
@@ -71,45 +127,44 @@ def _in_use(host: str, port: int) -> ValueError:
     return ValueError(f"--port: expected a free port, but {port} is in use on {host}; give another --port")
 
 
-def may_connect(host: str, origin: str | None, asked: str | None) -> bool:
-    """Whether a page may connect to the server.
-
-    Args:
-        host: address that the server listens on; any page may connect unless it is a loopback address.
-        origin: origin of the page, such as "http://127.0.0.1:8080"; None for programs other than browsers.
-        asked: host and port that the page connects to, such as "127.0.0.1:8080".
-    """
-    if host not in LOOPBACK or origin is None:
-        return True
-    parts = urlsplit(origin)
-    return parts.hostname in LOOPBACK and parts.netloc == asked
+def _url(address: str, port: int, token: str) -> str:
+    """Address to open; of all interfaces, the loopback one."""
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}" + (f"/?token={token}" if token else "")
 
 
-def _guard(server: "viser.ViserServer", host: str) -> None:
-    """Refuse pages of other servers, drop messages that the viewer does not use, and ignore invalid ones."""
-    websockets = server._websock_server
+def _accept_only_known(server: "viser.ViserServer") -> None:
+    """Drop messages that the viewer does not use, and ignore invalid ones."""
     server.get_event_loop().set_exception_handler(lambda _loop, context: log.debug("dropped: %s", context))
-    _accept_only(websockets)
-
-    async def admit(connection: "viser.infra.WebsockClientConnection") -> None:
-        _accept_only(connection)
-        socket = websockets._live_connections[connection.client_id]
-        assert socket.request is not None  # set by the handshake
-        headers = socket.request.headers
-        if not may_connect(host, headers.get("Origin"), headers.get("Host")):
-            await socket.close(1008, "the page is from another server")
-
-    websockets.on_client_connect(admit)
+    _filter(server._websock_server)
+    server._websock_server.on_client_connect(_filter)
 
 
-def _accept_only(handler: "viser.infra.WebsockMessageHandler") -> None:
-    """Make a viser message handler ignore all messages but `ACCEPTED`, and updates of properties but the value."""
+def _filter(handler: "viser.infra.WebsockMessageHandler") -> None:
+    """Make a viser message handler ignore all messages but valid ones of `ACCEPTED`."""
     handle = handler._handle_incoming_message
 
     async def accept(client_id: "viser.infra.ClientId", message: "viser.infra.Message") -> None:
-        name = type(message).__name__
-        if name in ACCEPTED and (name != "GuiUpdateMessage" or set(getattr(message, "updates", ())) == {"value"}):
+        if _is_valid(message):
             await handle(client_id, message)
 
     # viser has no public way to filter messages.
     handler._handle_incoming_message = accept  # type: ignore[method-assign]
+
+
+def _is_valid(message: "viser.infra.Message") -> bool:
+    """Whether a message is of a known type; updates may change the value only, cameras are finite numbers."""
+    name = type(message).__name__
+    if name == "GuiUpdateMessage":
+        return set(getattr(message, "updates", ())) == {"value"}
+    if name == "ViewerCameraMessage":
+        fields = {field: getattr(message, field) for field in CAMERA_FIELDS}
+        return all(_are_numbers(values, CAMERA_FIELDS[field]) for field, values in fields.items())
+    return name in ACCEPTED
+
+
+def _are_numbers(values: object, count: int | None) -> bool:
+    """Whether these are finite numbers: one if `count` is None, otherwise a list of as many."""
+    if count is None:
+        return isinstance(values, Real) and math.isfinite(values)
+    return isinstance(values, (list, tuple)) and len(values) == count and all(_are_numbers(x, None) for x in values)

@@ -1,5 +1,6 @@
 """One browser tab: its view, its settings, its camera path and the state of its picture."""
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,10 +24,13 @@ COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 PATH_COLOUR = (230, 70, 120)
 PLAY_FPS = 20
 MOST_FRUSTUMS = 500
+MOST_KEYFRAMES = 200
+MOST_SCREENSHOTS = 4  # requested and not drawn yet
+MOST_WAITING = 2000  # messages that a client has not taken yet, above which it gets no notifications
 
 
 class Session:
-    """The state of a client. viser's threads call its methods; another thread draws its pictures."""
+    """The state of a client. viser's event loop calls its methods; another thread draws its pictures."""
 
     def __init__(
         self,
@@ -36,6 +40,7 @@ class Session:
         settings: Settings,
         home: Viewpoint,
         wake: Callable[[], None],
+        waiting: Callable[[], int],
         save: Callable[[bytes], str] | None,
     ) -> None:
         """Add the panel and the frustums of a client.
@@ -47,18 +52,20 @@ class Session:
             settings: initial display settings.
             home: initial view.
             wake: called when a new picture is needed.
+            waiting: returns the number of messages that the client has not taken yet.
             save: writes a camera path into the run and returns the file's name; None only sends it to the browser.
         """
         self.client, self.world, self.cameras, self.home = client, world, cameras, home
-        self.settings, self.wake, self.save = settings, wake, save
+        self.settings, self.wake, self.waiting, self.save = settings, wake, waiting, save
         self.viewpoint: Viewpoint | None = None
         self.version = 0
         self.changed_at = time.perf_counter()
         self.drawn_version, self.drawn_step, self.drawn_scale, self.drawn_at = -1, -1, 0.0, 0.0
         self.screenshots: list[int] = []
+        self.has_download = False  # a file was sent and may not have arrived
         self.keyframes: list[Keyframe] = []
         self.closed = threading.Event()
-        self.playing = threading.Event()
+        self.playing = self.saving = False
         self.frustums: dict[str, viser.CameraFrustumHandle] = {}
         self.frustum_shape = (True, 1.0)
         size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs need even sizes
@@ -139,10 +146,12 @@ class Session:
     def _add_frustums(self) -> None:
         names = list(self.cameras)
         chosen = names[:: -(-len(names) // MOST_FRUSTUMS) or 1]
+        poses = np.array([camera_to_world(self.cameras[name]) for name in chosen]).reshape(-1, 4, 4)
+        self.places = self.world.to_browser(poses[:, :3, 3])
+        self.shown = np.ones(len(chosen), dtype=bool)
         self.group = self.client.scene.add_frame("/cameras", show_axes=False)
-        for name in chosen:
+        for name, pose, place in zip(chosen, poses, self.places, strict=True):
             camera = self.cameras[name]
-            pose = camera_to_world(camera)
             x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
             frustum = self.client.scene.add_camera_frustum(
                 f"/cameras/{name}",
@@ -153,7 +162,7 @@ class Session:
                 thickness_units="screen",
                 color=COLOURS.get(name.partition("/")[0], (160, 160, 160)),
                 wxyz=(w, x, y, z),
-                position=self.world.to_browser(pose[:3, 3]),
+                position=place,
                 format="jpeg",
                 cast_shadow=False,
                 receive_shadow=False,
@@ -161,7 +170,7 @@ class Session:
             frustum.on_click(partial(self._clicked, name))
             self.frustums[name] = frustum
 
-    def _clicked(self, name: str, _: object) -> None:
+    async def _clicked(self, name: str, _: object) -> None:
         self.jump(name)
 
     def show_thumbnail(self, name: str, pixels: np.ndarray) -> None:
@@ -184,21 +193,25 @@ class Session:
             return
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
         reach = 1.5 * FRUSTUM_SIZE * self.frustum_shape[1]
-        for frustum in list(self.frustums.values()):
-            far = bool(np.linalg.norm(frustum.position - eye) > reach)
-            if frustum.visible != far:
-                frustum.visible = far
+        far = np.linalg.norm(self.places - eye, axis=1) > reach
+        frustums = list(self.frustums.values())
+        for i in np.flatnonzero(far != self.shown):
+            frustums[i].visible = bool(far[i])
+        self.shown = far
 
     # Screenshot and path
 
     def take_screenshot(self, height: int) -> None:
-        """Request a picture of this height in pixels."""
-        self.screenshots.append(height)
-        self.wake()
+        """Request a picture of this height in pixels, unless `MOST_SCREENSHOTS` are requested already."""
+        if len(self.screenshots) < MOST_SCREENSHOTS:
+            self.screenshots.append(height)
+            self.wake()
 
     def add_keyframe(self) -> None:
         """Append the current view to the path."""
-        if self.viewpoint is not None:
+        if len(self.keyframes) >= MOST_KEYFRAMES:
+            self.tell(f"A path has at most {MOST_KEYFRAMES} views", "")
+        elif self.viewpoint is not None:
             self.keyframes.append(Keyframe(self.viewpoint.pose, self.viewpoint.fov))
             self._show_path()
 
@@ -232,36 +245,38 @@ class Session:
                 thickness_units="screen",
             )
 
-    def play(self, seconds: float, closed: bool) -> None:
+    async def play(self, seconds: float, closed: bool) -> None:
         """Move along the path once; if that is in progress, stop it.
 
         Args:
             seconds: duration.
             closed: return to the first view.
         """
-        if self.playing.is_set():
-            self.playing.clear()
+        if self.playing:
+            self.playing = False
             return
         try:
             way = interpolate(self.keyframes, max(round(seconds * PLAY_FPS), 2), closed)
         except ValueError:
             self.tell("Add at least two views first", "")
             return
-        self.playing.set()
+        self.playing = True
         self.panel.play.label = "Stop"
         self.client.scene.remove_by_name("/path")  # the line would cover the view
         start = time.perf_counter()
         for i, key in enumerate(way):
             self.go(key.pose, key.fov)
-            left = max(start + (i + 1) / PLAY_FPS - time.perf_counter(), 0.0)
-            if self.closed.wait(left) or not self.playing.is_set():
+            await asyncio.sleep(max(start + (i + 1) / PLAY_FPS - time.perf_counter(), 0.0))
+            if self.closed.is_set() or not self.playing:
                 break
-        self.playing.clear()
+        self.playing = False
         self.panel.play.label = "Play"
         self._show_path()
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
         """Send the path to the browser as a file, and write it into the run.
+
+        A request is ignored while the client has not received its previous file.
 
         Args:
             width: width of the frames, pixels.
@@ -273,15 +288,23 @@ class Session:
         if len(self.keyframes) < 2:
             self.tell("Add at least two views first", "")
             return
+        if self.saving or (self.has_download and self.waiting()):
+            return
+        self.saving = True
         try:
             content = path_json(self.keyframes, width, height, fps, seconds, closed)
             where = self.save(content) if self.save is not None else None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, MemoryError) as error:
             self.tell("The path was not saved", str(error))
             return
+        finally:
+            self.saving = False
+        self.has_download = True
         self.client.send_file_download("camera_path.json", content, save_immediately=True)
         self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
 
     def tell(self, title: str, text: str) -> None:
-        """Show a notification in the browser."""
+        """Show a notification in the browser, unless it takes no messages."""
+        if self.waiting() > MOST_WAITING:
+            return
         self.client.add_notification(title, text, auto_close_seconds=10.0)

@@ -1,11 +1,12 @@
 """The viewer: draws pictures for all connected browsers, on its own or between the steps of a training."""
 
-import contextlib
 import io
+import logging
 import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,20 +15,21 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
-from nexwarp.viewer import pacing
+from nexwarp.viewer import pacing, thumbnails
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
-from nexwarp.viewer.panel import set_value
 from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session
+from nexwarp.viewer.training_panel import TrainingPanel
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 
 if TYPE_CHECKING:
     import viser
 
-THUMBNAIL = 96  # pixels along the longer side
 SHARE = 0.2  # of a training's time for pictures, at the start
-TELL_SECONDS = 0.5  # between two updates of the status line
 DEFAULT_FOV = 0.9  # radians
+MOST_SENT = 2  # files on their way to clients, above which no screenshot is drawn: one may have 25 MB
+MOST_PATHS = 100  # written into the run
+log = logging.getLogger(__name__)
 
 
 class Viewer:
@@ -63,7 +65,7 @@ class Viewer:
         Raises:
             ValueError: the package viser is missing, or the address cannot be used.
         """
-        self.model, self.near, self.title, self.total = model, near, title, total
+        self.model, self.near, self.title = model, near, title
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos, self.save_path = photos, save_path
         self.world = World.around(list(self.cameras.values()), model().surfels.means)
@@ -73,13 +75,19 @@ class Viewer:
         self.sessions: dict[int, Session] = {}
         self.thumbnails: dict[str, np.ndarray] = {}
         self.step = 0
-        self.paused = False
-        self._told: tuple[float, int] | None = None
+        self.training: TrainingPanel | None = None
+        self._paths = 0
         self._news = threading.Event()
         self._lock = threading.Lock()
-        self.server = start_server(host, port)
-        self.url = f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{self.server.get_port()}"
+        self._photos_lock = threading.Lock()
+        self.web = start_server(host, port)
+        self.server, self.url = self.web.viser, self.web.url
         self._set_scene()
+        if total is not None:
+            self.training = TrainingPanel(self.server.gui, total, self.share, self._news.set)
+        self.server.on_client_disconnect(self._goodbye)
+        self.server.on_client_connect(self._welcome)
+        self.web.open()
 
     def __enter__(self) -> "Viewer":
         return self
@@ -91,8 +99,7 @@ class Viewer:
         """Disconnect all browsers and stop the server."""
         for session in list(self.sessions.values()):
             session.closed.set()
-        with contextlib.redirect_stdout(io.StringIO()):  # drops its message
-            self.server.stop()
+        self.web.stop()
 
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Draw pictures for the connected browsers until `stop()` returns True or Ctrl-C."""
@@ -106,7 +113,7 @@ class Viewer:
         """Draw pictures between two steps of a training; call it after each step.
 
         It costs nothing without connected browsers. While the training is paused, it returns only when the training is
-        resumed or `stop()` returns True.
+        resumed or `stop()` returns True. Errors of the viewer are logged: they do not end the training.
 
         Args:
             step: number of finished iterations.
@@ -114,17 +121,24 @@ class Viewer:
             stop: ends a pause.
         """
         self.step = step
-        if not self.sessions and not self.paused:
+        if self.training is None or not (self.sessions or self.training.paused):
             return
+        try:
+            self._serve(self.training, describe, stop)
+        except Exception as error:  # for example out of memory
+            log.warning("the viewer failed: %s", _one_line(error))
+            self.share.spend(time.perf_counter(), pacing.FIRST_SECONDS)
+
+    def _serve(self, training: TrainingPanel, describe: Callable[[], str], stop: Callable[[], bool]) -> None:
         now = time.perf_counter()
         if self.share.due(now):
-            self._tell(step, describe, now)
-            if self._draw_next(pacing.TRAINING_SECONDS):
-                end = time.perf_counter()
-                self.share.spend(end, min(end - now, pacing.LONGEST_WAIT))
-        if self.paused:
-            self._tell(step, describe, now, force=True)
-            while self.paused and not stop():
+            training.tell(self.step, describe, now)
+            seconds = self._draw_next(pacing.TRAINING_SECONDS)
+            if seconds is not None:
+                self.share.spend(time.perf_counter(), seconds)
+        if training.paused:
+            training.tell(self.step, describe, now, force=True)
+            while training.paused and not stop():
                 self._draw_or_wait()
 
     def finish(self, text: str, model: Callable[[], Model]) -> None:
@@ -138,34 +152,44 @@ class Viewer:
         for session in list(self.sessions.values()):
             session.drawn_version = -1  # its picture shows the previous model
         self._news.set()
-        self.paused = False
-        self.status.content = text
-        set_value(self.progress, 100.0)
-        for handle in (self.pause, self.share_slider):
-            handle.visible = False
+        if self.training is not None:
+            self.training.finish(text)
 
     # Drawing
 
     def _draw_or_wait(self) -> None:
         self._news.clear()
-        if not self._draw_next(None) and not self._draw_thumbnail():
+        if self._draw_next(None) is None and not self._draw_thumbnail():
             self._news.wait(0.05 if self.sessions else 0.5)
 
-    def _draw_next(self, longest: float | None) -> bool:
-        """Draw one picture, for the client that has waited longest; False if none is due. `longest` is in seconds."""
+    def _draw_next(self, longest: float | None) -> float | None:
+        """Draw one picture, for the client that has waited longest, of those that have taken their last one.
+
+        Args:
+            longest: largest predicted time of the picture, seconds; None for any. Screenshots take any time.
+
+        Returns:
+            The time for `Share`, seconds; None if no picture is due.
+        """
         for session in sorted(list(self.sessions.values()), key=lambda s: s.drawn_at):
+            if session.waiting():
+                continue
+            session.has_download = False
+            start = time.perf_counter()
+            is_first = _kind(session.settings) not in self.pace.seconds_per_pixel
             try:
-                if session.screenshots:
+                if session.screenshots and sum(s.has_download for s in self.sessions.values()) < MOST_SENT:
                     self._screenshot(session, session.screenshots.pop(0))
-                    return True
-                scale = self._due(session, longest, time.perf_counter())
-                if scale:
+                elif scale := self._due(session, longest, start):
                     self._draw(session, scale)
-                    return True
-            except (RuntimeError, ValueError) as error:  # for example out of memory; the other clients continue
+                else:
+                    continue
+            except Exception as error:  # for example out of memory; the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
-                session.tell("This picture could not be drawn", " ".join(str(error).split())[:300])
-        return False
+                session.tell("This picture could not be drawn", _one_line(error))
+            seconds = time.perf_counter() - start
+            return min(seconds, pacing.FIRST_SECONDS) if is_first else seconds
+        return None
 
     def _due(self, session: Session, longest: float | None, now: float) -> float:
         """Scale of the next picture of a client; 0 if none is due."""
@@ -173,7 +197,7 @@ class Viewer:
         if here is None:
             return 0.0
         kind, size = _kind(session.settings), (here.width, here.height)
-        finest = min(1.0, math.sqrt(pacing.MOST_PIXELS / (here.width * here.height)))
+        finest = pacing.limited(1.0, here.width, here.height)
         if longest is not None:
             finest = min(finest, self.pace.scale(kind, *size, longest))
         if session.version != session.drawn_version:
@@ -224,11 +248,13 @@ class Viewer:
         here, settings = session.viewpoint, session.settings
         if here is None:
             return
-        picture = self._picture(here, height / here.height, settings)
+        session.drawn_at = time.perf_counter()
+        picture = self._picture(here, pacing.limited(height / here.height, here.width, here.height), settings)
         assert picture is not None  # never stale
         file = io.BytesIO()
         Image.fromarray(picture.pixels).save(file, format="PNG")
         name = f"{self.title}_{settings.mode}.png".replace(" ", "_")
+        session.has_download = True
         session.client.send_file_download(name, file.getvalue(), save_immediately=True)
 
     def _draw_thumbnail(self) -> bool:
@@ -238,16 +264,11 @@ class Viewer:
         name = next((name for name in self.cameras if name not in self.thumbnails), None)
         if name is None:
             return False
-        camera = self.cameras[name]
-        here = Viewpoint(camera_to_world(camera), vertical_fov(camera), camera.width, camera.height)
-        model = self.model()
-        small = here.bands(min(THUMBNAIL / max(camera.width, camera.height), 1.0), self.near, model.surfels.means)
-        picture = draw(model, small, Settings(max_hits=model.options.max_hits))
-        assert picture is not None
+        pixels = thumbnails.of_camera(self.model(), self.cameras[name], self.near)
         with self._lock:
-            self.thumbnails[name] = picture.pixels
+            self.thumbnails[name] = pixels
             for session in self.sessions.values():
-                session.show_thumbnail(name, picture.pixels)
+                session.show_thumbnail(name, pixels)
         return True
 
     # The page
@@ -271,52 +292,21 @@ class Viewer:
         start.fov = self.home.fov
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         server.gui.set_panel_label(f"nexwarp · {self.title}")
-        if self.total is not None:
-            self._add_training()
-        server.on_client_disconnect(self._goodbye)
-        server.on_client_connect(self._welcome)
-
-    def _add_training(self) -> None:
-        from viser import Icon
-
-        gui = self.server.gui
-        with gui.add_folder("Training", order=0.0):
-            self.progress = gui.add_progress_bar(0.0)
-            self.status = gui.add_markdown("starting")
-            self.pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-            self.share_slider = gui.add_slider(
-                "Time for pictures",
-                5,
-                80,
-                5,
-                int(100 * SHARE),
-                hint="Percent of the training's time, while a browser is connected",
-            )
-        self.pause.on_click(lambda _: self._toggle_pause())
-        self.share_slider.on_update(lambda event: self.share.set(float(event.target.value)))
-
-    def _toggle_pause(self) -> None:
-        from viser import Icon
-
-        self.paused = not self.paused
-        self.pause.label = "Resume" if self.paused else "Pause"
-        self.pause.icon = Icon.PLAYER_PLAY if self.paused else Icon.PLAYER_PAUSE
-        self._news.set()
-
-    def _tell(self, step: int, describe: Callable[[], str], now: float, force: bool = False) -> None:
-        if not force and self._told is not None and now - self._told[0] < TELL_SECONDS:
-            return
-        how = "paused" if self.paused else "training"
-        if self._told is not None and not self.paused and now > self._told[0]:
-            how = f"{(step - self._told[1]) / (now - self._told[0]):.1f} it/s"
-        set_value(self.progress, 100.0 * step / max(self.total or 1, 1))
-        self.status.content = f"**{step:,}** of {self.total:,} · {how}  \n{describe()}"
-        self._told = (now, step)
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
-        if self.photos is not None and not self.thumbnails:
-            self.thumbnails = {name: _thumbnail(photo()) for name, photo in self.photos.items()}
-        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set, self.save_path)
+        try:
+            self._add_session(client)
+        except Exception as error:  # for example out of memory
+            log.warning("the viewer could not serve a browser tab: %s", _one_line(error))
+            client.add_notification("The viewer could not serve this tab: reload it", _one_line(error))
+
+    def _add_session(self, client: "viser.ClientHandle") -> None:
+        with self._photos_lock:  # one of the first clients reads the photos
+            if self.photos and not self.thumbnails:
+                self.thumbnails = thumbnails.of_photos(self.photos)
+        waiting = partial(self.web.waiting, client.client_id)
+        save = None if self.save_path is None else self._save_path
+        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set, waiting, save)
         with self._lock:
             if client.client_id not in self.server.get_clients():  # it has disconnected
                 return
@@ -324,6 +314,15 @@ class Viewer:
             for name, pixels in self.thumbnails.items():
                 session.show_thumbnail(name, pixels)
         self._news.set()
+
+    def _save_path(self, content: bytes) -> str:
+        """Write a camera path into the run; ValueError if too many are written."""
+        assert self.save_path is not None
+        with self._lock:
+            if self._paths >= MOST_PATHS:
+                raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
+            self._paths += 1
+        return self.save_path(content)
 
     def _settings(self) -> Settings:
         """Initial settings of a client: the model's own K."""
@@ -341,10 +340,6 @@ def _kind(settings: Settings) -> tuple[bool, int]:
     return settings.mode in TEXTURED, MAX_HITS if settings.mode == "hit count" else settings.max_hits
 
 
-def _thumbnail(photo: torch.Tensor) -> np.ndarray:
-    """Reduce a photo (H, W, 3) uint8 to at most `THUMBNAIL` pixels a side."""
-    from PIL import Image
-
-    image = Image.fromarray(photo.numpy())
-    image.thumbnail((THUMBNAIL, THUMBNAIL))
-    return np.asarray(image)
+def _one_line(error: Exception) -> str:
+    """The message of an error, or its type if it has none."""
+    return (" ".join(str(error).split()) or type(error).__name__)[:300]

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from nexwarp.camera import Camera
 from nexwarp.cameras.paths import focus
+from nexwarp.viewer.pacing import MOST_SIDE
 
 # The browser moves two units a second, so that it crosses a scene of this radius in three seconds.
 RADIUS = 3.0
-MAX_SIDE = 8192
 BAND_ROWS = 16  # rows of a tile
 
 FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
@@ -105,8 +105,8 @@ class Viewpoint:
             raise ValueError(f"camera: expected 10 finite numbers, got {values.tolist()}")
         if not 1e-3 < fov < math.pi - 1e-3 or np.abs(values[:4]).max() < 1e-6 or np.abs(values[4:7]).max() > 1e9:
             raise ValueError(f"camera: expected a rotation, a position and a field of view, got {values.tolist()}")
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise ValueError(f"camera: expected a canvas of 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+        if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
+            raise ValueError(f"camera: expected a canvas of 1 to {MOST_SIDE} pixels a side, got {width}x{height}")
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
         pose[:3, 3] = world.to_scene(values[4:7])

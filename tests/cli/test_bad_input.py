@@ -13,6 +13,7 @@ import torch
 
 from nexwarp.cli import main as cli
 from tests.cli.support import refused
+from tests.subprocesses import python_path
 from tests.test_scene import make_scene
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -180,7 +181,7 @@ def test_python_dash_m(tmp_path):
     """`python -m nexwarp` is the same program; of a mistake, one line is all that reaches the terminal."""
     command = [sys.executable, "-m", "nexwarp", "train", str(tmp_path / "no"), "--device", "cpu"]
     root = Path(__file__).parents[2]
-    environment = os.environ | {"PYTHONPATH": str(root)}
+    environment = os.environ | python_path(root)
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=120)
     assert done.returncode == 2
     assert (

@@ -157,17 +157,20 @@ def test_only_damaged_checkpoints_are_refused_and_left(finished, scene, capsys):
     assert snapshot(finished) == before
 
 
-@pytest.mark.parametrize("left", ["nothing", "half a config", "the config", "half a checkpoint"])
+@pytest.mark.parametrize("left", ["nothing", "half a config", "a lock", "the config", "half a checkpoint"])
 def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tmp_path, capsys, left):
     run = tmp_path / "run"
     run.mkdir()
     if left == "half a config":
-        (run / f".config.{2**22 + 1}.tmp.json").write_text("{")
+        (run / f".config.{2**22 + 1}-{0:016x}.tmp.json").write_text("{")
+    elif left == "a lock":
+        (run / "run.lock").write_text('{"process": 1, "host": "gone", "since": "then"}')
     elif left != "nothing":
         shutil.copy(trained / "config.json", run)
     if left == "half a checkpoint":
-        (run / "checkpoint.tmp").mkdir()
-        (run / "checkpoint.tmp" / "tensors.safetensors").write_bytes(b"\x10")
+        for name in ("checkpoint.tmp", f".checkpoint.{os.getppid()}-{7:016x}.tmp"):  # of 0.2.0, and of today
+            (run / name).mkdir()
+            (run / name / "tensors.safetensors").write_bytes(b"\x10")
     command = ["train", str(scene), "--run", str(run), *FLAGS, "--resume"]
     assert cli.main(command) == 0
     assert f"{run}: no checkpoint yet, training starts from the beginning" in capsys.readouterr().out
@@ -176,11 +179,20 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tm
 
 
 def test_resuming_removes_what_killed_processes_left(finished, scene):
-    mine = finished / "renders" / f".a.{os.getppid()}.tmp.png"  # of a process that lives
-    for file in (mine, finished / f".model.{2**22 + 1}.tmp.safetensors", finished / ".notes.tmp"):
-        file.touch()
+    """Of files that need the lock, all; of others, what is old and has no process here."""
+    alive, dead = (f"{process}-{0:016x}.tmp" for process in (os.getppid(), 2**22 + 1))
+    stays = [f"renders/.a.{alive}.png", f"renders/test/.b.{dead}.png", ".notes.tmp", f"mine/.c.{dead}.png"]
+    goes = [f".model.{alive}.safetensors", f"checkpoint/.state.{dead}.json", f"renders/.d.{dead}.png"]
+    goes += [f"export/.splats.{dead}.ply"]
+    for name in stays + goes:
+        (finished / name).parent.mkdir(exist_ok=True)
+        (finished / name).touch()
+        if name != stays[1]:
+            os.utime(finished / name, (0, 0))
+    before = snapshot(finished)
     assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
-    assert {f.name for f in finished.iterdir()} == RUN_FILES | {".notes.tmp"} and mine.exists()
+    assert before.keys() - snapshot(finished).keys() == set(goes)
+    assert not (finished / "export").exists()
 
 
 def test_a_run_whose_overwriting_was_killed_is_a_run_still(finished, scene, monkeypatch):

@@ -1,11 +1,18 @@
 """Which folders may become a run, and what of a run is never overwritten unasked."""
 
+import json
 import os
 import shutil
+from contextlib import nullcontext
 
 import pytest
 
 from nexwarp.cli import main as cli
+from nexwarp.cli import train
+from nexwarp.errors import RunError
+from nexwarp.run.contents import delete_files, list_files
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.run.lock import locked_run
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -36,13 +43,78 @@ def test_bad_input_does_not_overwrite(finished, tmp_path, capsys):
 
 
 def test_overwrite_replaces_a_run(finished, scene):
-    (finished / "renders" / "old.png").touch()
+    (finished / "renders" / "ellipse").mkdir()
+    (finished / "renders" / "ellipse" / "0007.png").touch()
     command = ["train", str(scene), "--run", str(finished), *FLAGS, "--iterations", "1", "--overwrite"]
     assert cli.main(command) == 0
-    assert {f.name for f in finished.iterdir()} == RUN_FILES - {"checkpoint.old"} and not (
-        finished / "renders" / "old.png"
-    ).exists()
+    assert {f.name for f in finished.iterdir()} == RUN_FILES - {"checkpoint.old"}
+    assert {f.name for f in (finished / "renders").iterdir()} == {"test", "compare"}
     assert read(finished, "metrics.json")["iterations"] == 1
+
+
+def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, capsys):
+    """Foreign files stay wherever they are, and links are not followed."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "0000.png").write_text("a picture")
+    (elsewhere / "model.safetensors").write_text("weights")
+    foreign = {
+        "notes.txt",
+        "camera_path_0.json",
+        "renders/mine.png",
+        "renders/test/view_000.txt",
+        "renders/test/drawing.png",
+        "renders/ellipse/cover.png",
+        "checkpoint/notes.txt",
+        "export/surfels.obj",
+        "mine/model.safetensors",
+        "mine/checkpoint/state.json",
+    }
+    for name in foreign:
+        (finished / name).parent.mkdir(parents=True, exist_ok=True)
+        (finished / name).write_text(name)
+    (finished / "renders" / "empty").mkdir()
+    (finished / "renders" / "spiral").symlink_to(elsewhere)
+    (finished / "model.safetensors").unlink()
+    (finished / "model.safetensors").symlink_to(elsewhere / "model.safetensors")
+    command = ["train", str(scene), "--run", str(finished), *FLAGS, "--iterations", "3", "--checkpoint-every", "1"]
+    for _ in range(2):
+        capsys.readouterr()
+        assert cli.main([*command, "--overwrite"]) == 0
+        out = capsys.readouterr().out
+        assert f"warning: {finished}: not deleted, as nexwarp did not write it: " in out and " more\n" in out
+        left = snapshot(finished)
+        kept = {f"checkpoint.kept_1/{n[11:]}" if n.startswith("checkpoint/") else n for n in foreign}
+        assert {left[name] for name in kept} == {name.encode() for name in foreign}
+        assert (finished / "renders" / "empty").is_dir() and (finished / "renders" / "spiral").is_symlink()
+        assert snapshot(elsewhere) == {"0000.png": b"a picture", "model.safetensors": b"weights"}
+    assert {name.split("/")[0] for name in left} == RUN_FILES | {"notes.txt", "camera_path_0.json", "mine"} | {
+        "checkpoint.kept_1",
+        "export",
+    }
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        '{"architectures": ["LlamaForCausalLM"], "hidden_size": 4096}',
+        "{}",
+        "[]",
+        '{"scene": {"path": "demo"',
+        "\0" * 90,
+    ],
+    ids=["another model's", "empty", "a list", "damaged", "zeros"],
+)
+def test_overwrite_refuses_the_config_of_something_else(scene, tmp_path, capsys, config):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "config.json").write_text(config)
+    (precious / "model.safetensors").write_text("years of training")
+    before = snapshot(precious)
+    command = ["train", str(scene), "--run", str(precious), *FLAGS, "--overwrite"]
+    words = "expected a run folder to overwrite", "config.json is damaged or not of a run", "nothing was deleted"
+    refused(capsys, command, str(precious), *words)
+    assert snapshot(precious) == before
 
 
 def test_overwrite_refuses_what_is_no_run(scene, tmp_path, capsys):
@@ -55,6 +127,57 @@ def test_overwrite_refuses_what_is_no_run(scene, tmp_path, capsys):
         command = ["train", str(scene), "--run", str(place), *FLAGS, "--overwrite"]
         refused(capsys, command, str(place), "expected a run folder to overwrite", "config.json")
     assert snapshot(precious) == {"thesis.tex": b"years of work"} and file.read_text() == "a file"
+
+
+def test_the_lock_is_free_while_a_viewer_shows_the_result(scene, tmp_path, monkeypatch):
+    """Others may evaluate the run then; during the training they may not."""
+    shown = []
+
+    class Viewer:
+        def between_steps(self, *_: object) -> None:
+            with pytest.raises(RunError, match="no other process writes"), locked_run(tmp_path / "run"):
+                pass
+
+        def finish(self, *_: object) -> None:
+            with locked_run(tmp_path / "run"):
+                shown.append(True)
+
+    monkeypatch.setattr(train.Train, "_viewer", lambda *_: nullcontext(Viewer()))
+    monkeypatch.setattr(train, "show_until_interrupted", lambda *_: None)
+    assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "1"]) == 0
+    assert shown
+
+
+def test_all_files_of_a_run_are_known(finished, scene, tmp_path):
+    """Whatever a command writes to a run folder, `--overwrite` knows as ours."""
+    paths = tmp_path / "tour.json"
+    for command in (
+        ["train", str(scene), "--run", str(finished), *FLAGS, "--overwrite", "--tensorboard"],
+        ["eval", str(finished), "--device", "cpu"],
+        ["export", str(finished)],
+        ["export", str(finished), "--format", "cameras"],
+        ["render", str(finished), "--set", "all", "--buffers", "--device", "cpu"],
+        ["render", str(finished), "--path", "ellipse", "--frames", "2", "--buffers", "--device", "cpu"],
+        ["render", str(finished), "--path", "interpolate", "--frames", "2", "--device", "cpu"],
+        ["render", str(finished), "--path", str(paths), "--device", "cpu"],
+    ):
+        if str(paths) in command:
+            shutil.copy(finished / "export" / "camera_path.json", paths)
+        assert cli.main(command) == 0
+    keep_camera_path(finished, b"{}")
+    (finished / "diverged.json").touch()
+    own, foreign = list_files(finished)
+    assert foreign == [] and set(own) == snapshot(finished).keys()
+    assert {"renders/train/view_001.exr", "renders/path_tour/0000.png", "camera_path_1.json"} <= set(own)
+    assert delete_files(finished) == [] and list(finished.iterdir()) == []
+
+
+def test_pictures_in_subfolders_are_known(tmp_path):
+    (tmp_path / "metrics.json").write_text(json.dumps({"views": {"left/a.b.jpg": {}, "../../c.jpg": {}, "": {}}}))
+    for name in ("left/a.b.png", "left/a.png", "c.png"):
+        (tmp_path / "renders" / "test" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "renders" / "test" / name).touch()
+    assert list_files(tmp_path)[0] == ["metrics.json", "renders/test/left/a.b.png"]
 
 
 def test_an_empty_folder_may_become_a_run(scene, tmp_path):

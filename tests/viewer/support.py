@@ -1,11 +1,13 @@
 """A viewer that serves, a client that speaks its protocol as a browser does, and cameras to look from."""
 
 import io
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -37,9 +39,8 @@ class Client:
 
         protocol = Subprotocol(f"viser-v{viser.__version__}")
         url = viewer.url.replace("http", "ws")
-        self.socket = connect(
-            url, subprotocols=[protocol], compression=None, max_size=None, max_queue=None, **arguments
-        )
+        settings = {"subprotocols": [protocol], "compression": None, "max_size": None, "max_queue": None} | arguments
+        self.socket = connect(url, **settings)
 
     def __enter__(self) -> "Client":
         return self
@@ -56,6 +57,15 @@ class Client:
         values = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -4), "fov": 0.8, "image_width": 96, "image_height": 72}
         values |= {"near": 0.01, "far": 1000.0, "look_at": (0, 0, 0), "up_direction": (0, -1, 0)}
         self.send("ViewerCameraMessage", **(values | changes))
+
+    @classmethod
+    def that_reads_nothing(cls, viewer: Viewer) -> "Client":
+        """A client behind small buffers whose messages wait at the server."""
+        url = urlsplit(viewer.url)
+        narrow = socket.socket()
+        narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**14)
+        narrow.connect((url.hostname, url.port))
+        return cls(viewer, sock=narrow, max_queue=1, close_timeout=0.1)
 
     def hear(self, seconds: float = 20.0) -> Iterator[dict[str, Any]]:
         """Messages as they come; TimeoutError after some time."""

@@ -60,8 +60,9 @@ def test_looking_changes_nothing_about_a_training(run):
             viewer.between_steps(step.iteration, describe)
             drawn.append(session.drawn_step)
             if step.iteration == 6:  # paused by somebody, resumed while it waits
-                viewer._toggle_pause()
-                threading.Timer(0.3, viewer._toggle_pause).start()
+                assert viewer.training is not None
+                viewer.training.toggle_pause()
+                threading.Timer(0.3, viewer.training.toggle_pause).start()
 
         watched.run(observe)
         assert len(set(drawn)) > 2 and described, "pictures came while it trained"
@@ -92,7 +93,8 @@ def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
         for i in range(1000):
             viewer.between_steps(i, lambda: pytest.fail("asked although nobody looks"))
         assert time.perf_counter() - start < 0.05, "less than 50 microseconds a step"
-        viewer._toggle_pause()
+        assert viewer.training is not None
+        viewer.training.toggle_pause()
         asked: list[int] = []
 
         def stop() -> bool:

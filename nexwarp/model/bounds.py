@@ -1,0 +1,100 @@
+"""Bounds of the values in files of models: within them every picture is finite."""
+
+from collections.abc import Iterator, Mapping
+
+import torch
+
+from nexwarp.camera import LARGEST_DISTANCE
+from nexwarp.checks import check_values
+from nexwarp.kernels.activate import SHORTEST
+from nexwarp.representation.detail_limits import NEVER
+from nexwarp.representation.texture import LARGEST_RESOLUTION
+
+LARGEST_HALF = 65504.0
+ROUNDING = 1 + 1e-6  # of the texture's resolutions
+
+# The exponential of 80 is finite in single precision; that of a large negative number is 0, which is a valid value.
+RAW = (-1e4, 80.0)
+
+BOUNDS: dict[str, tuple[float, float]] = {
+    "surfels.means": (-LARGEST_DISTANCE, LARGEST_DISTANCE),
+    "surfels.raw_quats": (-1e15, 1e15),
+    "surfels.log_scales": RAW,
+    "surfels.logit_opacities": (-1e4, 1e4),
+    "surfels.raw_gammas": RAW,
+    "surfels.sh0": (-1e6, 1e6),
+    "surfels.shN": (-1e6, 1e6),
+    "footprints": (0.0, NEVER),
+    "far_footprints": (0.0, NEVER),
+    "exposures.log_gains": (-20.0, 20.0),
+    "exposures.positions": (-LARGEST_DISTANCE, LARGEST_DISTANCE),
+    "exposures.directions": (-2.0, 2.0),
+    "exposures.coefficients": (-1e6, 1e6),
+    "exposures.mean": (-1e6, 1e6),
+    "exposures.lengths": (1e-15, LARGEST_DISTANCE),
+    "exposures.falloff": (-1e3, LARGEST_DISTANCE),
+    "texture.grid": (-LARGEST_HALF, LARGEST_HALF),
+    "texture.resolutions": (0.0, LARGEST_RESOLUTION * ROUNDING),
+}
+MATRICES = "texture.mlp."
+MATRIX_BOUNDS = (-LARGEST_HALF, LARGEST_HALF)
+LARGEST_LOG_LIGHT = 20.0  # logarithm of the largest factor of a lens's falloff
+SMALLEST_TANGENT = 1e-12  # squared, of a lens's falloff
+LARGEST_OUTPUT = 1e12  # of a layer of the texture's MLP
+
+
+def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
+    """Raise ValueError that names the tensor, the value and its range, if a model with these tensors could not render.
+
+    Args:
+        tensors: by their names in a model file, with the shapes of the format; other names are passed over.
+    """
+    tensors = {name: x.float() if x.dtype == torch.float16 else x for name, x in tensors.items()}
+    for name, tensor in tensors.items():
+        bounds = MATRIX_BOUNDS if name.startswith(MATRICES) else BOUNDS.get(name)
+        if bounds is not None:
+            check_values(name, tensor, *bounds)
+    if (quats := tensors.get("surfels.raw_quats")) is not None and len(quats):
+        lengths = quats.norm(dim=1)
+        if lengths.min() < SHORTEST:
+            where = int(lengths.argmin())
+            raise ValueError(f"surfels.raw_quats: expected a length of at least {SHORTEST:g}, got 0 at index {where}")
+    if (falloff := tensors.get("exposures.falloff")) is not None:
+        _check_falloff(*falloff.tolist())
+    _check_layers(tensors)
+
+
+def _check_falloff(a: float, b: float, largest: float) -> None:
+    if not largest >= SMALLEST_TANGENT:
+        raise ValueError(
+            f"exposures.falloff: expected a largest squared tangent of at least {SMALLEST_TANGENT:g}, got {largest:g}"
+        )
+    # The largest value of a t + b t^2 for t from 0 to 1 is at an end or, of a concave parabola, at its vertex.
+    vertex = -a * a / (4 * b) if b < 0 and 0 < -a / (2 * b) < 1 else 0.0
+    if max(a + b, vertex) > LARGEST_LOG_LIGHT:
+        raise ValueError(
+            f"exposures.falloff: expected a t + b t^2 of at most {LARGEST_LOG_LIGHT:g}, got a {a:g} and b {b:g}"
+        )
+
+
+def _check_layers(tensors: Mapping[str, torch.Tensor]) -> None:
+    """Raise ValueError if the grid's largest feature could make a layer of the MLP overflow."""
+    for name, largest in _largest_outputs(tensors):
+        if largest > LARGEST_OUTPUT:
+            raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
+
+
+def fits_half(tensors: Mapping[str, torch.Tensor]) -> bool:
+    """Whether no layer of the texture's MLP can overflow in half precision; the tensors are those of `check_bounds`."""
+    return all(largest <= LARGEST_HALF for _, largest in _largest_outputs(tensors))
+
+
+def _largest_outputs(tensors: Mapping[str, torch.Tensor]) -> Iterator[tuple[str, float]]:
+    """Yield the name of each matrix of the MLP, and a bound of the magnitude of its layer's outputs."""
+    if "texture.grid" not in tensors:
+        return
+    largest = tensors["texture.grid"].abs().max().item()
+    matrices = [name for name in tensors if name.startswith(MATRICES)]
+    for name in sorted(matrices, key=lambda name: int(name.split(".")[2])):
+        largest *= tensors[name].float().abs().sum(1).max().item()
+        yield name, largest

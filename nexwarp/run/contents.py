@@ -1,0 +1,164 @@
+"""Names of all files that nexwarp writes to a run folder: one list for their writers and for `--overwrite`."""
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
+from nexwarp.cameras.paths import PATHS
+from nexwarp.io.files import is_abandoned, is_temporary, remove_empty
+from nexwarp.io.json_files import READ_ERRORS, read_json
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
+
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.json"
+LOG_FILE = "metrics.jsonl"
+DIVERGED_FILE = "diverged.json"
+LOCK_FILE = "run.lock"
+CAMERA_PATH = "camera_path_{}.json"
+
+TENSORBOARD_FOLDER = "tensorboard"
+EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
+EXPORT_FOLDER = "export"
+SURFELS_FILE, SPLATS_FILE = "surfels.ply", "splats.ply"
+TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
+
+RENDERS_FOLDER = "renders"
+TRAIN, TEST, COMPARE = "train", "test", "compare"
+FILE_PATH = "path_{}"  # folder of the frames of a path from a file
+
+OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
+
+ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE)
+EXPORTS = (SURFELS_FILE, SPLATS_FILE, TRANSFORMS_FILE, CAMERA_PATH_FILE)
+PATTERN = re.compile(
+    "|".join(
+        [
+            *map(re.escape, ROOT_FILES),
+            re.escape(CAMERA_PATH).replace(r"\{\}", r"[1-9]\d*"),
+            *(re.escape(f"{EXPORT_FOLDER}/{name}") for name in EXPORTS),
+            rf"{RENDERS_FOLDER}/(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
+        ]
+    )
+)
+
+
+def picture_name(view: str) -> str:
+    """Return the file name of a view's rendering; a photo in a subfolder gives a name with the subfolder."""
+    return f"{Path(view).with_suffix('')}.png"
+
+
+def frame_name(index: int) -> str:
+    """Return the file name of a path's frame."""
+    return f"{index:04d}.png"
+
+
+def list_files(run: Path) -> tuple[list[str], list[str]]:
+    """Return the files below a run folder that have names of ours, and what else there is; links are not followed.
+
+    Names are relative to the folder. A foreign folder counts as one entry, with a slash at its end.
+    """
+    views = _view_pictures(run)
+    own: list[str] = []
+    foreign: list[str] = []
+    for name, entry in _entries(run):
+        if entry.is_dir(follow_symlinks=False):
+            if not _may_hold_ours(name):
+                foreign.append(f"{name}/")
+        else:
+            (own if _is_ours(name, views) else foreign).append(name)
+    return own, foreign
+
+
+def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
+    """Delete the files of a run, and the folders that this leaves empty; return what is left, as `list_files` does.
+
+    Args:
+        run: run folder.
+        keep: names of files of ours to keep.
+    """
+    own, foreign = list_files(run)
+    # The files of the run folder itself go last: until then they tell which pictures are ours.
+    own.sort(key=lambda name: "/" not in name)
+    folders = {run / name for name in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, RENDERS_FOLDER)}
+    for name in own:
+        if name not in keep:
+            (run / name).unlink()
+            folders |= {run / parent for parent in Path(name).parents[:-1]}
+    remove_empty(sorted(folders, reverse=True))
+    return foreign
+
+
+def remove_leftovers(run: Path) -> None:
+    """Remove the incomplete files that killed processes left; the caller holds the lock of the run folder.
+
+    Nobody else writes the files that need the lock. Pictures, exports and camera paths need none: a temporary file of
+    these stays while its process may be at work.
+    """
+    removed = set()
+    for name in list_files(run)[0]:
+        path = Path(name)
+        in_checkpoint = len(path.parts) > 1 and _is_aside(path.parts[0])
+        if in_checkpoint or (is_temporary(path.name) and (_needs_lock(name) or is_abandoned(run / name))):
+            (run / name).unlink(missing_ok=True)
+            removed |= {run / parent for parent in path.parents[:-1]}
+    remove_empty(sorted(removed | {f for f in run.iterdir() if _is_aside(f.name)}, reverse=True))
+
+
+def _entries(folder: Path, prefix: str = "") -> Iterator[tuple[str, os.DirEntry[str]]]:
+    """Yield the entries of a folder and of those subfolders that may hold files of ours, with their names."""
+    with os.scandir(folder) as found:
+        entries = sorted(found, key=lambda entry: entry.name)
+    for entry in entries:
+        name = prefix + entry.name
+        yield name, entry
+        if entry.is_dir(follow_symlinks=False) and _may_hold_ours(name):
+            yield from _entries(Path(entry.path), f"{name}/")
+
+
+def _is_aside(folder: str) -> bool:
+    """Whether a folder is a checkpoint that is being written."""
+    return folder == OLD_TEMPORARY or (folder.startswith(".checkpoint.") and is_temporary(folder))
+
+
+def _may_hold_ours(folder: str) -> bool:
+    top, _, rest = folder.partition("/")
+    if top == RENDERS_FOLDER:
+        return True
+    return not rest and (top in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER) or _is_aside(top))
+
+
+def _is_ours(name: str, views: set[str]) -> bool:
+    folder, _, base = name.rpartition("/")
+    if folder in CHECKPOINTS or _is_aside(folder):
+        return base in CHECKPOINT_FILES or is_temporary(base)
+    if folder == TENSORBOARD_FOLDER:
+        return base.startswith(EVENTS)
+    return name in views or is_temporary(base) or PATTERN.fullmatch(name) is not None
+
+
+def _needs_lock(name: str) -> bool:
+    """Whether a temporary file is one of a file that only the holder of the lock writes."""
+    folder, _, base = name.rpartition("/")
+    stems = (Path(file).stem for file in ROOT_FILES)
+    return folder in CHECKPOINTS or (not folder and any(base.startswith(f".{stem}.") for stem in stems))
+
+
+def _view_pictures(run: Path) -> set[str]:
+    """Return the names that renderings of the run's views have, as far as the run tells its views."""
+    views: set[str] = set()
+    for file, take in ((CAMERAS_FILE, lambda data: data.values()), (METRICS_FILE, lambda data: [data["views"]])):
+        try:
+            for group in take(read_json(run / file)):
+                views |= {str(name) for name in group}
+        except READ_ERRORS:  # there is none yet, or it is damaged
+            continue
+    pictures = {Path(picture_name(view)) for view in views if Path(view).name}
+    return {
+        f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
+        for group in (TRAIN, TEST, COMPARE)
+        for picture in pictures
+        for suffix in (".png", ".exr")
+    }

@@ -1,0 +1,134 @@
+"""Files are written under names that nobody can foresee, and are new: no link is ever written through."""
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from nexwarp.errors import StorageError
+from nexwarp.io import files
+from nexwarp.io.files import (
+    is_abandoned,
+    is_temporary,
+    make_folders,
+    sync,
+    temporary_name,
+    write_atomically,
+    written_aside,
+)
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.run.log import _open_log
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+
+
+def test_temporary_names_are_unpredictable_and_known_again(tmp_path):
+    names = {temporary_name(tmp_path / "a.b.json").name for _ in range(100)}
+    assert len(names) == 100 and all(is_temporary(name) and name.endswith(".tmp.json") for name in names)
+    assert is_temporary(temporary_name(tmp_path / "checkpoint").name)
+    for name in (
+        ".a.12.tmp.json",
+        ".notes.tmp",
+        "a.12-0123456789abcdef.tmp",
+        ".a.12-0123456789abcde.tmp",
+        ".a.tmp.b.c",
+    ):
+        assert not is_temporary(name), name
+
+
+def test_a_link_under_the_old_predictable_name_is_not_written_through(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("years of work")
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / f".config.{os.getpid()}.tmp.json").symlink_to(precious)
+    (run / "checkpoint.tmp").symlink_to(tmp_path / "elsewhere")
+    write_atomically(run / "config.json", b"{}")
+    save_checkpoint(run, {"x": torch.ones(1)}, {"iteration": 1})
+    assert precious.read_text() == "years of work" and not (tmp_path / "elsewhere").exists()
+    assert (run / "config.json").read_bytes() == b"{}" and load_checkpoint(run)[1] == {"iteration": 1}
+
+
+def test_a_temporary_file_is_always_a_new_one(tmp_path, monkeypatch):
+    """Even if the name were known: a link that stands there is an error, and stays."""
+    precious = tmp_path / "precious"
+    precious.write_text("years of work")
+    trap = tmp_path / ".file.1-0000000000000000.tmp"
+    trap.symlink_to(precious)
+    monkeypatch.setattr(files, "temporary_name", lambda _: trap)
+    with pytest.raises(StorageError, match="File exists"):
+        write_atomically(tmp_path / "file", b"new")
+    assert precious.read_text() == "years of work"
+
+
+def test_temporary_files_get_the_usual_permissions(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_atomically(tmp_path / "file", b"")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o640
+
+
+def test_long_names_leave_room_for_what_a_temporary_name_adds(tmp_path):
+    for stem in ("n" * 250, "é" * 125):
+        write_atomically(tmp_path / f"{stem}.png", b"")
+    assert len(os.listdir(tmp_path)) == 2
+
+
+def test_a_temporary_file_is_abandoned_when_it_is_old_and_its_process_is_gone(tmp_path):
+    def file(process: int, age: float) -> Path:
+        made = tmp_path / f".a.{process}-{0:016x}.tmp"
+        made.touch()
+        os.utime(made, (time.time() - age,) * 2)
+        return made
+
+    assert is_abandoned(file(2**22 + 1, 3600)) and is_abandoned(file(999_999_999, 3600))
+    assert not is_abandoned(file(2**22 + 1, 10))  # perhaps of another host
+    assert not is_abandoned(file(os.getppid(), 3600))
+    assert is_abandoned(file(os.getpid(), 3600))  # of an earlier process with this number: in a container all have one
+
+
+def test_a_log_is_not_appended_to_through_a_link(tmp_path):
+    (tmp_path / "precious").touch()
+    (tmp_path / "metrics.jsonl").symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match="symbolic links"):
+        _open_log(tmp_path / "metrics.jsonl")
+
+
+def test_new_folders_are_stored_from_the_top(tmp_path, monkeypatch):
+    synced: list[Path] = []
+    monkeypatch.setattr(files, "sync", synced.append)
+    a, b = tmp_path / "a", tmp_path / "a" / "b"
+    assert make_folders(b) == [b, a] and set(synced) == {tmp_path, a}
+    assert make_folders(b) == [] and len(synced) == 2
+
+
+def test_folders_of_a_failed_write_are_removed(tmp_path):
+    with pytest.raises(ValueError, match="mine"), written_aside(tmp_path / "a" / "b" / "file"):
+        raise ValueError("mine")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_may_not_be_read_is_not_synced(tmp_path, monkeypatch):
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refuse)
+        sync(tmp_path)
+        with pytest.raises(PermissionError):
+            (tmp_path / "file").write_bytes(b"")
+            sync(tmp_path / "file")
+
+
+def test_camera_paths_of_viewers_at_the_same_time_all_stay(tmp_path):
+    contents = [str(i).encode() for i in range(40)]
+    threads = [threading.Thread(target=keep_camera_path, args=(tmp_path, content)) for content in contents]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(f.read_bytes() for f in tmp_path.iterdir()) == sorted(contents)

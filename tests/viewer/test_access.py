@@ -1,0 +1,178 @@
+"""Who may open the viewer: Host, Origin and token, by the rules and against a running server."""
+
+import http.client
+from urllib.parse import urlsplit
+
+import pytest
+
+from nexwarp.viewer import Viewer
+from nexwarp.viewer.access import Access, is_loopback
+from nexwarp.viewer.server import check_server
+from tests.viewer.support import Client, serving
+
+LOCAL = Access(local=True, token="")
+OPEN = Access(local=False, token="secret")
+
+
+class Headers(dict[str, list[str]]):
+    """Headers of a request."""
+
+    def get_all(self, key: str) -> list[str]:
+        return self.get(key, [])
+
+
+def headers(host: str, origin: str | None = None, **others: str) -> Headers:
+    return Headers(
+        {"Host": [host]} | ({} if origin is None else {"Origin": [origin]}) | {k: [v] for k, v in others.items()}
+    )
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.0.0.2", "127.255.255.254", "::1", "::ffff:127.0.0.1"])
+def test_loopback_addresses(address):
+    assert is_loopback(address) and Access.to(address) == LOCAL
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "10.0.0.7", "::ffff:10.0.0.7", "fe80::1%eth0", "localhost", ""])
+def test_other_addresses_need_a_token_of_at_least_128_bits(address):
+    one, other = Access.to(address), Access.to(address)
+    assert not is_loopback(address) and one.token != other.token
+    assert len(one.token) >= 128 / 6, "6 bits a character"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:9000", "LocalHost", "127.0.0.2:8080", "[::1]:8080"])
+def test_own_pages_and_programs_may_connect(host):
+    assert LOCAL.refusal("/", headers(host)) is None, "no browser, or the page itself"
+    assert LOCAL.refusal("/", headers(host, f"http://{host}".lower())) is None
+
+
+@pytest.mark.parametrize(
+    "host, origin",
+    [
+        ("127.0.0.1:8080", "http://evil.example"),
+        ("127.0.0.1:8080", "https://127.0.0.1:8080"),
+        ("127.0.0.1:8080", "http://127.0.0.1:3000"),
+        ("127.0.0.1:8080", "http://localhost:8080"),
+        ("127.0.0.1:8080", "http://127.0.0.1:8080@evil.example"),
+        ("127.0.0.1:8080", "http://127.0.0.1:8080/"),
+        ("127.0.0.1:8080", "null"),
+        ("127.0.0.1:8080", ""),
+        ("127.0.0.1:8080", "127.0.0.1:8080"),
+    ],
+)
+def test_pages_of_other_origins_may_not(host, origin):
+    assert "page of another server" in str(LOCAL.refusal("/", headers(host, origin)))
+    token = "/?token=secret"
+    assert OPEN.refusal(token, headers(host)) is None and "page of another server" in str(
+        OPEN.refusal(token, headers(host, origin))
+    )
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example:8080", "127.0.0.1.evil.example", "0.0.0.0:8080", "10.0.0.7", "[::]:8080"]
+)
+def test_a_name_that_leads_here_is_refused_on_a_loopback_address(host):
+    """DNS rebinding: the page's Origin is its Host."""
+    for origin in (None, f"http://{host}"):
+        assert "this machine only" in str(LOCAL.refusal("/", headers(host, origin)))
+
+
+@pytest.mark.parametrize("hosts", [[], ["127.0.0.1", "127.0.0.1"], [""], ["a b/"], ["user@127.0.0.1"], ["127.0.0.1:x"]])
+def test_one_valid_host_is_needed(hosts):
+    assert "one header Host" in str(LOCAL.refusal("/", Headers({"Host": hosts})))
+
+
+def test_two_origins_are_refused():
+    both = Headers({"Host": ["localhost"], "Origin": ["http://localhost", "http://localhost"]})
+    assert LOCAL.refusal("/", both) is not None
+
+
+def test_the_token_is_in_the_url_or_the_cookie():
+    own = headers("lab.example:8080", "http://lab.example:8080")
+    assert OPEN.refusal("/?token=secret", own) is None
+    for target in (
+        "/",
+        "/?token=",
+        "/?token=secre",
+        "/?token=secret2",
+        "/?token=%FF",
+        "/secret",
+        "/?token=a&token=secret",
+    ):
+        assert "needs its token" in str(OPEN.refusal(target, own))
+        assert OPEN.cookie(target, own) is None
+    cookie = OPEN.cookie("/?token=secret", own)
+    assert cookie == "nexwarp_8080=secret; Path=/; HttpOnly; SameSite=Strict"
+    kept = cookie.split(";")[0]
+    assert OPEN.refusal("/", headers("lab.example:8080", Cookie=f"other=1; {kept}")) is None
+    for wrong in ("nexwarp_8080=wrong", "nexwarp_8081=secret", "nexwarp_8080", ""):
+        assert "needs its token" in str(OPEN.refusal("/", headers("lab.example:8080", Cookie=wrong)))
+    assert LOCAL.cookie("/?token=", headers("localhost")) is None
+
+
+def get(viewer: Viewer, path: str, **send: str) -> tuple[int, http.client.HTTPMessage, str]:
+    """Status, headers and text of a page."""
+    url = urlsplit(viewer.url)
+    connection = http.client.HTTPConnection(str(url.hostname), url.port, timeout=20)
+    try:
+        connection.request("GET", path, headers=send)
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read().decode()
+    finally:
+        connection.close()
+
+
+def refusal(viewer: Viewer, **arguments: object) -> str:
+    """The text with which a WebSocket is refused with 403."""
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus) as caught:
+        Client(viewer, **arguments)
+    assert caught.value.response.status_code == 403
+    return caught.value.response.body.decode()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "127.1", "LOCALHOST", "0"])
+def test_pages_of_other_servers_are_refused(model, host):
+    """By whatever name the address is given."""
+    with serving(model, host=host) as viewer:
+        assert "page of another server" in refusal(viewer, origin="http://evil.example")
+        status, _, text = get(
+            viewer, urlsplit(viewer.url)._replace(scheme="", netloc="").geturl() or "/", Origin="null"
+        )
+        assert status == 403 and "page of another server" in text
+        assert not viewer.sessions
+        own = viewer.url.partition("/?")[0]
+        with Client(viewer, origin=own) as client:
+            client.look()
+            assert client.picture().ndim == 3
+        if host != "0":
+            assert "token" not in viewer.url
+            rebound = {"Host": f"evil.example:{urlsplit(viewer.url).port}"}
+            assert get(viewer, "/", **rebound)[0] == 403
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_other_addresses_are_opened_with_the_token_only(model, host):
+    with serving(model, host=host) as viewer:
+        token = urlsplit(viewer.url).query
+        assert token.startswith("token=") and len(token) > 22
+        for path in ("/", "/?token=wrong", "/index.html"):
+            status, _, text = get(viewer, path)
+            assert status == 403 and "needs its token" in text and "html" not in text
+        status, sent, page = get(viewer, f"/?{token}")
+        assert status == 200 and "<html" in page
+        assert sent["Referrer-Policy"] == "no-referrer" and sent["Cache-Control"] == "no-store"
+        cookie = sent["Set-Cookie"].split(";")[0]
+        assert get(viewer, "/", Cookie=cookie)[0] == 200
+        own = viewer.url.partition("/?")[0]
+        viewer.url = own
+        assert "needs its token" in refusal(viewer, origin=own)
+        with Client(viewer, origin=own, additional_headers={"Cookie": cookie}) as client:
+            client.look()
+            assert client.picture().ndim == 3
+
+
+def test_the_address_that_is_bound_is_the_one_that_was_checked():
+    assert check_server("localhost", 0) == check_server("127.1", 0) == "127.0.0.1"
+    with pytest.raises(ValueError, match="--host: expected an address of this machine, got 'aaa"):
+        check_server("a" * 70, 0)

@@ -1,0 +1,285 @@
+"""What one client may cost: pictures, messages, connections and memory are bounded, and the other clients go on."""
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+import nexwarp as nw
+from nexwarp.errors import OutOfMemoryError
+from nexwarp.viewer import Viewer, connections, pacing
+from nexwarp.viewer import session as session_module
+from nexwarp.viewer import viewer as viewer_module
+from nexwarp.viewer.modes import Picture, draw
+from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
+from nexwarp.viewer.session import Session
+from tests.viewer.support import Client, ring, serving, wait_for
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+WINDOWS = [(1920, 1080), (8192, 8192), (8192, 1), (1, 8192), (1, 1), (8192, 100)]
+
+
+def session_of(viewer: Viewer) -> Session:
+    """The session of the client that came last."""
+    wait_for(lambda: bool(viewer.sessions))
+    return viewer.sessions[max(viewer.sessions)]
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("rows", [64, 2160])
+def test_pictures_have_at_most_8_megapixels(window, rows):
+    width, height = window
+    scale = limited(rows / height, width, height)
+    assert (width * scale) * (height * scale) <= MOST_PIXELS * 1.001 and max(window) * scale <= MOST_SIDE
+    assert scale == rows / height or limited(1.01 * scale, width, height) == scale, "as large as it may be"
+    pace = Pace()
+    assert pace.scale("new", width, height, 0.1) ** 2 * width * height <= max(FIRST_PIXELS, 32 * max(window))
+    assert pace.bands("new", MOST_PIXELS) == math.ceil(MOST_PIXELS / BAND_PIXELS), "a rendering has a bounded size"
+
+
+@pytest.mark.parametrize("window", [(8192, 1), (8192, 8192)])
+def test_screenshots_of_any_window_are_bounded(model, monkeypatch, window):
+    drawn: list[tuple[int, int]] = []
+
+    def record(model: nw.Model, bands: list[nw.Camera], *_: Any) -> Picture:
+        drawn.append((bands[0].width, sum(band.height for band in bands)))
+        assert all(band.height == 16 or band.width * band.height < 2 * BAND_PIXELS for band in bands)
+        return Picture(np.zeros((1, 1, 3), dtype=np.uint8))
+
+    monkeypatch.setattr(viewer_module, "draw", record)
+    with serving(model, photos={}) as viewer, Client(viewer) as client:
+        client.look(image_width=window[0], image_height=window[1])
+        session = session_of(viewer)
+        for _ in range(100):
+            session.take_screenshot(2160)
+            assert len(session.screenshots) <= session_module.MOST_SCREENSHOTS
+        wait_for(lambda: not session.screenshots and session.drawn_version == session.version)
+    assert max(width * height for width, height in drawn) <= 1.01 * MOST_PIXELS
+    assert max(max(size) for size in drawn) <= MOST_SIDE
+
+
+def test_a_flood_of_messages_is_read_at_a_bounded_rate_and_closed_if_it_goes_on(model, monkeypatch):
+    """A short one loses nothing."""
+    from websockets.exceptions import ConnectionClosed
+
+    with serving(model, photos={}) as viewer, Client(viewer) as good, Client(viewer) as flood:
+        good.look()
+        assert good.picture().ndim == 3
+        start, count = time.monotonic(), connections.BURST + 100
+        for i in range(count):
+            flood.look(position=(0, 0, -4 - i))
+        wait_for(lambda: len(viewer.sessions) == 2)
+        session = session_of(viewer)
+        eye = viewer.world.to_scene(np.array([0.0, 0.0, -4.0 - (count - 1)]))
+
+        def behind() -> bool:
+            assert session.viewpoint is not None
+            allowed = connections.BURST + connections.MESSAGES_A_SECOND * (time.monotonic() - start)
+            assert session.version <= allowed + 10
+            return not np.allclose(session.viewpoint.pose[:3, 3], eye)
+
+        good.look(position=(0.5, 0, -3))
+        assert good.picture().ndim == 3, "another client is served in the meantime"
+        wait_for(lambda: not behind())
+        monkeypatch.setattr(connections, "FLOOD_SECONDS", 0.2)
+        with suppress(ConnectionClosed):
+            for _ in range(2 * count):
+                flood.look()
+        wait_for(lambda: len(viewer.sessions) == 1)
+        good.look(position=(0.6, 0, -3))
+        assert good.picture().ndim == 3
+
+
+@pytest.fixture
+def heavy_pictures(monkeypatch) -> Iterator[list[int]]:
+    """Pictures of noise of a megapixel, drawn in no time; the client of each."""
+    noise = np.random.default_rng(0).integers(0, 256, (1000, 1000, 3), dtype=np.uint8)
+    drawn: list[int] = []
+    original = Viewer._draw
+
+    def count(viewer: Viewer, session: Session, scale: float) -> None:
+        drawn.append(session.client.client_id)
+        original(viewer, session, scale)
+
+    monkeypatch.setattr(Viewer, "_draw", count)
+    monkeypatch.setattr(viewer_module, "draw", lambda *_: Picture(noise))
+    yield drawn
+
+
+def test_a_client_that_reads_slowly_gets_few_pictures_and_is_closed(model, monkeypatch, heavy_pictures):
+    monkeypatch.setattr(connections, "SEND_SECONDS", 1.0)
+    with serving(model, photos={}) as viewer, Client(viewer) as good:
+        good.look()
+        assert good.picture().ndim == 3
+        with Client.that_reads_nothing(viewer) as slow:
+            slow.look()
+            wait_for(lambda: len(viewer.sessions) == 2)
+            mine, other = (viewer.sessions[number] for number in sorted(viewer.sessions))
+            other.take_screenshot(64)
+            end = time.monotonic() + 20.0
+            while heavy_pictures.count(mine.client.client_id) < 9:
+                assert time.monotonic() < end
+                for session in (mine, other):
+                    session._changed()
+                    session.tell("again", "and again")
+                next(good.hear())
+                assert other.waiting() <= session_module.MOST_WAITING + 5
+            assert heavy_pictures.count(other.client.client_id) <= 5
+            wait_for(lambda: len(viewer.sessions) == 1)
+        mine._changed()
+        assert good.picture().ndim == 3
+
+
+def test_200_clients_are_served_or_refused_with_a_reason(model):
+    from websockets.exceptions import InvalidStatus
+
+    served: list[Client] = []
+    reasons: list[str] = []
+    with serving(model, photos={}) as viewer:
+        try:
+            for _ in range(200):
+                try:
+                    served.append(Client(viewer))
+                except InvalidStatus as error:
+                    assert error.response.status_code == 503
+                    reasons.append(error.response.body.decode())
+            assert len(served) == connections.MAX_CLIENTS and len(reasons) == 200 - len(served)
+            assert set(reasons) == {
+                "the viewer serves at most 32 browser tabs: close one of them and reload this page\n"
+            }
+            for client in served:
+                client.look()
+            for client in served:
+                assert client.picture().ndim == 3
+        finally:
+            for client in served:
+                client.socket.close()
+        wait_for(lambda: not viewer.web.gate.clients)
+        with Client(viewer) as late:
+            late.look()
+            assert late.picture().ndim == 3
+
+
+def test_connections_that_say_nothing_are_bounded(model):
+    with serving(model, photos={}) as viewer:
+        url = urlsplit(viewer.url)
+        silent = [socket.create_connection((str(url.hostname), int(url.port or 0))) for _ in range(200)]
+        gate = viewer.web.gate
+        wait_for(lambda: len(gate.connections) == connections.MAX_CONNECTIONS)
+        time.sleep(0.1)
+        assert len(gate.connections) == connections.MAX_CONNECTIONS, "the others are closed"
+        for connection in silent:
+            connection.close()
+        wait_for(lambda: not gate.connections)
+        with Client(viewer) as client:
+            client.look()
+            assert client.picture().ndim == 3
+
+
+def test_large_messages_and_other_versions_close_their_connection(model, capfd):
+    from websockets.exceptions import ConnectionClosed
+
+    with serving(model, photos={}) as viewer, Client(viewer) as good:
+        for send, reason in ((b"\x00" * (connections.MAX_MESSAGE_BYTES + 1), "too big"), ("text", "1011")):
+            with Client(viewer) as bad, pytest.raises(ConnectionClosed, match=reason):
+                bad.socket.send(send)
+                list(bad.hear())
+        with Client(viewer, subprotocols=["viser-v0.0.1"]) as old, pytest.raises(ConnectionClosed, match="reload"):
+            list(old.hear())
+        good.look()
+        assert good.picture().ndim == 3
+    assert "ersion" not in capfd.readouterr().out, "a stranger prints nothing into the training's display"
+
+
+def test_paths_are_bounded(model, monkeypatch):
+    monkeypatch.setattr(session_module, "MOST_KEYFRAMES", 3)
+    monkeypatch.setattr(viewer_module, "MOST_PATHS", 2)
+    written: list[bytes] = []
+
+    def keep(content: bytes) -> str:
+        written.append(content)
+        return "kept"
+
+    with serving(model, photos={}, save_path=keep) as viewer, Client(viewer) as client:
+        client.look()
+        session = session_of(viewer)
+        for _ in range(10):
+            session.add_keyframe()
+        assert len(session.keyframes) == 3
+        for _ in range(5):
+            wait_for(lambda: not session.waiting())
+            session.save_path(64, 48, 30, 0.1, False)
+        notes = (m for m in client.hear() if m["type"] == "NotificationShowMessage")
+        assert "at most 3 views" in str(next(notes))
+        assert "at most 2 paths" in str(next(note for note in notes if "not saved" in str(note)))
+        assert len(written) == 2
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OutOfMemoryError("too little"), OSError("encoder"), KeyError("x")])
+@pytest.mark.parametrize("where", ["draw", "status", "welcome"])
+def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where):
+    def fail(*_: Any, **__: Any) -> Any:
+        raise error
+
+    pytest.importorskip("viser")
+    with Viewer(lambda: model, ring(), near=0.01, port=0, total=10) as viewer:
+        if where == "draw":
+            monkeypatch.setattr(viewer_module, "draw", fail)
+        if where == "welcome":
+            monkeypatch.setattr(viewer_module, "Session", fail)
+        with Client(viewer) as client:
+            client.look()
+            if where == "welcome":
+                note = next(m for m in client.hear() if m["type"] == "NotificationShowMessage")
+                assert "reload" in str(note) and not viewer.sessions
+            else:
+                wait_for(lambda: bool(viewer.sessions))
+            viewer.share.share = 0.9
+            for step in range(3):
+                wait_for(lambda: not any(s.waiting() for s in viewer.sessions.values()))
+                viewer.share.free_at = -math.inf
+                viewer.between_steps(step, fail if where == "status" else lambda: "fine")
+            if where == "draw":
+                note = next(m for m in client.hear() if m["type"] == "NotificationShowMessage")
+                assert "could not be drawn" in str(note)
+            monkeypatch.setattr(viewer_module, "draw", draw)
+            over = threading.Event()
+            if where != "welcome":
+                session_of(viewer).change(mode="alpha")
+                thread = threading.Thread(target=viewer.show, args=(over.is_set,))
+                thread.start()
+                try:
+                    assert client.picture().ndim == 3, "it recovers"
+                finally:
+                    over.set()
+                    thread.join()
+
+
+def test_a_screenshot_counts_in_full_for_the_share_of_time(model, monkeypatch):
+    """A first picture does not, since it includes compilation."""
+    pytest.importorskip("viser")
+
+    def slow(*arguments: Any) -> Any:
+        time.sleep(0.3)
+        return draw(*arguments)
+
+    monkeypatch.setattr(viewer_module, "draw", slow)
+    monkeypatch.setattr(pacing, "FIRST_SECONDS", 0.1)
+    with Viewer(lambda: model, ring(), near=0.01, port=0, total=10, photos={}) as viewer, Client(viewer) as client:
+        client.look()
+        session = session_of(viewer)
+        counted: list[float] = []
+        monkeypatch.setattr(viewer.share, "spend", lambda _, seconds: counted.append(seconds))
+        for _ in range(2):
+            wait_for(lambda: not session.waiting())
+            session.take_screenshot(64)
+            viewer.between_steps(1, lambda: "fine")
+        assert counted[0] == pacing.FIRST_SECONDS and counted[1] >= 0.3
