@@ -165,13 +165,27 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera], *, vignetting: boo
     """
     if len(seen.view) == 0:
         return None
-    stride = -(-len(seen.places) // MOST_CHECKED)
-    some = seen.of_points(np.arange(len(seen.places)) % stride == 0)
-    none, gains, both = np.mean([_errors_of(a, b, cameras) for a, b in _halves(some)], axis=0)
+    none, gains, both = held_out_errors(seen, cameras)
     with_lens = vignetting and both < (1 - MARGIN) * gains
     if (both if with_lens else gains) >= (1 - MARGIN) * none:
         return None
     return fit_exposures(seen, cameras, vignetting=with_lens)
+
+
+def held_out_errors(seen: Observations, cameras: Sequence[Camera]) -> tuple[float, float, float]:
+    """Return the errors at held-out halves of the points of no exposures, gains alone, and gains with a falloff.
+
+    Args:
+        seen: one observation or more; of many points, every n-th is taken.
+        cameras: cameras of the photos.
+
+    Returns:
+        Means of `held_out_error` over both halves along each principal axis.
+    """
+    stride = -(-len(seen.places) // MOST_CHECKED)
+    some = seen.of_points(np.arange(len(seen.places)) % stride == 0)
+    none, gains, both = np.mean([_errors_of(a, b, cameras) for a, b in _halves(some)], axis=0).tolist()
+    return none, gains, both
 
 
 def _halves(seen: Observations) -> list[tuple[Observations, Observations]]:
