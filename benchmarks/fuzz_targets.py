@@ -275,7 +275,7 @@ def _read_options(folder: Path) -> None:
     try:
         data: Any = read_object(folder / "options.json")
         render: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in dict(data["render"]).items()}
-        options = RenderOptions(**render)
+        options = RenderOptions().changed(**render)
         with_settings(Config(), parse_settings(str(x) for x in data["settings"]))
     except KeyError as error:
         raise ValueError(f"{folder}: {error}") from None

@@ -16,6 +16,7 @@ from nexwarp.representation import exposures as exposures_module
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.trainer import Trainer
+from tests.exposed import with_exposures
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
@@ -199,7 +200,7 @@ def test_of_very_many_photos_each_keeps_its_own_gains(
 
 def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
     """Finishing changes nothing of the training: steps are those of a training that was never finished."""
-    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60))
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60)))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=20, max_surfels=40, texture=texture)
     one, other = (Trainer(scene, config, "cpu") for _ in range(2))

@@ -18,9 +18,20 @@ from nexwarp.representation import exposures
 from nexwarp.representation.exposures import EVEN, Exposures
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.exposure_calibration import photo_gains
+from nexwarp.train.exposure_calibration import (
+    ExposureCalibration,
+    calibrate_exposures,
+    choose_fit,
+    fit_exposures,
+    observations,
+    photo_gains,
+)
+from nexwarp.train.losses import LossWeights
+from nexwarp.train.step_losses import as_taken, step_losses
+from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import TrainingViews
+from nexwarp.train.views import TrainingViews, mean_color
+from tests.exposed import exposure_at, with_exposures
 from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
@@ -128,6 +139,57 @@ def test_the_falloff_is_the_angle_s():
     assert torch.equal(present(exposures.falloff_of(cameras[0])), whole)
     with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
         Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
+
+
+def test_known_gains_are_found_beside_saturated_skies():
+    """To 2 %, though a third of each photo's points is clipped in the brighter photos; the points' colours too."""
+    gains = torch.linspace(-0.5, 0.5, 11)[:, None].expand(11, 3).double()
+    cameras, photos, points = photographs(gains)
+    sky = [torch.where((p > 0) & (torch.arange(48)[:, None, None] < 16), (p * 2.0).clamp(max=255), p) for p in photos]
+    seen = observations(cameras, [p.to(torch.uint8) for p in sky], points, None)
+    fit = present(choose_fit(seen, cameras))
+    assert np.abs(np.exp(fit.gains - gains.numpy()) - 1).max() < 0.02 and (fit.lens == 0).all()
+
+
+def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
+    """The demo, and points that are shaded by what lies around them, which looks like gains on one side alone."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=160, height=120, views=20, points=1500))
+    assert calibrate_exposures(scene, Config()) is None
+    cameras, photos, points = photographs(torch.zeros(8, 3))
+    even = observations(cameras, photos, points, None)
+    assert choose_fit(even, cameras) is None
+    side = np.where(even.places[even.point, 1] < 0.1, 1.0, -1.0)
+    shaded = even._replace(color=even.color + 0.1 * (side * np.linspace(-1, 1, 8)[even.view])[:, None])
+    assert abs(fit_exposures(shaded, cameras, vignetting=False).gains).max() > 0.02
+    assert choose_fit(shaded, cameras) is None
+
+
+def test_the_falloff_has_a_gate_of_its_own():
+    gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    for lens, expected in (((0.0, 0.0), False), ((-0.5, 0.0), True)):
+        cameras, photos, points = photographs(gains, 0.1, lens)
+        seen = observations(cameras, photos, points, None)
+        assert (present(choose_fit(seen, cameras)).lens != 0).any() == expected
+        assert (present(choose_fit(seen, cameras, vignetting=False)).lens == 0).all()
+
+
+def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
+    """Those of the scene without exposures, whatever the exposures of the photos; a point in no photo keeps its own."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
+    exposed = with_exposures(scene)
+    far = torch.tensor([[1e3, 0.0, 0.0]])
+    exposed = dataclasses.replace(
+        exposed,
+        points=torch.cat([exposed.points, far]),
+        colors=torch.cat([torch.zeros_like(exposed.colors), torch.tensor([[7, 8, 9]], dtype=torch.uint8)]),
+    )
+    colors = present(calibrate_exposures(exposed, Config())).colors
+    torch.testing.assert_close(colors[-1], torch.tensor([7.0, 8.0, 9.0]) / 255)
+    shown = (colors[:-1] > 0).any(1)
+    assert shown.float().mean() > 0.5
+    mean = float(np.exp(np.mean([np.log(exposure_at(view)) for view in scene.train])))
+    ratio = colors[:-1][shown] / (mean * scene.colors[shown] / 255).clamp_min(0.05)
+    assert ratio.median().item() == pytest.approx(1.0, abs=0.05)
 
 
 def test_photos_that_share_nothing_keep_their_colours():
@@ -240,20 +302,53 @@ def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff)
     assert_close(slots, buffers.textured, kind="value", name="sum over the slots")
 
 
-def test_photos_are_brought_to_one_exposure():
+def test_renderings_are_brought_to_the_photo_s_exposure():
+    """Photos stay as they are; their exposures are those of the reduced camera where photos are reduced."""
     camera = looking(0.0)
     image = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     views = [View(camera, image, None, name) for name in "ab"]
     gains = torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0]])
+    plain = TrainingViews(views, torch.device("cpu"))
     mine = TrainingViews(views, torch.device("cpu"), gains)
-    torch.testing.assert_close(mine.get(0, 1)[1], image / 255.0 / gains[0])
-    torch.testing.assert_close(mine.get(1, 1)[1], image / 255.0)
+    assert plain.exposure(0, 1) is None and torch.equal(present(mine.exposure(0, 1)), gains[0])
+    assert torch.equal(mine.get(0, 1)[1], image / 255.0)
     lens = Exposures.of(gains.log(), [camera, camera], (-0.3, -0.2, 0.4))
-    even = TrainingViews(views, torch.device("cpu"), gains, lens)
-    expected = image / 255.0 / gains[0] / present(lens.falloff_of(camera))
-    torch.testing.assert_close(even.get(0, 1)[1], expected)
-    halves = expected.view(24, 2, 32, 2, 3).mean((1, 3))
-    torch.testing.assert_close(even.get(0, 2)[1], halves)
+    dark = TrainingViews(views, torch.device("cpu"), gains, lens)
+    small, photo = dark.get(0, 2)
+    torch.testing.assert_close(photo, (image / 255.0).view(24, 2, 32, 2, 3).mean((1, 3)))
+    torch.testing.assert_close(present(dark.exposure(0, 2)), gains[0] * present(lens.falloff_of(small)))
+
+
+def test_brighter_than_a_saturated_pixel_is_no_error():
+    """Photos of one surface, two of them clipped: losses and gradients are 0 for its true colour."""
+    scene = random_scene()
+    camera, surfels = make_camera(scene), make_surfels(scene)
+    out = nw.render(surfels, make_texture(), camera)
+    image = torch.full_like(out.image, 0.8).requires_grad_()
+    textured = 0.8 * out.weights.sum(-1, keepdim=True).detach().expand_as(image)
+    for gain in (1.0, 1.5, 3.0):
+        photo = torch.full_like(image, 0.8 * gain).clamp(max=1.0)
+        target = Target(camera, photo, 0.0, torch.tensor([gain] * 3))
+        taken = as_taken(dataclasses.replace(out, image=image, textured=textured), target)
+        losses = step_losses(taken, target, surfels, make_texture(), Config(losses=LossWeights(alpha=0.0)))
+        assert losses["l1"] < 1e-6 and losses["dssim"] < 1e-4
+        (gradient,) = torch.autograd.grad(losses["l1"] + losses["dssim"], image)
+        assert (gradient == 0).all() or gain == 1.0
+        darker = as_taken(dataclasses.replace(out, image=0.3 * image), target)
+        (gradient,) = torch.autograd.grad((darker.image - photo).abs().mean(), image)
+        assert (gradient < 0).all()  # too dark: it is pulled up
+    assert as_taken(out, Target(camera, out.image.detach(), 0.0)) is out
+
+
+def test_the_mean_colour_is_that_of_the_mean_exposure():
+    cameras, generator = [looking(0.1 * i) for i in range(4)], torch.Generator().manual_seed(0)
+    gains = torch.tensor([[0.5], [0.8], [1.25], [2.0]]).expand(4, 3)
+    exposures_ = Exposures.of(gains.log(), cameras, (-0.3, -0.2, 0.4))
+    scene = 0.1 + 0.2 * torch.rand(48, 64, 3, generator=generator)
+    light = present(exposures_.falloff_of(cameras[0]))
+    views = [View(c, to_uint8(scene * g * light), None, "") for c, g in zip(cameras, gains, strict=True)]
+    calibration = ExposureCalibration(exposures_, gains, torch.zeros(0, 3))
+    assert mean_color(views, calibration) == pytest.approx(scene.mean((0, 1)).tolist(), abs=2e-3)
 
 
 def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
@@ -267,16 +362,8 @@ def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
 
 def test_training_takes_exposures_out(tmp_path):
     """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
-    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
-
-    def gain(view: View) -> float:
-        return 0.75 + 0.08 * view.camera.position[0].item()
-
-    def exposed(views: list[View]) -> list[View]:
-        return [dataclasses.replace(view, image=to_uint8(view.image / 255 * gain(view))) for view in views]
-
-    scene = dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
-    expected = torch.tensor([gain(view) for view in scene.train]).log()
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
+    expected = torch.tensor([exposure_at(view) for view in scene.train]).log()
     expected -= expected.mean()
     _, without = trained(scene, exposures=False)
     model, figure = trained(scene, exposures=True)
@@ -299,7 +386,7 @@ def test_training_takes_vignetting_out(tmp_path):
     scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
     camera = scene.test[0].camera
     even, without = trained(scene, vignetting=False)
-    assert present(even.exposures).falloff_of(camera) is None
+    assert even.exposures is None
     model, figure = trained(scene, vignetting=True)
     found = present(present(model.exposures).falloff_of(camera))
     assert (found - present(lens.falloff_of(camera))).abs().max() < 0.08
@@ -308,22 +395,20 @@ def test_training_takes_vignetting_out(tmp_path):
 
 def test_each_of_many_photos_has_its_own_gains(tmp_path, monkeypatch):
     """Renderings take theirs from some of the photos; training takes out what each has."""
-    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60))
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60)))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=20, max_surfels=40, texture=texture)
-    expected = Trainer(scene, config, "cpu").views.scales
+    expected = present(Trainer(scene, config, "cpu").views.gains)
     monkeypatch.setattr(exposures, "MOST_PHOTOS", 4)
     trainer = Trainer(scene, config, "cpu")
-    scales = trainer.views.scales
-    assert isinstance(expected, torch.Tensor) and isinstance(scales, torch.Tensor)
     assert len(present(trainer.exposures).log_gains) <= 4 < len(scene.train)
-    assert torch.equal(scales, expected) and expected.shape == (len(scene.train), 3)
+    assert torch.equal(present(trainer.views.gains), expected) and expected.shape == (len(scene.train), 3)
     trainer.run()
 
 
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
 def test_no_exposures_where_none_are_wanted(tmp_path, change):
-    scene = nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60))
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60)))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=2, max_surfels=40, texture=texture, **change)
     assert Trainer(scene, config, "cpu").finish().exposures is None

@@ -259,10 +259,11 @@ def scene_of_losses() -> dict[str, torch.Tensor]:
     return {name: x.clone().requires_grad_() for name, x in leaves.items()} | {"target": target}
 
 
-def terms_of(tensors: dict[str, torch.Tensor], **options: torch.Tensor) -> dict[str, torch.Tensor]:
+def terms_of(tensors: dict[str, torch.Tensor], **options: Any) -> dict[str, torch.Tensor]:
     factors = LossWeights(opacity=0.0, grid=0.0)
     rest: dict[str, Any] = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
-    return losses.training_losses(**tensors, **rest, loss_weights=factors, **options)
+    given: dict[str, Any] = {**tensors, **rest, **options}
+    return losses.training_losses(**given, loss_weights=factors)
 
 
 def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:

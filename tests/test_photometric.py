@@ -7,6 +7,7 @@ import torch
 from torch.autograd import gradcheck
 
 from nexwarp.kernels import launch
+from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops import photometric
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.train import losses
@@ -85,6 +86,27 @@ def test_terms_are_the_references(device: torch.device, slots: int, names: tuple
         if gradient is not None:
             assert gradient.dtype == dtype
             assert_close(gradient, wanted, kind="gradient", name=f"gradient to {name}")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_saturated_target_counts_no_brighter_value(device: torch.device, dtype: torch.dtype) -> None:
+    """Terms and gradients are those of values that equal the target there."""
+    saturation = 0.6
+    given = inputs()
+    image, textured, weights, target = given.values()
+    share = weights.sum(-1, keepdim=True) + WEIGHT_EPSILON
+    clipped = (target >= saturation) & (image > target), (target >= saturation) & (textured / share > target)
+    assert all(0 < x.sum() < x.numel() for x in clipped)
+    errors = (image - target).abs(), (textured / share - target).abs()
+    wanted = [error.masked_fill(mask, 0.0).mean() for error, mask in zip(errors, clipped, strict=True)]
+    leaves = moved(given, device, dtype)
+    actual = photometric_terms(*leaves.values(), l1=1.0, texture=1.0, saturation=saturation)[:2]
+    for term, expected in zip(actual, wanted, strict=True):
+        assert_close(present(term), expected, kind="value", name="term")
+    found = torch.autograd.grad(total(actual), [leaves[name] for name in NAMES])
+    expected_gradients = torch.autograd.grad(total(wanted), [given[name] for name in NAMES])
+    for name, gradient, expected in zip(NAMES, found, expected_gradients, strict=True):
+        assert_close(gradient, expected, kind="gradient", name=f"gradient to {name}")
 
 
 def test_gradients_against_finite_differences() -> None:

@@ -12,20 +12,22 @@ import pytest
 import torch
 
 import nexwarp as nw
+from benchmarks.peer_gsplat import PeerSettings
 from benchmarks.quality.__main__ import main
 from benchmarks.quality.jobs import TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import read_results
-from benchmarks.quality.rows import GSPLAT, ROWS, Row
+from benchmarks.quality.rows import GSPLAT, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
-from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, moved
+from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, inner_validation, moved, of_training_views
 from benchmarks.timing import ROOT
-from nexwarp.data import Scene
+from nexwarp.data import Scene, View
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
+from tests.narrowing import present
 from tests.tolerances import assert_close
 
 
@@ -220,3 +222,42 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
     assert ("interrupted: the same command does what is missing" in said) == (how == signal.SIGINT)
     assert not (tmp_path / "out.jsonl").exists()
+
+
+def test_validation_views_are_training_views(scene: Scene) -> None:
+    part = inner_validation(scene)
+    names = [view.name for view in scene.train]
+    assert [view.name for view in part.test] == names[::8]
+    assert sorted(view.name for view in (*part.test, *part.train)) == names
+
+
+def test_an_arc_starts_from_what_its_training_views_show(scene: Scene) -> None:
+    """Points of held-out photos alone are dropped; the others' colours hold nothing of a held-out photo."""
+    part = held_out_arc(scene)
+    shown = {tuple(point) for view in part.train for point in present(view.points).tolist()}
+    assert 0 < len(part.points) <= len(scene.points)
+    assert {tuple(point) for point in part.points.tolist()} <= shown
+    assert len(part.colors) == len(part.track_lengths) == len(part.reprojection_errors) == len(part.points)
+    held_out = {view.name for view in part.test}
+
+    def darkened(views: list[View]) -> list[View]:
+        return [dataclasses.replace(v, image=v.image * 0) if v.name in held_out else v for v in views]
+
+    dark = dataclasses.replace(
+        scene, train=darkened(scene.train), test=darkened(scene.test), colors=torch.zeros_like(scene.colors)
+    )
+    assert torch.equal(held_out_arc(dark).colors, part.colors)
+    here = {tuple(place): color for place, color in zip(scene.points.tolist(), scene.colors.tolist(), strict=True)}
+    before = torch.tensor([here[tuple(place)] for place in part.points.tolist()])
+    assert (part.colors.float() - before).abs().median() < 16
+    without = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
+    assert of_training_views(without) is without
+
+
+def test_settings_of_the_peers_are_checked() -> None:
+    for row in PEERS:
+        PeerSettings(**row.settings)
+    with pytest.raises(ValueError, match="strategy: expected default for 2dgs, got mcmc"):
+        PeerSettings(primitive="2dgs")
+    with pytest.raises(ValueError, match="primitive: expected one of 3dgs, 2dgs, got '4dgs'"):
+        PeerSettings(primitive="4dgs")

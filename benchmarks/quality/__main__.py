@@ -41,7 +41,7 @@ def _rows(texts: Iterable[str]) -> dict[str, Row]:
     rows = dict(ROWS)
     for text in texts:
         name, base, settings = text.split(":", 2)
-        row = Row(name, base or "default", json.loads(settings or "{}")) if base != "gsplat" else Row(name, None)
+        row = Row(name, None if base == "gsplat" else base or "default", json.loads(settings or "{}"))
         if rows.setdefault(name, row) != row:
             raise ValueError(f"--row: expected a name that no other row has, got {name}")
     return rows
@@ -58,7 +58,8 @@ def _wanted_jobs(given: argparse.Namespace, rows: Mapping[str, Row]) -> list[Tra
     for table in filter(None, (given.tables or "").split(",")):
         for job in table_jobs(table, scenes, seeds, given.iterations, given.size):
             if job.row in only:
-                wanted[dataclasses.replace(job, downscale=given.downscale)] = None
+                job = dataclasses.replace(job, downscale=given.downscale, variant=job.variant or given.variant)
+                wanted[job] = None
     for name in (text.split(":", 1)[0] for text in given.row or ()):
         for scene in scenes:
             for seed in seeds:
@@ -136,7 +137,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     add("--tables", help=f"comma-separated: {', '.join(TABLES)}; arc: a held-out arc of neighbouring views")
     add("--only", help="comma-separated rows of the tables; default: all of them")
     add("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
-    add("--variant", default="", choices=("", *VARIANTS), help="of the scene, for --row; arc: a held-out arc")
+    add("--variant", default="", choices=("", *VARIANTS), help="of the scenes; inner: validation views")
     add(
         "--scenes",
         default=",".join(SCENES),

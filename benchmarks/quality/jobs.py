@@ -5,12 +5,24 @@ import json
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from benchmarks.quality.rows import CHANGES, DEFAULT, DEMO_CONFIG, DEMOS, HITS, NO_TEXTURE, PAPER, PEER, REMOVALS, Row
+from benchmarks.quality.rows import (
+    CHANGES,
+    DEFAULT,
+    DEMO_CONFIG,
+    DEMOS,
+    HITS,
+    NO_TEXTURE,
+    PAPER,
+    PEER,
+    PEERS,
+    REMOVALS,
+    Row,
+)
 from nexwarp.train.config import Config
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
 
-SCENES = ("fox", "saharov", "kitchen25")
+SCENES = ("train", "fox", "saharov", "kitchen25")
 DEMO = "demo"  # the built-in scene
 TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames", "demo")
 CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
@@ -71,7 +83,7 @@ def table_jobs(
     sizes: tuple[int, ...] = (size,)
     variants: tuple[str, ...] = ("",)
     if table == "peers":
-        rows, sizes = (DEFAULT, PEER), (size, size // 4)
+        rows, sizes = (DEFAULT, *PEERS), (size, size // 4)
     elif table == "curve":
         rows, sizes, scenes = (DEFAULT, PEER), CURVE, ("fox",)
     elif table == "paper":

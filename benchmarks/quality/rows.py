@@ -16,7 +16,7 @@ class Row:
     Attributes:
         name: as the tables print it.
         preset: of nexwarp; None trains gsplat.
-        settings: changes of the preset, by the names of `--set`.
+        settings: changes of the preset, by the names of `--set`; of gsplat those of `peer_gsplat.PeerSettings`.
     """
 
     name: str
@@ -26,7 +26,18 @@ class Row:
 
 PAPER = Row("paper", "paper")
 DEFAULT = Row("default")
+# gsplat as its examples have it, and with what our default has and they lack.
 PEER = Row(GSPLAT, None)
+_BACKGROUND = {"background": True}
+_EXPOSED = _BACKGROUND | {"exposures": True}
+PEERS = (
+    PEER,
+    Row("gsplat MCMC, background", None, _BACKGROUND),
+    Row("gsplat MCMC, exposures", None, _EXPOSED),
+    Row("gsplat MCMC, even start", None, _EXPOSED | {"even_start": True}),
+    Row("gsplat default", None, _BACKGROUND | {"strategy": "default"}),
+    Row("gsplat 2DGS", None, _BACKGROUND | {"strategy": "default", "primitive": "2dgs"}),
+)
 NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
 # The ablations of the paper.
 REMOVALS = (
@@ -66,4 +77,4 @@ DEMO_CONFIG = with_settings(preset("default"), DEMO_SETTINGS)
 _SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
 _AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_CONFIG.rates.mlp[0],) * 2}
 DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
-ROWS = {row.name: row for row in (DEFAULT, PAPER, PEER, *REMOVALS, *HITS, *CHANGES, *DEMOS)}
+ROWS = {row.name: row for row in (DEFAULT, PAPER, *PEERS, *REMOVALS, *HITS, *CHANGES, *DEMOS)}

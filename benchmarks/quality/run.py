@@ -103,7 +103,7 @@ def run_job(
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     if row.preset is None:
-        trained = _train_gsplat(job, scene, device)
+        trained = _train_gsplat(job, row, scene, device)
     else:
         trained = _train_nexwarp(job, row, scene, device, models, start)
     peak = {}
@@ -200,17 +200,18 @@ def _restore(trainer: Trainer, folder: Path) -> None:
         trainer.restore(Path(own))
 
 
-def _train_gsplat(job: TrainingJob, scene: Scene, device: torch.device) -> Trained:
+def _train_gsplat(job: TrainingJob, row: Row, scene: Scene, device: torch.device) -> Trained:
     from benchmarks import peer_gsplat
 
     begin = time.perf_counter()
-    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device)
+    settings = peer_gsplat.PeerSettings(**row.settings)
+    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device, settings)
     if device.type == "cuda":
         torch.cuda.synchronize()
     seconds = time.perf_counter() - begin
 
     def image(camera: Camera) -> torch.Tensor:
-        return gaussians.render(camera.to(device))[0]
+        return gaussians.image(camera.to(device))
 
     with torch.no_grad():
         renderings = [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
@@ -218,6 +219,7 @@ def _train_gsplat(job: TrainingJob, scene: Scene, device: torch.device) -> Train
         "primitives": len(gaussians.splats["means"]),
         "megabytes": gaussians.megabytes,
         "seconds": seconds,
+        "train_psnr": train_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
     }
     return Trained(renderings, facts)

@@ -10,8 +10,41 @@ from benchmarks.quality.jobs import DEMO, TrainingJob
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
+from nexwarp.data.scene import TEST_EVERY
 
 ARC_VIEWS = 8
+
+
+def inner_validation(scene: Scene) -> Scene:
+    """Hold out every 8th training view, to choose settings by; the test views are left out."""
+    test = scene.train[::TEST_EVERY]
+    train = [view for index, view in enumerate(scene.train) if index % TEST_EVERY]
+    return dataclasses.replace(scene, train=train, test=test)
+
+
+def of_training_views(scene: Scene) -> Scene:
+    """Drop points that no training view was used for, and take the others' colours from training photos alone.
+
+    Structure from motion saw all photos: its points and their colours tell of places that only test photos show.
+    Scenes whose views do not say which points they show stay as they are.
+    """
+    rows = {place.tobytes(): row for row, place in enumerate(scene.points.numpy())}
+    sums, counts = torch.zeros(len(scene.points), 3), torch.zeros(len(scene.points))
+    for view in scene.train:
+        if view.points is None:
+            return scene
+        pixels, depths = view.camera.project(view.points)
+        size = torch.tensor([view.camera.width, view.camera.height])
+        inside = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(1)
+        found = torch.tensor([rows.get(place.tobytes(), -1) for place in view.points[inside].numpy()])
+        column, line = pixels[inside].long()[found >= 0].unbind(1)
+        found = found[found >= 0]
+        sums.index_add_(0, found, view.image[line, column].float())
+        counts.index_add_(0, found, torch.ones(len(found)))
+    seen = counts > 0
+    colors = (sums[seen] / counts[seen, None]).round().to(torch.uint8)
+    points = {name: getattr(scene, name)[seen] for name in ("points", "track_lengths", "reprojection_errors")}
+    return dataclasses.replace(scene, colors=colors if scene.colors.dtype == torch.uint8 else colors / 255, **points)
 
 
 def held_out_arc(scene: Scene) -> Scene:
@@ -19,7 +52,8 @@ def held_out_arc(scene: Scene) -> Scene:
     views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
     first = (len(views) - ARC_VIEWS) // 2
     test = views[first : first + ARC_VIEWS]
-    return dataclasses.replace(scene, train=views[:first] + views[first + ARC_VIEWS :], test=test)
+    train = views[:first] + views[first + ARC_VIEWS :]
+    return of_training_views(dataclasses.replace(scene, train=train, test=test))
 
 
 def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
@@ -44,6 +78,7 @@ def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] =
 
 
 VARIANTS = {
+    "inner": inner_validation,
     "arc": held_out_arc,
     "x100": lambda scene: moved(scene, factor=100.0),
     "moved": lambda scene: moved(scene, shift=(1000.0, 0.0, 0.0)),

@@ -60,7 +60,7 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:
         data = read_json(path)
         check_version(data.get("format_version", 1), CAMERAS_VERSION)
         groups = {group: data[group] for group in SETS if group in data}
-        if not groups:
+        if data and not groups:
             raise ValueError(f"expected {' or '.join(SETS)}, found neither")
         check_range("number of cameras", sum(len(members) for members in groups.values()), 0, MAX_CAMERAS)
         return {

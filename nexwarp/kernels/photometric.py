@@ -2,7 +2,8 @@
 
 With S = sum_k W, a pixel's share is |image - target|, |textured / (S + eps) - target| (both summed over the channels)
 and 1 - S, each times a scale, which holds the term's factor and the number of values. One thread a pixel; a term whose
-output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0.
+output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0. A
+channel whose target is at least `saturation` has a difference of 0 from any brighter value.
 """
 
 import functools
@@ -31,6 +32,18 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         return vec3(sign(x[0]), sign(x[1]), sign(x[2]))
 
     @wp.func
+    def channel_difference(x: real, y: real, saturation: real):
+        return wp.where(y >= saturation and x > y, ZERO, x - y)
+
+    @wp.func
+    def difference(x: vec3, y: vec3, saturation: real):
+        return vec3(
+            channel_difference(x[0], y[0], saturation),
+            channel_difference(x[1], y[1], saturation),
+            channel_difference(x[2], y[2], saturation),
+        )
+
+    @wp.func
     def distance(x: vec3):
         return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
 
@@ -49,6 +62,7 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         weights: wp.array2d(dtype=real),
         target: wp.array(dtype=vec3),
         scales: vec3,
+        saturation: real,
         # outputs
         l1: wp.array(dtype=real),
         texture: wp.array(dtype=real),
@@ -57,9 +71,9 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         p = first + wp.tid()
         weight = total(weights, p)
         if l1:
-            l1[p] = distance(image[p] - target[p]) * scales[0]
+            l1[p] = distance(difference(image[p], target[p], saturation)) * scales[0]
         if texture:
-            texture[p] = distance(textured[p] / (weight + EPS) - target[p]) * scales[1]
+            texture[p] = distance(difference(textured[p] / (weight + EPS), target[p], saturation)) * scales[1]
         if alpha:
             alpha[p] = (ONE - weight) * scales[2]
 
@@ -71,6 +85,7 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         weights: wp.array2d(dtype=real),
         target: wp.array(dtype=vec3),
         scales: vec3,
+        saturation: real,
         grad_l1: wp.array(dtype=real),
         grad_texture: wp.array(dtype=real),
         grad_alpha: wp.array(dtype=real),
@@ -81,12 +96,12 @@ def photometric_kernels(real: type) -> SimpleNamespace:
     ):
         p = first + wp.tid()
         if grad_image:
-            grad_image[p] = signs(image[p] - target[p]) * (grad_l1[0] * scales[0])
+            grad_image[p] = signs(difference(image[p], target[p], saturation)) * (grad_l1[0] * scales[0])
         change = real(0.0)
         if grad_texture:
             divisor = total(weights, p) + EPS
             color = textured[p] / divisor
-            grad = signs(color - target[p]) * (grad_texture[0] * scales[1]) / divisor
+            grad = signs(difference(color, target[p], saturation)) * (grad_texture[0] * scales[1]) / divisor
             change -= wp.dot(grad, color)
             if grad_textured:
                 grad_textured[p] = grad

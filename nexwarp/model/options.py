@@ -8,6 +8,7 @@ from typing import Literal, TypedDict, get_args
 from typing_extensions import Unpack
 
 from nexwarp.checks import check_range
+from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS
 
 Exposure = Literal["photos", "mean"]
@@ -75,5 +76,5 @@ class RenderOptions:
         known = [field.name for field in dataclasses.fields(self)]
         for name in changes:
             if name not in known:
-                raise TypeError(f"{name}: expected one of the options {', '.join(known)}")
+                raise TypeError(f"{one_line(name, 60)}: expected one of the options {', '.join(known)}")
         return dataclasses.replace(self, **changes)

@@ -1,5 +1,6 @@
 """The losses that compare pixel by pixel, several in one go."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -22,6 +23,7 @@ def photometric_terms(
     l1: float = 0.0,
     texture: float = 0.0,
     alpha: float = 0.0,
+    saturation: float | None = None,
 ) -> tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor | None]:
     """Return the L1, texture and alpha terms of `nexwarp.train.losses`, each times its factor.
 
@@ -35,6 +37,7 @@ def photometric_terms(
         l1: factor of the mean of |image - target|.
         texture: factor of the mean of |textured / (sum_k W + 1e-6) - target|.
         alpha: factor of the mean of 1 - sum_k W.
+        saturation: a channel of `target` from here on counts as any brighter value; None counts none so.
 
     Returns:
         Three scalars; None, at no cost, for a factor of 0.
@@ -55,7 +58,7 @@ def photometric_terms(
     if "target" in read and read["target"][0].requires_grad:
         raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
     tensors = [read[name][0].contiguous() if name in read else None for name in wanted]
-    return _Photometric.apply((l1, texture, alpha), *tensors)
+    return _Photometric.apply((l1, texture, alpha), math.inf if saturation is None else saturation, *tensors)
 
 
 def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Argument]:
@@ -66,18 +69,22 @@ def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Argument
 
 class _Context(Context):
     scales: tuple[float, float, float]
+    saturation: float
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: _Context, factors: Factors, *tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+    def forward(
+        ctx: _Context, factors: Factors, saturation: float, *tensors: torch.Tensor | None
+    ) -> tuple[torch.Tensor | None, ...]:
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
         ctx.scales = (factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
+        ctx.saturation = saturation
         maps = like.new_empty(sum(factor != 0.0 for factor in factors), pixels)
         rows = iter(maps)
         outputs = [array(next(rows), real) if factor else None for factor in factors]
-        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales)]
+        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), real(saturation)]
         launch(like, photometric_kernels(real).forward, pixels, inputs, outputs)
         ctx.save_for_backward(*tensors)  # type: ignore[arg-type]  # torch saves None too
         ctx.set_materialize_grads(False)
@@ -91,9 +98,9 @@ class _Photometric(torch.autograd.Function):
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
         l1, texture, alpha = (grad is not None for grad in grads)
-        reached = zip(tensors, ctx.needs_input_grad[1:], (l1, texture, texture or alpha, False), strict=True)
+        reached = zip(tensors, ctx.needs_input_grad[2:], (l1, texture, texture or alpha, False), strict=True)
         results = [torch.empty_like(x) if needed and term else None for x, needed, term in reached]
         incoming = [None if grad is None else array(grad.reshape(1), real) for grad in grads]
-        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), *incoming]
+        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), real(ctx.saturation), *incoming]
         launch(like, photometric_kernels(real).backward, pixels, inputs, _arrays(real, results[:3]))
-        return None, *results
+        return None, None, *results

@@ -35,13 +35,14 @@ def train(
         device: where to train; None is CUDA where there is a device, else the CPU.
         callbacks: functions that are called with a `StepReport` after each step. One that raises stops the training;
             its exception is passed on. After divergence, steps are repeated and reported again.
-        losses: own losses by name: functions of the step's `Rendering` and `Target` (`target.photo` (H, W, 3),
-            `target.camera`, `target.background`, `target.counts`) that return a scalar tensor. They are added to ours
-            as they are, so that factors are their own business, and appear in `StepReport.losses` by their names. In
-            border steps, the photo's edge is repeated beyond its frame, where `counts` is False. On CUDA, steps are
-            captured as CUDA graphs and replayed: a loss may then depend on tensors, which it reads in place, but not on
-            numbers that change in Python; set `config.cuda_graphs` to False for such a loss. A step with a loss that
-            cannot be captured, such as one that calls `item()`, warns, and all steps are launched kernel by kernel.
+        losses: own losses by name: functions of the step's `Rendering`, at the photo's exposure, and its `Target`
+            (`target.photo` (H, W, 3), `target.camera`, `target.background`, `target.counts`) that return a scalar
+            tensor. They are added to ours as they are, so that factors are their own business, and appear in
+            `StepReport.losses` by their names. In border steps, the photo's edge is repeated beyond its frame, where
+            `counts` is False. On CUDA, steps are captured as CUDA graphs and replayed: a loss may then depend on
+            tensors, which it reads in place, but not on numbers that change in Python; set `config.cuda_graphs` to
+            False for such a loss. A step with a loss that cannot be captured, such as one that calls `item()`, warns,
+            and all steps are launched kernel by kernel.
         optimizer: function from a list of parameter groups, dictionaries with `params`, `name` and `lr`, to any
             `torch.optim.Optimizer` that keeps these groups; None is Adam. Each group's `lr` is that of the first step,
             and may be changed; a schedule sets `group["lr"]` before each step, and keeps the ratio of the last rate to

@@ -18,11 +18,20 @@ USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as 
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 
-def initial_surfels(scene: Scene, config: Config, generator: torch.Generator) -> Surfels:
-    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 4.3)."""
+def initial_surfels(
+    scene: Scene, config: Config, generator: torch.Generator, colors: torch.Tensor | None = None
+) -> Surfels:
+    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 4.3).
+
+    Args:
+        scene: its P points are taken.
+        config: settings.
+        generator: of random rotations, on the CPU.
+        colors: (P, 3) colours of the points; None takes the scene's.
+    """
     points = initial_points(
         scene.points,
-        scene.colors,
+        scene.colors if colors is None else colors,
         max(config.max_surfels // 2, 1),
         track_lengths=scene.track_lengths,
         errors=scene.reprojection_errors,

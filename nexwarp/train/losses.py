@@ -58,6 +58,7 @@ def training_losses(
     loss_weights: LossWeights,
     mask: torch.Tensor | None = None,
     empty: torch.Tensor | None = None,
+    saturation: float | None = None,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of the training loss, already multiplied by their factors: their sum is the loss.
 
@@ -73,6 +74,8 @@ def training_losses(
         mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
             and the texture are 0. None is True everywhere.
         empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
+        saturation: a channel of `target` from here on is clipped: L1 and texture terms do not count a brighter value
+            there. None counts all.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
@@ -93,6 +96,7 @@ def training_losses(
         l1=1.0 - factors.dssim,
         texture=factors.texture * has_slots,
         alpha=factors.alpha * (has_slots and all_count),
+        saturation=saturation,
     )
     if not all_count and factors.alpha > 0.0:
         alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import get_args, get_origin, get_type_hints
 
+from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.train.config import LARGEST_NUMBER, Config
 
@@ -58,7 +59,7 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
         if not (name and equals and value):
             raise ValueError(f"expected KEY=VALUE, got {text!r:.60}")
         if name in settings:
-            raise ValueError(f"{name}: expected it once, got it twice")
+            raise ValueError(f"{one_line(name, 60)}: expected it once, got it twice")
         try:
             settings[name] = json.loads(value)
         except (ValueError, RecursionError):
@@ -76,7 +77,7 @@ def _find_setting(config: Config, name: str) -> tuple[str, str]:
         return part, key
     close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part or name}.")]
     # Not the first one of all, the preset, which has a flag of its own.
-    raise ValueError(f"{name}: expected a setting, such as {', '.join(close or known[1:5])}")
+    raise ValueError(f"{one_line(name, 60)}: expected a setting, such as {', '.join(close or known[1:5])}")
 
 
 def _typed(name: str, value: object, annotation: object) -> object:

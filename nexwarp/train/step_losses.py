@@ -1,5 +1,6 @@
 """All losses of a training step: the paper's, ours, and those that the caller of a training adds."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import torch
@@ -12,6 +13,8 @@ from nexwarp.train.losses import border_loss, depth_loss, training_losses
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
+# Photos are clipped from here on: what lies beyond it is unknown.
+SATURATION = 250 / 255
 BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "border", "empty", "depth")
 
 
@@ -32,6 +35,19 @@ def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]
     return dict(losses or {})
 
 
+def as_taken(out: Rendering, target: Target) -> Rendering:
+    """Return a rendering at the exposure of the photo that it is compared with.
+
+    Where the photo is saturated, a brighter image counts as equal to it: it has no error and no gradient there.
+    Clipped photos of different exposures would otherwise ask for different colours of the same bright surface.
+    """
+    if target.exposure is None:
+        return out
+    image, plain, textured = (x * target.exposure for x in (out.image, out.plain, out.textured))
+    clipped = (target.photo >= SATURATION) & (image > target.photo)
+    return dataclasses.replace(out, image=torch.where(clipped, target.photo, image), plain=plain, textured=textured)
+
+
 def step_losses(
     out: Rendering,
     target: Target,
@@ -45,7 +61,7 @@ def step_losses(
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
     Args:
-        out: the rendering of the target's camera.
+        out: the rendering of the target's camera, `as_taken`.
         target: what it is compared with.
         surfels: whose opacities the sparsity term takes.
         texture: whose grid the regularisation takes.
@@ -68,6 +84,7 @@ def step_losses(
         loss_weights=factors,
         mask=target.counts,
         empty=target.empty,
+        saturation=None if target.exposure is None else SATURATION,
     )
     if target.beyond is not None and factors.border > 0:
         losses["border"] = factors.border * border_loss(out.image, target.photo, target.beyond)

@@ -19,8 +19,9 @@ class Target:
 
     Attributes:
         camera: the camera that the step renders.
-        photo: (H, W, 3) float, the photo at the photos' mean exposure; values may exceed 1.
+        photo: (H, W, 3) float in [0, 1], the photo.
         background: three numbers or a (3,) tensor, the colour behind everything in this step.
+        exposure: (3,) or (H, W, 3), the photo's gains times the lens's falloff; None is the mean exposure.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
         beyond: (H, W) bool, what lies beyond the photo's frame, where its edge is repeated; None is nothing.
@@ -32,6 +33,7 @@ class Target:
     camera: Camera
     photo: torch.Tensor
     background: Color
+    exposure: torch.Tensor | None = None
     counts: torch.Tensor | None = None
     empty: torch.Tensor | None = None
     beyond: torch.Tensor | None = None
@@ -107,9 +109,10 @@ class TargetMaker:
             if alpha is not None:
                 photo = photo + (1 - alpha)[..., None] * (behind - self.background_tensor)
         mask = self.views.mask(index, factor)
+        exposure = self.views.exposure(index, factor)
         if mask is None or self.config.mask_mode == "ignore":
-            return Target(camera, photo, background, counts=mask)
-        return Target(camera, torch.where(mask[..., None], photo, behind), background, empty=~mask)
+            return Target(camera, photo, background, exposure, counts=mask)
+        return Target(camera, torch.where(mask[..., None], photo, behind), background, exposure, empty=~mask)
 
     def shifted(self, target: Target) -> Target:
         """Shift a target's window at random, for a border step; beyond the frame, the photo's edge is repeated.
@@ -125,10 +128,12 @@ class TargetMaker:
         inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))
         rows, columns = rows.clamp(0, sizes[0] - 1)[:, None], columns.clamp(0, sizes[1] - 1)
         known = None if target.counts is None else target.counts[rows, columns]
+        exposure = target.exposure
         return dataclasses.replace(
             target,
             camera=camera.crop(left, top, camera.width, camera.height),
             photo=target.photo[rows, columns],
+            exposure=exposure if exposure is None or exposure.ndim == 1 else exposure[rows, columns],
             counts=inside if known is None else inside & known,
             empty=None if target.empty is None else target.empty[rows, columns],
             beyond=~inside if known is None else ~inside & known,

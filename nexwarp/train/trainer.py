@@ -42,7 +42,7 @@ from nexwarp.train.state import (
     restore_random,
     scene_digest,
 )
-from nexwarp.train.step_losses import OwnLoss, check_own_losses, step_losses
+from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker
 from nexwarp.train.views import TrainingViews, mean_color
 
@@ -102,17 +102,19 @@ class Trainer:
         seed_everything(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
-        self.surfels = initial_surfels(scene, config, self.generator).to(self.device)
+        calibration = calibrate_exposures(scene, config)
+        colors = None if calibration is None else calibration.colors
+        self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
         self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer)
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds = 0, 0.0
         self.order: list[int] = []
-        self.exposures: Exposures | None
-        self.exposures, gains = calibrate_exposures(scene, config)
+        self.exposures: Exposures | None = None if calibration is None else calibration.exposures
+        gains = None if calibration is None else calibration.gains
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
-        self.background = config.background or scene.background or mean_color(scene.train)
+        self.background = config.background or scene.background or mean_color(scene.train, calibration)
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise)
         self.rate_factor = 1.0
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
@@ -191,8 +193,9 @@ class Trainer:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         try:
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
+            taken = as_taken(out, target)
             losses = step_losses(
-                out,
+                taken,
                 target,
                 self.surfels,
                 self.texture,
@@ -202,7 +205,7 @@ class Trainer:
             )
             request = None
             if self.densifier.active(self.iteration):
-                errors = (out.image.detach() - target.photo).abs().mean(dim=-1)
+                errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
             with updating():
@@ -213,7 +216,7 @@ class Trainer:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        return StepResult(losses, out.image.detach(), out.intermediates.tiles.room)
+        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room)
 
     def _graph_key(self) -> Hashable:
         state = [self.densifier.errors]

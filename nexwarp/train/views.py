@@ -9,7 +9,8 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.data import View
-from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.exposures import DECIMALS, Exposures
+from nexwarp.train.exposure_calibration import ExposureCalibration
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
@@ -31,9 +32,16 @@ class TrainingViews:
         gains: torch.Tensor | None = None,
         lens: Exposures | None = None,
     ) -> None:
-        """Move the views to a device; `get` divides photos by their `gains` (V, 3) and by the falloff of `lens`."""
+        """Move the views to a device.
+
+        Args:
+            views: the training views.
+            device: of the training.
+            gains: (V, 3) gains of the photos; None where they have one exposure.
+            lens: whose falloff the photos have; None is a lens without vignetting.
+        """
         self.device = device
-        self.scales = 255.0 if gains is None else (255.0 * gains).to(device)
+        self.gains = None if gains is None else gains.to(device)
         self.lens = None if lens is None else copy.deepcopy(lens).to(device)
         self.names = [view.name for view in views]
         self.cameras = [view.camera.to(device) for view in views]
@@ -69,12 +77,14 @@ class TrainingViews:
         """
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
-        scale = self.scales if isinstance(self.scales, float) else self.scales[index]
-        photo = photo.float() / scale
-        falloff = None if self.lens is None else self.lens.falloff_of(self.cameras[index])
-        if falloff is not None:
-            photo /= falloff
-        return self._camera(index, factor), self._reduce(photo, index, factor)
+        return self._camera(index, factor), self._reduce(photo.float() / 255.0, index, factor)
+
+    def exposure(self, index: int, factor: int) -> torch.Tensor | None:
+        """Return gains times falloff of the reduced photo, (3,) or (H, W, 3); None where photos have one exposure."""
+        if self.gains is None:
+            return None
+        falloff = None if self.lens is None else self.lens.falloff_of(self._camera(index, factor))
+        return self.gains[index] if falloff is None else self.gains[index] * falloff
 
     def mask(self, index: int, factor: int) -> torch.Tensor | None:
         """Return the mask (H, W) bool of the reduced photo, or None; a block counts where all its pixels count."""
@@ -139,9 +149,15 @@ class TrainingViews:
         return small.permute(1, 2, 0).contiguous()
 
 
-def mean_color(views: list[View]) -> tuple[float, float, float]:
-    """Mean sRGB colour in [0, 1] of all pixels of the photos."""
-    sums = torch.stack([view.image.sum((0, 1), dtype=torch.int64) for view in views]).sum(0).double()
-    pixels = sum(view.image.shape[0] * view.image.shape[1] for view in views)
-    red, green, blue = (sums / pixels / 255).tolist()
+def mean_color(views: list[View], calibration: ExposureCalibration | None = None) -> tuple[float, float, float]:
+    """Mean sRGB colour in [0, 1] of all pixels of the photos, each divided by its exposure."""
+    total, pixels = torch.zeros(3, dtype=torch.float64), 0
+    for index, view in enumerate(views):
+        light = None if calibration is None else calibration.exposures.falloff_of(view.camera)
+        # Integers have the same sum whatever the number of threads; rounding hides the order of the others.
+        sums = view.image.sum((0, 1), dtype=torch.int64) if light is None else (view.image / light.double()).sum((0, 1))
+        total += sums if calibration is None else sums / calibration.gains[index].double()
+        pixels += view.image.shape[0] * view.image.shape[1]
+    mean = total / pixels / 255
+    red, green, blue = (mean if calibration is None else mean.clamp(0, 1).round(decimals=DECIMALS)).tolist()
     return red, green, blue
