@@ -45,6 +45,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", TARGETS)
 def test_readers_load_or_refuse_in_one_line(results: dict[str, Any], name: str) -> None:
     result, (inputs, _) = results[f"mutate {name}"], DRIVERS["mutate"]
@@ -53,6 +54,7 @@ def test_readers_load_or_refuse_in_one_line(results: dict[str, Any], name: str) 
     assert 0 < result["loaded"] < inputs, "inputs are neither all as good as new nor all beyond recognition"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", DRAWN)
 def test_readers_stand_what_hypothesis_draws(results: dict[str, Any], name: str) -> None:
     result = results[f"hypothesis {name}"]

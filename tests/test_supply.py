@@ -68,7 +68,7 @@ def test_every_line_has_one_version_and_hashes(name: str) -> None:
 def test_locks_are_the_constraints(python: str, platform: dict[str, str]) -> None:
     """On every Python and platform: the tested versions, and all that pyproject.toml asks for; else run .ci/lock.py."""
     versions = {"python_version": python, "python_full_version": f"{python}.20", "implementation_name": "cpython"}
-    environment: dict[str, str] = {**{k: str(v) for k, v in default_environment().items()}, **versions, **platform}
+    environment = {name: str(value) for name, value in default_environment().items()} | versions | platform
     tested, extras = pinned(constraints(), environment), asked()
     for locks, wanted in ((LOCKS[:2], ("", *RUN_EXTRAS)), (LOCKS, tuple(extras))):
         lock = pinned([requirement for name in locks for requirement, _ in read_lock(name)], environment)
