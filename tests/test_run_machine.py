@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -279,7 +279,7 @@ class RunFolders(RuleBasedStateMachine):
         run = self.root / name
         for file in files:
             if run.is_dir() and not (run / file).exists():
-                (run / file).parent.mkdir(exist_ok=True)
+                (run / file).parent.mkdir(parents=True, exist_ok=True)
                 content = f"{file} {number}".encode()
                 (run / file).write_bytes(content)
                 self.slots[name].foreign[file] = content
@@ -360,6 +360,7 @@ def test_random_lives_of_run_folders(tmp_path, monkeypatch, count):
             deadline=None,
             database=None,
             derandomize=count != RUNS,
+            phases=[Phase.generate],  # ten steps can be read; a shorter life takes minutes to find
             suppress_health_check=list(HealthCheck),
         ),
     )
