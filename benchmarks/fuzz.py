@@ -25,18 +25,20 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import psutil
 import warp as wp
 
 from benchmarks.fuzz_inputs import Files, damage, strategy
 from benchmarks.fuzz_targets import TARGETS, FuzzTarget
 
-HANG = 5.0  # seconds an input
+HANG = 5.0  # seconds an input may use the processor
+ASLEEP = 6  # how many times as long it may take where it does not use it: on a busy machine, or asleep
 MEMORY = 10**9  # bytes that the process may have beyond those before its first input
 BATCH = 2000  # inputs a process
 DOCUMENTED = (ValueError, TypeError, FileNotFoundError)
@@ -138,7 +140,7 @@ def _batch(
     """Run inputs in one forked process, and return the index to continue with."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
-    now = context.RawArray("d", [float(first), time.monotonic()])
+    now = context.RawArray("d", [float(first), time.monotonic(), 0.0])
     arguments = (target, valid, folder, theirs, now, first, last, left, seed, driver)
     process = context.Process(target=_work, args=arguments, daemon=True)
     process.start()
@@ -150,7 +152,7 @@ def _batch(
                 _collect(ours.recv(), target, result, folder, failed)
         except EOFError:
             break
-        if time.monotonic() - now[1] > HANG:
+        if _hangs(process.pid, now):
             hung = True
             process.kill()
             while True:
@@ -168,6 +170,23 @@ def _batch(
     result.inputs += 1
     result.failures.append(_saved(failure, folder, failed))
     return index + 1
+
+
+def _hangs(process: int | None, now: Sequence[float]) -> bool:
+    """Whether a process works on an input for too long.
+
+    Args:
+        process: its id.
+        now: index of the input, and the times at which the process began it: `time.monotonic`, `time.process_time`.
+    """
+    seconds = time.monotonic() - now[1]
+    if seconds <= HANG or process is None:
+        return False
+    try:
+        used = sum(psutil.Process(process).cpu_times()[:2])
+    except psutil.Error:  # it has ended
+        return False
+    return used - now[2] > HANG or seconds > ASLEEP * HANG
 
 
 def _collect(message: tuple[Any, ...], target: FuzzTarget, result: Result, folder: Path, failed: Path) -> None:
@@ -225,7 +244,7 @@ def _work(
     def run(index: int, files: Files) -> None:
         """Run an input; end the process when time is up."""
         target.write(folder, files)
-        now[0], now[1] = float(index), time.monotonic()
+        now[:] = [float(index), time.monotonic(), time.process_time()]
         outcome = judge(target.read, folder)
         counts.inputs += 1
         if isinstance(outcome, Failure):
@@ -236,7 +255,7 @@ def _work(
             counts.loaded += 1
         else:
             counts.refusals[outcome] += 1
-        now[0], now[1] = float(index + 1), time.monotonic()
+        now[:] = [float(index + 1), time.monotonic(), time.process_time()]
         if counts.inputs % 50 == 0:
             _report(report, counts)
         if time.monotonic() > end:

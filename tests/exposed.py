@@ -1,9 +1,10 @@
 """Scenes whose photos have different exposures."""
 
 import dataclasses
+from pathlib import Path
 
-from nexwarp.data import Scene, View
-from nexwarp.io.pictures import to_uint8
+from nexwarp.data import Scene, View, load_scene
+from nexwarp.io.pictures import save_png, to_uint8
 
 
 def exposure_at(view: View) -> float:
@@ -17,3 +18,10 @@ def with_exposures(scene: Scene) -> Scene:
         return [dataclasses.replace(view, image=to_uint8(view.image / 255 * exposure_at(view))) for view in views]
 
     return dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
+
+
+def expose_photos(folder: Path) -> None:
+    """Make the photos of a scene grow brighter along the capture, in their PNG files."""
+    scene = with_exposures(load_scene(folder))
+    for view in (*scene.train, *scene.test):
+        save_png(folder / "images" / view.name, view.image)

@@ -19,6 +19,7 @@ from nexwarp.data import write_demo
 from nexwarp.model.bounds import BOUNDS, MATRIX_BOUNDS
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
+from tests.exposed import expose_photos
 from tests.test_docs import DOCS, ROOT, SYMBOLS
 
 
@@ -27,6 +28,7 @@ def run(tmp_path_factory, one_torch_thread: None) -> Path:
     """A small run."""
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
+    expose_photos(scene)
     changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
     flags = [x for change in changes for x in ("--set", change)]
     flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]

@@ -69,13 +69,12 @@ def training_losses(
         target: (H, W, 3), the photograph.
         opacities: (N,) in [0, 1].
         grid: (L, T, F), hash-grid values; None without a texture: no grid term.
-        resolutions: (L,), cells per world unit; may be None when `grid` is.
+        resolutions: (L,), cells per world unit; None where `grid` is.
         loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
-        mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
-            and the texture are 0. None is True everywhere.
+        mask: (H, W) bool, True where the photograph counts, which None is everywhere: elsewhere no term has a gradient,
+            and those of the image and the texture are 0.
         empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
-        saturation: a channel of `target` from here on is clipped: L1 and texture terms do not count a brighter value
-            there. None counts all.
+        saturation: from here on a channel of `target` counts as any brighter value, but for D-SSIM; None counts none.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
@@ -89,10 +88,7 @@ def training_losses(
     # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
     all_count = weights.shape[-1] <= factors.alpha_hits
     l1_term, texture_term, alpha_term = photometric_terms(
-        image,
-        textured,
-        weights,
-        target,
+        *(image, textured, weights, target),
         l1=1.0 - factors.dssim,
         texture=factors.texture * has_slots,
         alpha=factors.alpha * (has_slots and all_count),
