@@ -1,5 +1,6 @@
 """COLMAP scenes: what is read is what was written, and bad input is one clear line."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -259,6 +260,10 @@ BAD_SCENES = {
     # pycolmap would allocate for a count from nowhere: 95 seconds, and all the memory there is.
     "truncated points": (damaged("sparse/0/points3D.bin"), "points3D.bin: truncated or damaged"),
     "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),
+    "image id beyond 32 bits": (
+        damaged("sparse/0/images.txt", lambda data: re.sub(rb"(?m)^1 ", b"18446744073709551617 ", data), text=True),
+        "expected id, pose, camera and name of an image, got '18446744073709551617",
+    ),
     "focal length of zero": (
         built(params=(0.0, 43.0, 25.5, 16.25)),
         "00.png: .* K: expected focal lengths > 0",

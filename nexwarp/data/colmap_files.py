@@ -18,6 +18,7 @@ from nexwarp.data.lens import camera_models
 
 MAX_CAMERAS = MAX_IMAGES = 100_000
 MAX_POINTS = 10_000_000
+LARGEST_ID = 2**32 - 1  # of an image, as binary files hold it
 MAX_OBSERVATIONS = 100_000_000
 MAX_NAME = 4096  # bytes
 MAX_LINE = 64 * 2**20  # bytes of a line of a text file, enough for a million keypoints
@@ -281,7 +282,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, ImageRecord]]:
         try:
             identity, *pose, camera, name = line.split(None, 9)
             numbers = int(identity), tuple(map(float, pose)), int(camera)
-            if len(pose) != 7:
+            if len(pose) != 7 or not 0 <= numbers[0] <= LARGEST_ID:
                 raise ValueError
         except ValueError:
             raise _unreadable(where, "id, pose, camera and name of an image", line) from None

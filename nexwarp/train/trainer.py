@@ -12,6 +12,7 @@ from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError, needed_memory
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
+from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
@@ -324,8 +325,8 @@ class Trainer:
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            reason = " ".join(found.split())  # torch's go over several lines
-            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
+            told = one_line(found)  # torch's go over several lines
+            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
 
     def _check_origin(self, snapshot: Snapshot) -> None:
         """Raise ValueError unless a snapshot comes from a run of this scene with these settings."""
