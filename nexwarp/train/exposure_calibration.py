@@ -180,11 +180,12 @@ def held_out_errors(seen: Observations, cameras: Sequence[Camera]) -> tuple[floa
         cameras: cameras of the photos.
 
     Returns:
-        Means of `held_out_error` over both halves along each principal axis.
+        Means of `held_out_error` over both halves along each principal axis; 0 where the points cannot be cut in two.
     """
     stride = -(-len(seen.places) // MOST_CHECKED)
     some = seen.of_points(np.arange(len(seen.places)) % stride == 0)
-    none, gains, both = np.mean([_errors_of(a, b, cameras) for a, b in _halves(some)], axis=0).tolist()
+    errors = [_errors_of(a, b, cameras) for a, b in _halves(some)]
+    none, gains, both = np.mean(errors, axis=0).tolist() if errors else (0.0, 0.0, 0.0)
     return none, gains, both
 
 
