@@ -1,7 +1,6 @@
-"""Argument checks; each message names the argument, the expected value and the given one. And the free memory."""
+"""Argument checks; each message names the argument, the expected value and the given one."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import torch
 
@@ -86,20 +85,3 @@ def check_range(name: str, value: float, low: float, high: float = float("inf"))
     if not low <= value <= high:
         upper = "" if high == float("inf") else f" and at most {high:g}"
         raise ValueError(f"{name}: expected at least {low:g}{upper}, got {value!s:.60}")
-
-
-def available_memory() -> int:
-    """Free memory for this process in bytes: that of the machine or of its control group, whichever is smaller."""
-    import psutil
-
-    free = int(psutil.virtual_memory().available)
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        if limit != "max":
-            used = int((group / "memory.current").read_text())
-            stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-            free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
-    except (OSError, ValueError):  # no control groups of version 2
-        pass
-    return max(free, 0)

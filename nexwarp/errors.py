@@ -15,19 +15,9 @@ Arguments of Python functions that are out of range or of another type raise pla
 """
 
 import os
-import re
 from collections.abc import Mapping
 
-import torch
-
-ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
-
-# Of CUDA's own calls, and of its libraries, which do not say how much they wanted.
-EXHAUSTED = re.compile(
-    r"CUDA (driver )?error:? .*out of memory|_ALLOC_FAILED|cudaErrorMemoryAllocation|bad_alloc", re.I
-)
-
-UNKNOWN = "more than there is"
+UNKNOWN = "more than there is"  # memory that an error does not tell
 
 
 class NexwarpError(Exception):
@@ -98,24 +88,3 @@ class OutOfMemoryError(NexwarpError, MemoryError):
         """Return the error of a rendering that does not fit."""
         advice = "render a smaller image, with a lower K, or in parts (Camera.crop)"
         return cls(f"out of memory: {task} needs {needed}; {advice}", needed)
-
-
-def needed_memory(error: BaseException) -> str | None:
-    """Return what an error of torch or Warp says of the memory that it did not get; None for other errors."""
-    if not isinstance(error, (MemoryError, RuntimeError)):
-        return None
-    if isinstance(error, OutOfMemoryError):
-        return error.needed
-    match = ALLOCATION.search(str(error))
-    if match is not None:
-        return _readable(match[1])
-    exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
-    return UNKNOWN if exhausted else None
-
-
-def _readable(amount: str) -> str:
-    match = re.fullmatch(r"(\d+) ?bytes", amount, re.I)
-    if match is None:
-        return amount
-    size = int(match[1])
-    return f"{size / 2**30:.2f} GiB" if size >= 2**30 else f"{size / 2**20:.2f} MiB"

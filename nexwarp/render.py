@@ -10,8 +10,9 @@ import torch
 from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.checks import check_finite, check_range, check_tensors
-from nexwarp.errors import OutOfMemoryError, needed_memory
+from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.memory import needed_memory
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels

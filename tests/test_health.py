@@ -13,7 +13,8 @@ import torch
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene, write_demo
-from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError, needed_memory
+from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
+from nexwarp.memory import needed_memory
 from nexwarp.train import trainer
 from nexwarp.train.checkpoint import save_checkpoint
 from nexwarp.train.config import Config, TextureConfig

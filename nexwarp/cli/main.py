@@ -16,7 +16,8 @@ from nexwarp.cli.eval import Eval
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
-from nexwarp.errors import NexwarpError, needed_memory
+from nexwarp.errors import NexwarpError
+from nexwarp.memory import needed_memory
 
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,

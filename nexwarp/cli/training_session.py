@@ -13,8 +13,9 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
-from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError, needed_memory
+from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError
 from nexwarp.io.json_files import Json, write_json
+from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TEST, TRAIN, picture_name, remove_leftovers

@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nexwarp.errors import FormatError, StorageError
+from nexwarp.errors import StorageError
 
-LONGEST_HEADER = 2**20  # bytes; that of a model has about 5,000
 TEMPORARY = re.compile(r"\..+\.(\d{1,9})-[0-9a-f]{16}\.tmp(\.[^.]*)?")
 MAX_STEM = 40  # characters of a file's stem in its temporary name; a file system may limit names to 255 bytes
 STALE_SECONDS = 600.0
@@ -26,17 +25,6 @@ def one_line(text: object, limit: int = 300) -> str:
         for c in " ".join(str(text)[: 4 * limit].split())
     )
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
-
-
-def check_tensors_header(path: Path) -> None:
-    """Raise FormatError if a safetensors file's header is long: parsing one of 100,000 tensors takes seconds."""
-    with path.open("rb") as file:
-        size = int.from_bytes(file.read(8), "little")
-    # A file whose header would not fit is damaged, which its reader says.
-    if LONGEST_HEADER < size <= path.stat().st_size:
-        raise FormatError(
-            f"{path}: expected a safetensors header of at most {LONGEST_HEADER:,} bytes, a few tensors, got {size:,}"
-        )
 
 
 def temporary_name(path: Path) -> Path:

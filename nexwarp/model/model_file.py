@@ -11,8 +11,9 @@ import torch
 
 from nexwarp.checks import check_range, check_tensors, check_version
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.io.files import check_tensors_header, one_line, write_atomically
+from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
+from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions

@@ -37,7 +37,7 @@ def photometric_terms(
         l1: factor of the mean of |image - target|.
         texture: factor of the mean of |textured / (sum_k W + 1e-6) - target|.
         alpha: factor of the mean of 1 - sum_k W.
-        saturation: a channel of `target` from here on counts as any brighter value; None counts none so.
+        saturation: a channel of `target` with at least this value equals any brighter one; None compares all values.
 
     Returns:
         Three scalars; None, at no cost, for a factor of 0.

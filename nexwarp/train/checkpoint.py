@@ -11,8 +11,9 @@ import torch
 
 from nexwarp.checks import check_version
 from nexwarp.errors import CheckpointError, MissingError
-from nexwarp.io.files import check_tensors_header, is_temporary, sync, temporary_name, write_atomically
+from nexwarp.io.files import is_temporary, sync, temporary_name, write_atomically
 from nexwarp.io.json_files import READ_ERRORS, read_json
+from nexwarp.io.safetensors_files import check_tensors_header
 
 CHECKPOINT_VERSION = 1
 

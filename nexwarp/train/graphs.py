@@ -10,7 +10,8 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import StagedCamera
-from nexwarp.errors import OutOfMemoryError, needed_memory
+from nexwarp.errors import OutOfMemoryError
+from nexwarp.memory import needed_memory
 from nexwarp.model.options import RenderOptions
 from nexwarp.train.target import Target
 

@@ -10,10 +10,11 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
-from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError, needed_memory
+from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
+from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures

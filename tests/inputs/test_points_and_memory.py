@@ -7,6 +7,7 @@ import torch
 import nexwarp.data.memory
 import nexwarp.data.scene
 import nexwarp.data.views
+import nexwarp.memory
 from benchmarks.inputs import write_points
 from nexwarp.data import load_scene
 from tests.test_scene import make_scene
@@ -62,7 +63,7 @@ def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monke
 def test_a_thousand_photos_of_eight_megapixels_fit_8_gb_at_half_size():
     sizes = [(3264, 2448)] * 1000
     assert nexwarp.data.memory.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.memory.photos_bytes(sizes, 1, 3)
-    assert nexwarp.checks.available_memory() > 2**20
+    assert nexwarp.memory.available_memory() > 2**20
 
 
 def test_progress_counts_every_photo(tmp_path):
