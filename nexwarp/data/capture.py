@@ -1,6 +1,6 @@
 """The content of a scene's files without pixels: photos with their cameras, and points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -124,6 +124,16 @@ def inside_folder(where: str, path: Path, folder: Path) -> Path:
     if not inside:
         raise ValueError(f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it")
     return path
+
+
+def distinct_photos(source: Path, photos: Iterable[Photo]) -> list[Photo]:
+    """Return photos as a list; raise ValueError at the first one whose name came before."""
+    found: dict[str, Photo] = {}
+    for photo in photos:
+        if photo.name in found:
+            raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
+        found[photo.name] = photo
+    return list(found.values())
 
 
 def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:

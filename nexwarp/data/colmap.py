@@ -11,6 +11,7 @@ from nexwarp.data.capture import (
     Cloud,
     Photo,
     check_points,
+    distinct_photos,
     inside_folder,
     safe_name,
 )
@@ -67,8 +68,8 @@ def read_model(path: Path, images: Path) -> Capture:
     if not records.images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
-    photos = [_photo(image, records.cameras, lenses, folder, images) for image in records.images.values()]
-    _check_unique(folder, photos)
+    each = (_photo(image, records.cameras, lenses, folder, images) for image in records.images.values())
+    photos = distinct_photos(folder, each)
     if not len(records.points.ids):
         return Capture(folder, sorted(photos, key=lambda photo: photo.name), None)
     cloud = _cloud(records.points, folder)
@@ -149,12 +150,3 @@ def _cloud(points: PointRecords, folder: Path) -> Cloud:
             f"{folder}: expected finite reprojection errors, got {points.errors[index]} (point id {points.ids[index]})"
         )
     return Cloud(points.positions, points.colors, points.lengths.astype(np.int32), points.errors.astype(np.float32))
-
-
-def _check_unique(source: Path, photos: list[Photo]) -> None:
-    """Raise ValueError if two photos have the same name."""
-    seen: set[str] = set()
-    for photo in photos:
-        if photo.name in seen:
-            raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
-        seen.add(photo.name)

@@ -16,6 +16,7 @@ from nexwarp.data.capture import (
     Cloud,
     Photo,
     check_points,
+    distinct_photos,
     inside_folder,
     safe_name,
     short,
@@ -104,16 +105,14 @@ def _frame_list(file: Path, data: JsonObject) -> list[Json]:
 def _frames(file: Path, data: JsonObject, images: str) -> list[Photo]:
     """The photos in the order of the file."""
     to_original = inverse_applied(file, data)
-    photos: dict[str, Photo] = {}
-    for index, frame in enumerate(_frame_list(file, data)):
+
+    def photo(index: int, frame: Json) -> Photo:
         where = f"{file}: frame {index}"
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
-        photo = _photo(where, file.parent, data, frame, images, to_original)
-        if photo.name in photos:
-            raise ValueError(f"{file}: expected each photo once, got {photo.name} twice")
-        photos[photo.name] = photo
-    return list(photos.values())
+        return _photo(where, file.parent, data, frame, images, to_original)
+
+    return distinct_photos(file, (photo(index, frame) for index, frame in enumerate(_frame_list(file, data))))
 
 
 def _photo(
