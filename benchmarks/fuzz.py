@@ -277,15 +277,9 @@ def _report(report: Connection, counts: Result) -> None:
 
 
 def _limit_memory() -> None:
-    import torch
-
     from nexwarp.kernels import launch
-    from nexwarp.ops import columns
 
-    # Threads do not survive the fork; without this the process may wait for them.
-    torch.set_num_threads(1)
-    launch.set_num_threads(1)
-    columns._pool.cache_clear()
+    launch.set_num_threads(1)  # each thread would take memory of its own
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL("libc.so.6").mallopt(M_ARENA_MAX, 1)

@@ -4,7 +4,9 @@
     python -m benchmarks.quality table results.jsonl --out quality.md --json quality.json
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
     python -m benchmarks.quality train --tables demo --seeds 0 --pictures DIR --out demo.jsonl
+    python -m benchmarks.quality train --tables changes --variant inner --out inner.jsonl
 
+`--variant inner` holds out every 8th training photo in place of the test views, to choose settings by.
 `train` appends one JSON line per training and skips the trainings that the file already holds: it can be stopped and
 resumed, and run on several machines. Rows that differ only in K, in the removal of floaters or in how a model is
 finished train alike until the difference takes effect (`more_hits_from`, `densify.stop`); until there they share one

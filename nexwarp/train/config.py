@@ -109,12 +109,13 @@ class Config:
     trained."""
     exposures: bool = True
     """Estimate each photo's exposure and white balance before training, as gains of red, green and blue, and train at
-    the mean exposure. Rendered views get gains that are predicted from nearby photos."""
+    the mean exposure. Rendered views get gains that are predicted from nearby photos. Photos of one exposure are left
+    alone."""
     metering: bool = True
     """Auto exposure, with `exposures`: if the photos' gains depend on the brightness of what they show, predict the
     gains of rendered views from brightness, too."""
     vignetting: bool = True
-    """With `exposures`: estimate the vignetting of the lens, remove it for training, and apply it to rendered views."""
+    """With `exposures`: estimate the vignetting of the lens, and apply it to rendered views if the photos show it."""
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""

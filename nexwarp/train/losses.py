@@ -71,28 +71,27 @@ def training_losses(
         grid: (L, T, F), hash-grid values; None without a texture: no grid term.
         resolutions: (L,), cells per world unit; None where `grid` is.
         loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
-        mask: (H, W) bool, True where the photograph counts, which None is everywhere: elsewhere no term has a gradient,
-            and those of the image and the texture are 0.
+        mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
+            and the texture are 0. None is True everywhere.
         empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
-        saturation: from here on a channel of `target` counts as any brighter value, but for D-SSIM; None counts none.
+        saturation: a channel of `target` with at least this value equals any brighter one in the L1 and texture terms.
+            None compares all values.
 
     Returns:
         Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
     """
     factors, has_slots = loss_weights, weights.shape[-1] > 0
     _check_masks(image, mask=mask, empty=empty)
-    if mask is not None:
-        image, textured, weights = _masked(image, textured, weights, target, mask)
-    if empty is not None:
-        _, textured, weights = _masked(image, textured, weights, target, ~empty)
+    image, textured, weights = _counted(image, textured, weights, target, mask, empty)
     # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
     all_count = weights.shape[-1] <= factors.alpha_hits
+    shares = {
+        "l1": 1.0 - factors.dssim,
+        "texture": factors.texture * has_slots,
+        "alpha": factors.alpha * (has_slots and all_count),
+    }
     l1_term, texture_term, alpha_term = photometric_terms(
-        *(image, textured, weights, target),
-        l1=1.0 - factors.dssim,
-        texture=factors.texture * has_slots,
-        alpha=factors.alpha * (has_slots and all_count),
-        saturation=saturation,
+        image, textured, weights, target, **shares, saturation=saturation
     )
     if not all_count and factors.alpha > 0.0:
         alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
@@ -119,6 +118,22 @@ def _computed(term: torch.Tensor | None) -> torch.Tensor:
     """Return a term whose factor is not 0, which is therefore computed."""
     assert term is not None
     return term
+
+
+def _counted(
+    image: torch.Tensor,
+    textured: torch.Tensor,
+    weights: torch.Tensor,
+    target: torch.Tensor,
+    mask: torch.Tensor | None,
+    empty: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Put the photograph, without a gradient, where it does not count; in `empty` pixels into the texture alone."""
+    if mask is not None:
+        image, textured, weights = _masked(image, textured, weights, target, mask)
+    if empty is not None:
+        _, textured, weights = _masked(image, textured, weights, target, ~empty)
+    return image, textured, weights
 
 
 def _masked(
