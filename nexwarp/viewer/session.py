@@ -63,7 +63,8 @@ class Session:
         self.drawn_version, self.drawn_step, self.drawn_scale, self.drawn_at = -1, -1, 0.0, 0.0
         self.screenshots: list[int] = []
         self.has_download = False  # a file was sent and may not have arrived
-        self.keyframes: list[Keyframe] = []
+        # Replaced, never changed: handlers of several threads read it, each once.
+        self.keyframes: tuple[Keyframe, ...] = ()
         self.closed = threading.Event()
         self.playing = self.saving = False
         self.frustums: dict[str, viser.CameraFrustumHandle] = {}
@@ -212,21 +213,22 @@ class Session:
         if len(self.keyframes) >= MOST_KEYFRAMES:
             self.tell(f"A path has at most {MOST_KEYFRAMES} views", "")
         elif self.viewpoint is not None:
-            self.keyframes.append(Keyframe(self.viewpoint.pose, self.viewpoint.fov))
+            self.keyframes = (*self.keyframes, Keyframe(self.viewpoint.pose, self.viewpoint.fov))
             self._show_path()
 
     def remove_keyframe(self) -> None:
         """Remove the path's last keyframe."""
         if self.keyframes:
-            self.keyframes.pop()
+            self.keyframes = self.keyframes[:-1]
             self._show_path()
 
     def _show_path(self) -> None:
-        self.panel.count_keyframes(len(self.keyframes))
+        keys = self.keyframes
+        self.panel.count_keyframes(len(keys))
         self.client.scene.remove_by_name("/path")
-        if not self.keyframes:
+        if not keys:
             return
-        points = [key.pose[:3, 3] for key in self.keyframes]
+        points = [key.pose[:3, 3] for key in keys]
         self.client.scene.add_point_cloud(
             "/path/views",
             points=self.world.to_browser(np.stack(points)).astype(np.float32),
@@ -234,8 +236,8 @@ class Session:
             point_size=0.03,
             point_shape="circle",
         )
-        if len(self.keyframes) > 1:
-            way = interpolate(self.keyframes, 24 * len(self.keyframes))
+        if len(keys) > 1:
+            way = interpolate(keys, 24 * len(keys))
             line = self.world.to_browser(np.stack([key.pose[:3, 3] for key in way])).astype(np.float32)
             self.client.scene.add_line_segments(
                 "/path/way",
@@ -285,14 +287,15 @@ class Session:
             seconds: duration of the video.
             closed: return to the first view.
         """
-        if len(self.keyframes) < 2:
+        keys = self.keyframes
+        if len(keys) < 2:
             self.tell("Add at least two views first", "")
             return
         if self.saving or (self.has_download and self.waiting()):
             return
         self.saving = True
         try:
-            content = path_json(self.keyframes, width, height, fps, seconds, closed)
+            content = path_json(keys, width, height, fps, seconds, closed)
             where = self.save(content) if self.save is not None else None
         except (OSError, ValueError, MemoryError) as error:
             self.tell("The path was not saved", str(error))

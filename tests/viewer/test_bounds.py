@@ -4,7 +4,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 from urllib.parse import urlsplit
@@ -17,6 +17,7 @@ from nexwarp.errors import OutOfMemoryError
 from nexwarp.viewer import Viewer, connections, pacing
 from nexwarp.viewer import session as session_module
 from nexwarp.viewer import viewer as viewer_module
+from nexwarp.viewer.camera_path import Keyframe, path_json
 from nexwarp.viewer.modes import Picture, draw
 from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
 from nexwarp.viewer.session import Session
@@ -197,6 +198,25 @@ def test_large_messages_and_other_versions_close_their_connection(model, capfd):
         good.look()
         assert good.picture().ndim == 3
     assert "ersion" not in capfd.readouterr().out, "a stranger prints nothing into the training's display"
+
+
+def test_a_path_is_saved_as_it_was_when_another_thread_shortens_it(model, monkeypatch):
+    lengths: list[tuple[int, int]] = []
+
+    def shortened(keys: Sequence[Keyframe], *rest: Any) -> bytes:
+        before = len(keys)
+        session.remove_keyframe()
+        lengths.append((before, len(keys)))
+        return path_json(keys, *rest)
+
+    monkeypatch.setattr(session_module, "path_json", shortened)
+    with serving(model, photos={}) as viewer, Client(viewer) as client:
+        client.look()
+        session = session_of(viewer)
+        session.add_keyframe()
+        session.add_keyframe()
+        session.save_path(64, 48, 30, 0.1, False)
+        assert lengths == [(2, 2)] and len(session.keyframes) == 1
 
 
 def test_paths_are_bounded(model, monkeypatch):
