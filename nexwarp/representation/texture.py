@@ -171,7 +171,8 @@ class NeuralTexture(nn.Module):
         """
         degree = min(sh_degree, self.sh_degree)
         flat = directions.reshape(-1, 3)
-        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp)
+        image = (directions.shape[0], directions.shape[1]) if directions.ndim == 3 else None
+        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp, image)
         return colors.view(positions.shape)
 
     def _evaluate(
@@ -182,6 +183,7 @@ class NeuralTexture(nn.Module):
         degree: int,
         directions: torch.Tensor | None = None,
         clamp: bool = False,
+        image: tuple[int, int] | None = None,
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if not self.down_weighting:
@@ -205,6 +207,7 @@ class NeuralTexture(nn.Module):
             offset=0.0 if self.residual else 0.5,
             clamp=clamp,
             half=self._in_half(),
+            image=image,
         )
 
 

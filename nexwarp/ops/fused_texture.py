@@ -1,0 +1,349 @@
+"""Texturing in one kernel each way, for the shapes that `fused_texture` takes; see `nexwarp.ops.texture`."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from nexwarp.kernels.fused_scatter import fused_scatter_kernel
+from nexwarp.kernels.fused_texture import (
+    FEATURES,
+    WARPS,
+    WIDTH,
+    Layout,
+    fused_kernels,
+    gradient_sizes,
+    logical_feature,
+    logical_output,
+)
+from nexwarp.kernels.tiles import LARGEST_INT
+from nexwarp.ops._interop import Context, array, device_of, launch
+from nexwarp.ops.half_gradients import gradient_scale
+
+# Blocks of each multiprocessor that share out the tiles.
+FORWARD_BLOCKS, BACKWARD_BLOCKS = 8, 3
+FORWARD_THREADS = 128
+
+
+class Shape(NamedTuple):
+    """An image's points, as the kernels order them.
+
+    Attributes:
+        width, height: in pixels; without an image, the number of directions and 1.
+        hits: K.
+    """
+
+    width: int
+    height: int
+    hits: int
+
+    @property
+    def shift(self) -> int:
+        """Tiles are (1 << shift) pixels wide and (16 >> shift) high."""
+        return 3 if self.height > 1 else 4
+
+    @property
+    def units(self) -> int:
+        """Number of tiles times hits."""
+        wide, high = 1 << self.shift, 16 >> self.shift
+        return -(-self.width // wide) * -(-self.height // high) * self.hits
+
+    @property
+    def threads(self) -> int:
+        """Threads of a run of `fused_scatter`."""
+        wide = 2 * self.shift - 3
+        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits * 32
+
+
+def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bool:
+    """Whether the fused kernels take a texture: L * F = 32, F 2 or 4, two hidden layers of 64, at most degree 3."""
+    levels, size, features = grid.shape
+    shapes = [tuple(matrix.shape) for matrix in weights]
+    outputs = [(3 * (degree + 1) ** 2, WIDTH) for degree in range(4)]
+    return (
+        levels * features == FEATURES
+        and features in (2, 4)
+        and shapes[:-1] == [(WIDTH, FEATURES), (WIDTH, WIDTH)]
+        and shapes[-1] in outputs
+        and levels * size * features <= LARGEST_INT
+        and points <= LARGEST_INT // 64
+    )
+
+
+def usable(
+    positions: torch.Tensor, directions: torch.Tensor, grid: torch.Tensor, weights: Sequence[torch.Tensor]
+) -> bool:
+    """Whether the fused kernels compute these colours; see `nexwarp.ops.texture`."""
+    return (
+        positions.is_cuda
+        and positions.dtype == torch.float32
+        and torch.cuda.get_device_capability(positions.device) >= (8, 0)
+        and not (torch.is_grad_enabled() and directions.requires_grad)
+        and not torch.are_deterministic_algorithms_enabled()
+        and len(positions) > 0
+        and fits(grid, weights, len(positions))
+    )
+
+
+def colors(
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    directions: torch.Tensor,
+    grid: torch.Tensor,
+    weights: Sequence[torch.Tensor],
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+    shape: Shape,
+    offset: float,
+    clamp: bool,
+    *,
+    keep: bool,
+) -> torch.Tensor:
+    """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
+
+    The arguments are those of `nexwarp.ops.texture`; `shape` is the image's, and `keep` says whether there will be a
+    backward pass.
+    """
+    return _Colors.apply(
+        positions, depths, directions, grid, resolutions, focal, shape, offset, clamp, keep, *weights
+    )
+
+
+class _Context(Context):
+    shape: Shape
+    clamp: bool
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: _Context,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        directions: torch.Tensor,
+        grid: torch.Tensor,
+        resolutions: torch.Tensor,
+        focal: torch.Tensor,
+        shape: Shape,
+        offset: float,
+        clamp: bool,
+        keep: bool,
+        *weights: torch.Tensor,
+    ) -> torch.Tensor:
+        table = grid.contiguous().half()
+        result, encoded, packed = forward(
+            positions, depths, directions, table, weights, resolutions, focal, shape, offset, clamp, keep
+        )
+        ctx.shape, ctx.clamp = shape, clamp
+        if keep:
+            kept = (result if clamp else None, encoded, packed)
+            ctx.save_for_backward(positions, depths, directions, table, resolutions, focal, *kept, *weights)
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        positions, depths, directions, table, resolutions, focal, result, encoded, packed, *weights = ctx.saved_tensors
+        need_positions, need_depths, _, need_grid, *_ = ctx.needs_input_grad
+        scale, grad = gradient_scale(grad, torch.float16), grad.contiguous()
+        given = (positions, depths, directions, table, weights, resolutions, focal, encoded, packed, result, ctx.shape)
+        grad_grid, grad_points, grad_matrices = backward(grad, scale, *given, need_positions or need_depths)
+        return (
+            grad_points[:, :3] if need_positions and grad_points is not None else None,
+            grad_points[:, 3] if need_depths and grad_points is not None else None,
+            None,
+            grad_grid if need_grid else None,
+            *(None,) * 6,
+            *grad_matrices,
+        )
+
+
+def forward(
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    directions: torch.Tensor,
+    table: torch.Tensor,
+    weights: Sequence[torch.Tensor],
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+    shape: Shape,
+    offset: float,
+    clamp: bool,
+    keep: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the colours (n, 3), the features as fragments, none unless `keep`, and the packed matrices.
+
+    Args:
+        positions, depths, directions, resolutions, focal, offset, clamp: as of `nexwarp.ops.texture`; float32.
+        table: (L, T, F) half precision.
+        weights: float32.
+        shape: of the image.
+        keep: keep the features for `backward`.
+    """
+    degree, features = _degree(weights), table.shape[2]
+    packed = _pack(weights, features, degree)
+    encoded = torch.empty(shape.units * 256 if keep else 0, dtype=torch.int32, device=table.device)
+    colors = torch.empty_like(positions)
+    warps = _warps(positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
+    _launch(
+        fused_kernels(features, degree, clamp).forward,
+        positions,
+        warps,
+        [
+            array(table.view(-1), wp.float16),
+            wp.uint32(table.shape[1] - 1),
+            array(positions, wp.vec3),
+            array(depths, wp.float32),
+            array(directions, wp.vec3),
+            array(resolutions, wp.float32),
+            array(focal, wp.float32),
+            array(packed, wp.int32),
+            *shape,
+            shape.shift,
+            offset,
+        ],
+        [array(encoded, wp.int32), array(colors, wp.vec3)],
+        FORWARD_THREADS,
+    )
+    return colors, encoded, packed
+
+
+def backward(
+    grad_colors: torch.Tensor,
+    scale: torch.Tensor,
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    directions: torch.Tensor,
+    table: torch.Tensor,
+    weights: Sequence[torch.Tensor],
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+    encoded: torch.Tensor,
+    packed: torch.Tensor,
+    colors: torch.Tensor | None,
+    shape: Shape,
+    need_points: bool,
+) -> tuple[torch.Tensor, torch.Tensor | None, list[torch.Tensor]]:
+    """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices.
+
+    Args:
+        grad_colors: (n, 3).
+        scale: (1,) factor of gradients in half precision.
+        encoded, packed: of `forward`.
+        colors: of `forward` if they were clamped.
+        need_points: whether positions or depths need a gradient.
+
+    The others are those of `forward`.
+    """
+    degree, (levels, size, features) = _degree(weights), table.shape
+    unscale = scale.reciprocal()
+    grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=table.device)
+    warps = _warps(positions, shape.units, BACKWARD_BLOCKS * WARPS)
+    sums = positions.new_empty(warps // (WARPS if positions.is_cuda else 1), sum(gradient_sizes(degree)))
+    _launch(
+        fused_kernels(features, degree, colors is not None).backward,
+        positions,
+        warps,
+        [
+            array(encoded, wp.int32),
+            array(directions, wp.vec3),
+            array(packed, wp.int32),
+            *shape,
+            shape.shift,
+            array(scale, wp.float32),
+            array(colors, wp.vec3),
+            array(grad_colors, wp.vec3),
+        ],
+        [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
+        32 * WARPS,
+    )
+    flat = sums.sum(0).index_select(0, _order(features, degree, positions.device)) * unscale
+    ends = np.cumsum([0, *(matrix.numel() for matrix in weights)]).tolist()
+    grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
+    grad_grid = torch.zeros_like(table, dtype=torch.float32)
+    grad_points = positions.new_empty(int(need_points), len(positions), 4)
+    row, vec = (wp.types.vector(length=features, dtype=x) for x in (wp.float16, wp.float32))
+    launch(
+        positions,
+        fused_scatter_kernel(features),
+        shape.threads,
+        [
+            array(table, row),
+            array(positions, wp.vec3),
+            array(depths, wp.float32),
+            array(resolutions, wp.float32),
+            array(focal, wp.float32),
+            wp.uint32(size - 1),
+            array(grad_encoded, row),
+            array(unscale, wp.float32),
+            *shape,
+            shape.shift,
+            levels,
+        ],
+        [array(grad_grid, vec), array(grad_points, wp.vec4)],
+        smallest=shape.threads,
+    )
+    return grad_grid, grad_points[0] if need_points else None, grad_matrices
+
+
+def _launch(
+    kernel: wp.Kernel, like: torch.Tensor, warps: int, inputs: list[object], outputs: list[object], threads: int
+) -> None:
+    """Launch a kernel whose second argument is its number of threads, on CUDA 32 for each warp."""
+    count = warps * 32 if device_of(like).is_cuda else warps
+    launch(like, kernel, count, [count, *inputs], outputs, block_dim=threads, smallest=count)
+
+
+def _warps(like: torch.Tensor, most: int, each: int) -> int:
+    """Return how many warps share out the work: `each` a multiprocessor on CUDA."""
+    if not like.is_cuda:
+        return min(most, 2)
+    return torch.cuda.get_device_properties(like.device).multi_processor_count * each
+
+
+def _degree(weights: Sequence[torch.Tensor]) -> int:
+    return round((len(weights[-1]) // 3) ** 0.5) - 1
+
+
+def _pack(weights: Sequence[torch.Tensor], features: int, degree: int) -> torch.Tensor:
+    """Return the matrices as words of two halves, in the order in which the kernels' lanes load them."""
+    padded = torch.cat([*(matrix.reshape(-1) for matrix in weights), weights[0].new_zeros(1)])
+    return padded.index_select(0, _sources(features, degree, padded.device)).half().view(torch.int32)
+
+
+@functools.cache
+def _sources(features: int, degree: int, device: torch.device) -> torch.Tensor:
+    """Return where each packed half is among the matrices' values, one after another; a zero stands after them."""
+    w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[:, [logical_feature(c, features) for c in range(FEATURES)]]
+    w2 = WIDTH * FEATURES + np.arange(WIDTH**2).reshape(WIDTH, WIDTH)
+    start, outputs = WIDTH * (FEATURES + WIDTH), 3 * (degree + 1) ** 2
+    w3 = np.full((outputs + 1, WIDTH), start + outputs * WIDTH)  # its last row, that of -1, is padding
+    w3[:-1] = start + np.arange(outputs * WIDTH).reshape(outputs, WIDTH)
+    w3 = w3[[logical_output(c, degree) for c in range(16 * Layout(degree).pairs)]]
+    # As matrices of the products: (inner dimension, columns).
+    matrices = {"W1": w1.T, "W2": w2.T, "W3": w3.T, "W3T": w3, "W2T": w2, "W1T": w1}
+    parts = []
+    for name, (k_tiles, n_tiles) in Layout(degree).segments().items():
+        pairs = (k_tiles + 1) // 2
+        matrix = np.full((pairs * 32, n_tiles * 8), start + outputs * WIDTH)
+        matrix[: k_tiles * 16] = matrices[name][:, : n_tiles * 8]
+        # k = pair * 32 + tile * 16 + part * 8 + q * 2 + half; column = n * 8 + g.
+        split = matrix.reshape(pairs, 2, 2, 4, 2, n_tiles, 8)
+        parts.append(split.transpose(5, 0, 6, 3, 1, 2, 4).reshape(-1))  # n, pair, g, q, tile, part, half
+    return torch.from_numpy(np.concatenate(parts).astype(np.int64)).to(device)
+
+
+@functools.cache
+def _order(features: int, degree: int, device: torch.device) -> torch.Tensor:
+    """Return where each value of the matrices' gradients is among the sums of the backward kernel."""
+    columns = np.argsort([logical_feature(c, features) for c in range(FEATURES)])
+    w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[:, columns]
+    w2 = WIDTH * FEATURES + np.arange(WIDTH**2)
+    rows = [logical_output(c, degree) for c in range(16 * Layout(degree).pairs)]
+    w3 = np.array([rows.index(i) for i in range(3 * (degree + 1) ** 2)])[:, None] * WIDTH + np.arange(WIDTH)
+    parts = [w1.reshape(-1), w2, WIDTH * (FEATURES + WIDTH) + w3.reshape(-1)]
+    return torch.from_numpy(np.concatenate(parts).astype(np.int64)).to(device)
