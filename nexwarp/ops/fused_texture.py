@@ -10,13 +10,14 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.fused_scatter import fused_scatter_kernel
-from nexwarp.kernels.fused_texture import (
+from nexwarp.kernels.fused_texture import fused_kernels
+from nexwarp.kernels.native.fused_texture import (
     FEATURES,
+    GRADIENTS,
+    MATRICES,
+    OUTPUTS,
     WARPS,
     WIDTH,
-    Layout,
-    fused_kernels,
-    gradient_sizes,
     logical_feature,
     logical_output,
 )
@@ -94,6 +95,7 @@ def colors(
     depths: torch.Tensor,
     directions: torch.Tensor,
     grid: torch.Tensor,
+    table: torch.Tensor,
     weights: Sequence[torch.Tensor],
     resolutions: torch.Tensor,
     focal: torch.Tensor,
@@ -105,12 +107,11 @@ def colors(
 ) -> torch.Tensor:
     """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
 
-    The arguments are those of `nexwarp.ops.texture`; `shape` is the image's, and `keep` says whether there will be a
-    backward pass.
+    The arguments are those of `nexwarp.ops.texture`; `table` is the grid in half precision, `shape` the image's,
+    and `keep` says whether there will be a backward pass.
     """
-    return _Colors.apply(
-        positions, depths, directions, grid, resolutions, focal, shape, offset, clamp, keep, *weights
-    )
+    given = (positions, depths, directions, grid, table, resolutions, focal, shape, offset, clamp, keep)
+    return _Colors.apply(*given, *weights)
 
 
 class _Context(Context):
@@ -126,6 +127,7 @@ class _Colors(torch.autograd.Function):
         depths: torch.Tensor,
         directions: torch.Tensor,
         grid: torch.Tensor,
+        table: torch.Tensor,
         resolutions: torch.Tensor,
         focal: torch.Tensor,
         shape: Shape,
@@ -134,7 +136,6 @@ class _Colors(torch.autograd.Function):
         keep: bool,
         *weights: torch.Tensor,
     ) -> torch.Tensor:
-        table = grid.contiguous().half()
         result, encoded, packed = forward(
             positions, depths, directions, table, weights, resolutions, focal, shape, offset, clamp, keep
         )
@@ -157,7 +158,7 @@ class _Colors(torch.autograd.Function):
             grad_points[:, 3] if need_depths and grad_points is not None else None,
             None,
             grad_grid if need_grid else None,
-            *(None,) * 6,
+            *(None,) * 7,
             *grad_matrices,
         )
 
@@ -184,13 +185,13 @@ def forward(
         shape: of the image.
         keep: keep the features for `backward`.
     """
-    degree, features = _degree(weights), table.shape[2]
-    packed = _pack(weights, features, degree)
+    features = table.shape[2]
+    packed = _pack(weights, features)
     encoded = torch.empty(shape.units * 256 if keep else 0, dtype=torch.int32, device=table.device)
     colors = torch.empty_like(positions)
     warps = _warps(positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
     _launch(
-        fused_kernels(features, degree, clamp).forward,
+        fused_kernels(features).forward,
         positions,
         warps,
         [
@@ -205,6 +206,7 @@ def forward(
             *shape,
             shape.shift,
             offset,
+            int(clamp),
         ],
         [array(encoded, wp.int32), array(colors, wp.vec3)],
         FORWARD_THREADS,
@@ -239,13 +241,13 @@ def backward(
 
     The others are those of `forward`.
     """
-    degree, (levels, size, features) = _degree(weights), table.shape
+    levels, size, features = table.shape
     unscale = scale.reciprocal()
     grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=table.device)
     warps = _warps(positions, shape.units, BACKWARD_BLOCKS * WARPS)
-    sums = positions.new_empty(warps // (WARPS if positions.is_cuda else 1), sum(gradient_sizes(degree)))
+    sums = positions.new_empty(warps // (WARPS if positions.is_cuda else 1), sum(GRADIENTS))
     _launch(
-        fused_kernels(features, degree, colors is not None).backward,
+        fused_kernels(features).backward,
         positions,
         warps,
         [
@@ -261,7 +263,7 @@ def backward(
         [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
         32 * WARPS,
     )
-    flat = sums.sum(0).index_select(0, _order(features, degree, positions.device)) * unscale
+    flat = sums.sum(0).index_select(0, _order(features, len(weights[-1]), positions.device)) * unscale
     ends = np.cumsum([0, *(matrix.numel() for matrix in weights)]).tolist()
     grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
@@ -305,32 +307,28 @@ def _warps(like: torch.Tensor, most: int, each: int) -> int:
     return torch.cuda.get_device_properties(like.device).multi_processor_count * each
 
 
-def _degree(weights: Sequence[torch.Tensor]) -> int:
-    return round((len(weights[-1]) // 3) ** 0.5) - 1
-
-
-def _pack(weights: Sequence[torch.Tensor], features: int, degree: int) -> torch.Tensor:
+def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:
     """Return the matrices as words of two halves, in the order in which the kernels' lanes load them."""
     padded = torch.cat([*(matrix.reshape(-1) for matrix in weights), weights[0].new_zeros(1)])
-    return padded.index_select(0, _sources(features, degree, padded.device)).half().view(torch.int32)
+    return padded.index_select(0, _sources(features, len(weights[-1]), padded.device)).half().view(torch.int32)
 
 
 @functools.cache
-def _sources(features: int, degree: int, device: torch.device) -> torch.Tensor:
+def _sources(features: int, outputs: int, device: torch.device) -> torch.Tensor:
     """Return where each packed half is among the matrices' values, one after another; a zero stands after them."""
     w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[:, [logical_feature(c, features) for c in range(FEATURES)]]
     w2 = WIDTH * FEATURES + np.arange(WIDTH**2).reshape(WIDTH, WIDTH)
-    start, outputs = WIDTH * (FEATURES + WIDTH), 3 * (degree + 1) ** 2
-    w3 = np.full((outputs + 1, WIDTH), start + outputs * WIDTH)  # its last row, that of -1, is padding
-    w3[:-1] = start + np.arange(outputs * WIDTH).reshape(outputs, WIDTH)
-    w3 = w3[[logical_output(c, degree) for c in range(16 * Layout(degree).pairs)]]
+    start = WIDTH * (FEATURES + WIDTH)
+    zero = start + outputs * WIDTH
+    w3 = np.minimum(start + np.arange(OUTPUTS * WIDTH), zero).reshape(OUTPUTS, WIDTH)
+    w3 = w3[[logical_output(c) for c in range(OUTPUTS)]]
     # As matrices of the products: (inner dimension, columns).
     matrices = {"W1": w1.T, "W2": w2.T, "W3": w3.T, "W3T": w3, "W2T": w2, "W1T": w1}
     parts = []
-    for name, (k_tiles, n_tiles) in Layout(degree).segments().items():
+    for name, (k_tiles, n_tiles) in MATRICES.items():
         pairs = (k_tiles + 1) // 2
-        matrix = np.full((pairs * 32, n_tiles * 8), start + outputs * WIDTH)
-        matrix[: k_tiles * 16] = matrices[name][:, : n_tiles * 8]
+        matrix = np.full((pairs * 32, n_tiles * 8), zero)
+        matrix[: k_tiles * 16] = matrices[name]
         # k = pair * 32 + tile * 16 + part * 8 + q * 2 + half; column = n * 8 + g.
         split = matrix.reshape(pairs, 2, 2, 4, 2, n_tiles, 8)
         parts.append(split.transpose(5, 0, 6, 3, 1, 2, 4).reshape(-1))  # n, pair, g, q, tile, part, half
@@ -338,12 +336,11 @@ def _sources(features: int, degree: int, device: torch.device) -> torch.Tensor:
 
 
 @functools.cache
-def _order(features: int, degree: int, device: torch.device) -> torch.Tensor:
+def _order(features: int, outputs: int, device: torch.device) -> torch.Tensor:
     """Return where each value of the matrices' gradients is among the sums of the backward kernel."""
     columns = np.argsort([logical_feature(c, features) for c in range(FEATURES)])
     w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[:, columns]
     w2 = WIDTH * FEATURES + np.arange(WIDTH**2)
-    rows = [logical_output(c, degree) for c in range(16 * Layout(degree).pairs)]
-    w3 = np.array([rows.index(i) for i in range(3 * (degree + 1) ** 2)])[:, None] * WIDTH + np.arange(WIDTH)
-    parts = [w1.reshape(-1), w2, WIDTH * (FEATURES + WIDTH) + w3.reshape(-1)]
-    return torch.from_numpy(np.concatenate(parts).astype(np.int64)).to(device)
+    rows = np.argsort([logical_output(c) for c in range(OUTPUTS)])[:outputs]
+    w3 = WIDTH * (FEATURES + WIDTH) + rows[:, None] * WIDTH + np.arange(WIDTH)
+    return torch.from_numpy(np.concatenate([x.reshape(-1) for x in (w1, w2, w3)]).astype(np.int64)).to(device)

@@ -37,6 +37,7 @@ def texture(
     offset: float = 0.5,
     clamp: bool = False,
     half: bool = False,
+    table: torch.Tensor | None = None,
     image: tuple[int, int] | None = None,
     fused: bool = True,
 ) -> torch.Tensor:
@@ -61,6 +62,7 @@ def texture(
         clamp: limit colours to >= 0.
         half: keep features, activations and coefficients in half precision; gradients are scaled on the way
             and summed in float32.
+        table: (L, T, F) the grid in half precision, where the caller has it already.
         image: (height, width), whose product is P, of the image that the directions belong to, row by row; neighbouring
             pixels then work together. It changes no result but for the order of sums.
         fused: False computes layer by layer in any case.
@@ -77,10 +79,11 @@ def texture(
         if fused and half and fused_texture.usable(positions, directions, grid, weights):
             height, width = image or (1, len(directions))
             shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
-            return fused_texture.colors(
-                positions, depths, directions, grid, weights, resolutions, focal, shape, offset, clamp, keep=keep
-            )
-    return _Texture.apply(positions, depths, directions, grid, resolutions, focal, offset, clamp, half, keep, *weights)
+            copy = grid.detach().contiguous().half() if table is None else table
+            given = (positions, depths, directions, grid, copy, weights, resolutions, focal, shape, offset, clamp)
+            return fused_texture.colors(*given, keep=keep)
+    given = (positions, depths, directions, grid, table, resolutions, focal, offset, clamp, half, keep)
+    return _Texture.apply(*given, *weights)
 
 
 class _Texture(torch.autograd.Function):
@@ -91,6 +94,7 @@ class _Texture(torch.autograd.Function):
         depths: torch.Tensor,
         directions: torch.Tensor | None,
         grid: torch.Tensor,
+        table: torch.Tensor | None,
         resolutions: torch.Tensor,
         focal: torch.Tensor,
         offset: float,
@@ -100,7 +104,7 @@ class _Texture(torch.autograd.Function):
         *weights: torch.Tensor,
     ) -> torch.Tensor:
         dtype = torch.float16 if half else grid.dtype
-        table = grid.contiguous().to(dtype)
+        table = table if half and table is not None else grid.contiguous().to(dtype)
         matrices = [w.to(dtype) for w in weights]
         count = len(positions)
         encoded = torch.empty(grid.shape[0] * grid.shape[2], _padded(count, dtype), dtype=dtype, device=grid.device)
@@ -162,7 +166,7 @@ class _Texture(torch.autograd.Function):
             grad_depths if need_depths else None,
             grad_directions,
             grad_grid if need_grid else None,
-            *(None,) * 6,
+            *(None,) * 7,
             *grad_matrices,
         )
 

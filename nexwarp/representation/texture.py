@@ -100,6 +100,7 @@ class NeuralTexture(nn.Module):
         self.sh_degree = sh_degree
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
+        self._half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
         self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
@@ -127,6 +128,28 @@ class NeuralTexture(nn.Module):
 
     def _in_half(self) -> bool:
         return self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32
+
+    def half_copy(self) -> torch.Tensor:
+        """Return a half-precision copy (L, T, F) of the grid, which evaluations use from now on.
+
+        Torch's own changes of the grid are noticed. Whoever writes to the grid past torch, as a kernel or through
+        `grid.data` does, writes to the copy too, or calls `drop_half_copy`.
+        """
+        key = (self.grid.data_ptr(), self.grid._version)
+        if self._half_copy is None or self._half_copy[0].device != self.grid.device:
+            self._half_copy = (self.grid.detach().half(), key)
+        elif self._half_copy[1] != key:
+            self._half_copy[0].copy_(self.grid.detach())
+            self._half_copy = (self._half_copy[0], key)
+        return self._half_copy[0]
+
+    def drop_half_copy(self) -> None:
+        """Make each evaluation in half precision convert the grid again."""
+        self._half_copy = None
+
+    def half_copy_key(self) -> tuple[int, int, int] | None:
+        """Return what changes when `half_copy` would be made anew; None without a copy."""
+        return None if self._half_copy is None else (self._half_copy[0].data_ptr(), *self._half_copy[1])
 
     def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
         """Return the field's SH coefficients.
@@ -207,6 +230,7 @@ class NeuralTexture(nn.Module):
             offset=0.0 if self.residual else 0.5,
             clamp=clamp,
             half=self._in_half(),
+            table=self.half_copy() if self._in_half() and self._half_copy is not None else None,
             image=image,
         )
 
