@@ -64,8 +64,11 @@ _STEP = """
         unsigned words[2];
         for (int k = 0; k < 2; ++k)
             asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(words[k]) : "f"(p[2 * k + 1]), "f"(p[2 * k]));
-        if (size == 4) *reinterpret_cast<uint2*>(halves.data + at) = make_uint2(words[0], words[1]);
-        else for (int k = 0; k < size; ++k) halves.data[at + k] = wp::half(p[k]);
+        if (size == 4) {
+            *reinterpret_cast<uint2*>(halves.data + at) = make_uint2(words[0], words[1]);
+        } else {
+            for (int k = 0; k < 4; ++k) if (k < size) halves.data[at + k] = wp::half(p[k]);
+        }
 #else
         for (int k = 0; k < size; ++k) halves.data[at + k] = wp::half(p[k]);
 #endif
@@ -73,7 +76,22 @@ _STEP = """
     return loss;
 """
 
+# 1 - beta^count, which is small in the first steps: in double precision, or by the function made for that.
+_REST = """
+#if defined(__CUDA_ARCH__)
+    return -expm1f(log_beta * count);
+#else
+    return (float)(1.0 - wp::exp((double)log_beta * count));
+#endif
+"""
+
 Real = wp.array(dtype=wp.float32)
+
+
+@wp.func_native(_REST)
+def rest_of_power(log_beta: wp.float32, count: wp.float32) -> wp.float32:
+    """Return 1 - exp(log_beta * count)."""
+    ...
 
 
 @functools.cache
@@ -108,8 +126,12 @@ def adam_kernel() -> wp.Kernel:
         level_bits: wp.int32,
         step: Real,
         rates: Real,
-        beta1: wp.float64,
-        beta2: wp.float64,
+        beta1: wp.float32,
+        beta2: wp.float32,
+        rest1: wp.float32,
+        rest2: wp.float32,
+        log_beta1: wp.float32,
+        log_beta2: wp.float32,
         epsilon: wp.float32,
         # read and written
         values: Real,
@@ -120,11 +142,8 @@ def adam_kernel() -> wp.Kernel:
         losses: Real,
     ):
         thread = first + wp.tid()
-        one = wp.float64(1.0)
-        count = wp.float64(step[0])
-        # In double precision: 1 - beta^step is small in the first steps.
-        rate = wp.float64(rates[0]) / (one - wp.pow(beta1, count))
-        correction = one / wp.sqrt(one - wp.pow(beta2, count))
+        rate = rates[0] / rest_of_power(log_beta1, step[0])
+        correction = 1.0 / wp.sqrt(rest_of_power(log_beta2, step[0]))
         loss = update(
             thread,
             values,
@@ -134,12 +153,12 @@ def adam_kernel() -> wp.Kernel:
             halves,
             factors,
             level_bits,
-            wp.float32(beta1),
-            wp.float32(beta2),
-            wp.float32(one - beta1),
-            wp.float32(one - beta2),
-            wp.float32(rate),
-            wp.float32(correction),
+            beta1,
+            beta2,
+            rest1,
+            rest2,
+            rate,
+            correction,
             epsilon,
         )
         if losses.shape[0] > 0:

@@ -1,5 +1,6 @@
 """One step of Adam on one parameter, in place, with a regulariser and a half-precision copy."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -69,8 +70,9 @@ def adam_step(
             level_bits or 0,
             array(step.view(1), wp.float32),
             array(rate.view(1), wp.float32),
-            wp.float64(betas[0]),
-            wp.float64(betas[1]),
+            *betas,
+            *(1.0 - beta for beta in betas),
+            *(math.log(beta) for beta in betas),
             epsilon,
         ],
         [

@@ -268,25 +268,25 @@ def backward(
     grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
     grad_points = positions.new_empty(int(need_points), len(positions), 4)
-    row, vec = (wp.types.vector(length=features, dtype=x) for x in (wp.float16, wp.float32))
     launch(
         positions,
         fused_scatter_kernel(features),
         shape.threads,
         [
-            array(table, row),
+            array(table.view(-1), wp.float16),
             array(positions, wp.vec3),
             array(depths, wp.float32),
             array(resolutions, wp.float32),
             array(focal, wp.float32),
             wp.uint32(size - 1),
-            array(grad_encoded, row),
+            array(grad_encoded.view(-1), wp.float16),
+            shape.units * 16,
             array(unscale, wp.float32),
             *shape,
             shape.shift,
             levels,
         ],
-        [array(grad_grid, vec), array(grad_points, wp.vec4)],
+        [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
         smallest=shape.threads,
     )
     return grad_grid, grad_points[0] if need_points else None, grad_matrices
