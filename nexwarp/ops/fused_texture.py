@@ -28,6 +28,8 @@ from nexwarp.ops.half_gradients import gradient_scale
 # Blocks of each multiprocessor that share out the tiles.
 FORWARD_BLOCKS, BACKWARD_BLOCKS = 8, 3
 FORWARD_THREADS = 128
+# Runs of levels that different threads of the scatter kernel take.
+SCATTER_RUNS = 1
 
 
 class Shape(NamedTuple):
@@ -267,11 +269,11 @@ def backward(
     ends = np.cumsum([0, *(matrix.numel() for matrix in weights)]).tolist()
     grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    grad_points = positions.new_empty(int(need_points), len(positions), 4)
+    grad_points = positions.new_empty(SCATTER_RUNS * need_points, len(positions), 4)
     launch(
         positions,
         fused_scatter_kernel(features),
-        shape.threads,
+        shape.threads * SCATTER_RUNS,
         [
             array(table.view(-1), wp.float16),
             array(positions, wp.vec3),
@@ -284,12 +286,13 @@ def backward(
             array(unscale, wp.float32),
             *shape,
             shape.shift,
-            levels,
+            -(-levels // SCATTER_RUNS),
         ],
         [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
-        smallest=shape.threads,
+        smallest=shape.threads * SCATTER_RUNS,
     )
-    return grad_grid, grad_points[0] if need_points else None, grad_matrices
+    points = grad_points.sum(0) if SCATTER_RUNS > 1 else grad_points[0] if need_points else None
+    return grad_grid, points, grad_matrices
 
 
 def _launch(

@@ -251,7 +251,7 @@ _MASKED = """
 EACH_LANE {
     UNROLL
     for (int i = 0; i < 2; ++i) {
-        const unsigned kept = LAYER[n >> 1][(n & 1) * 2 + i][l];
+        const unsigned kept = LAYER;
         OUT[n >> 1][(n & 1) * 2 + i][l] = halves(kept & 0xffffu ? d[2 * i][l] : 0.0f, kept >> 16 ? d[2 * i + 1][l] : 0.0f);
     }
 }
@@ -279,6 +279,9 @@ EACH_LANE {
 }
 """
 
+# A word of `early`, where the first hidden layer waits for its turn.
+_EARLY = "early[(warp * 16 + (lane >> 2) + 8 * i) * ROW + (n >> 1) * 8 + (n & 1) * 4 + (lane & 3)]"
+
 _STAGE = """
             EACH_LANE {
                 UNROLL
@@ -286,7 +289,7 @@ _STAGE = """
                     UNROLL
                     for (int r = 0; r < 4; ++r) {
                         const int row = warp * 16 + (lane >> 2) + 8 * (r & 1);
-                        stage[PART][row * ROW + t * 8 + (r >> 1) * 4 + (lane & 3)] = SOURCE[t][r][l];
+                        PART[row * ROW + t * 8 + (r >> 1) * 4 + (lane & 3)] = SOURCE[t][r][l];
                     }
                 }
             }
@@ -297,13 +300,16 @@ _SYNC = """
             __syncthreads();
 #endif
 """
+_NEXT_STAGE = """
+            stage = stage == stages ? stages + 2 : stages;
+"""
 
 _ACCUMULATE = """
             #pragma unroll 1
             for (int s = 0; s < WARPS; ++s) {
                 unsigned right[PAIRS][4][LANES];
                 UNROLL
-                for (int p = 0; p < PAIRS; ++p) transposed(stage[1], s, FIRST_P + p, false, right[p]);
+                for (int p = 0; p < PAIRS; ++p) transposed(RIGHT, s, FIRST_P + p, false, right[p]);
                 UNROLL
                 for (int m = 0; m < ROWS; ++m) {
                     unsigned left[4][LANES];
@@ -334,14 +340,25 @@ _KEEP = """
     }
 """
 
+_READ_X = """
+            EACH_LANE {
+                const unsigned* from = reinterpret_cast<const unsigned*>(encoded.data) + (size_t)unit * 256;
+                UNROLL
+                for (int t = 0; t < 2; ++t) {
+                    if (here) read_four(from + (t * 32 + lane) * 4, x[t], l);
+                    else x[t][0][l] = x[t][1][l] = x[t][2][l] = x[t][3][l] = 0u;
+                }
+            }
+"""
+
 _BACKWARD = """
 #if defined(__CUDA_ARCH__)
     constexpr int WARPS = CUDA_WARPS;
-    __shared__ __align__(16) unsigned stage[2][WARPS * 16 * ROW];
+    __shared__ __align__(16) unsigned stages[4][WARPS * 16 * ROW], early[WARPS * 16 * ROW];
     const int warp = threadIdx.x >> 5, block = thread / (32 * WARPS), blocks = threads / (32 * WARPS);
 #else
     constexpr int WARPS = 1;
-    unsigned stage[2][WARPS * 16 * ROW];
+    unsigned stages[4][WARPS * 16 * ROW], early[WARPS * 16 * ROW];
     const int warp = 0, block = thread, blocks = threads;
 #endif
     // Which part of each matrix's gradient this warp sums: rows and pairs of tiles of columns.
@@ -355,6 +372,8 @@ _BACKWARD = """
     const int across = (width + (1 << shift) - 1) >> shift;
     const int units = across * ((height + (16 >> shift) - 1) >> (4 - shift)) * hits;
     const size_t places = (size_t)units * 16;
+    // Two pairs of stages take turns, so that one barrier a layer suffices.
+    unsigned (*stage)[WARPS * 16 * ROW] = stages;
     #pragma unroll 1
     for (int first = block * WARPS; first < units; first += blocks * WARPS) {
             const int unit = first + warp, tile = unit / hits, hit = unit % hits;
@@ -385,26 +404,19 @@ PIXELS
                 }
             }
             }
-            EACH_LANE {
-                const unsigned* from = reinterpret_cast<const unsigned*>(encoded.data) + (size_t)unit * 256;
-                UNROLL
-                for (int t = 0; t < 2; ++t) {
-                    if (here) read_four(from + (t * 32 + lane) * 4, x[t], l);
-                    else x[t][0][l] = x[t][1][l] = x[t][2][l] = x[t][3][l] = 0u;
-                }
-            }
+READ_X
 BODY
     }
     float* slots = grad_matrices.data + (size_t)block * SUMS;
 """
 
 
-def _staged(part: int, source: str, tiles: int) -> str:
-    return _STAGE.replace("PART", str(part)).replace("SOURCE", source).replace("TILES", str(tiles))
+def _staged(part: str, source: str, tiles: int) -> str:
+    return _STAGE.replace("PART", part).replace("SOURCE", source).replace("TILES", str(tiles))
 
 
-def _summed(text: str, number: int, columns: int, offset: int) -> str:
-    """Fill in which sums of matrix gradient `number` a warp holds."""
+def _summed(text: str, number: int, columns: int = 0, offset: int = 0) -> str:
+    """Fill in which sums of matrix gradient `number` a warp holds, and where the layer's input is."""
     first_m, first_p = ("0", f"warp * P{number}") if number == 3 else (f"half_m * M{number}", f"half_p * P{number}")
     names = {
         "FIRST_M": f"({first_m})",
@@ -414,6 +426,7 @@ def _summed(text: str, number: int, columns: int, offset: int) -> str:
         "COLUMNS": str(columns),
         "OFFSET": str(offset),
         "SUM": f"sum{number}",
+        "RIGHT": "early" if number == 2 else "stage[1]",
     }
     for name, value in names.items():
         text = text.replace(name, value)
@@ -435,19 +448,18 @@ def backward_text(features: int) -> str:
     at = offsets()
     body = product("x", f"weights + {at['W1']}", 2, 8, _HIDDEN.replace("OUT", "y"))
     body += product("y", f"weights + {at['W2']}", 4, 8, _HIDDEN.replace("OUT", "z"))
-    body += _staged(0, "g", 3) + _staged(1, "z", 4) + _SYNC
-    body += _summed(_ACCUMULATE, 3, 0, 0)
+    body += _staged("early", "y", 4) + _staged("stage[0]", "g", 3) + _staged("stage[1]", "z", 4) + _SYNC
+    body += _summed(_ACCUMULATE, 3)
     body += "unsigned dz[4][4][LANES], dy[4][4][LANES], even[2][LANES];"
-    masked = _MASKED.replace("LAYER", "z").replace("OUT", "dz")
+    masked = _MASKED.replace("LAYER", "z[n >> 1][(n & 1) * 2 + i][l]").replace("OUT", "dz")
     body += product("g", f"weights + {at['W3T']}", 3, 8, masked)
-    body += _SYNC + _staged(0, "dz", 4) + _staged(1, "y", 4) + _SYNC
-    body += _summed(_ACCUMULATE, 2, 0, 0)
-    masked = _MASKED.replace("LAYER", "y").replace("OUT", "dy")
+    body += _NEXT_STAGE + _staged("stage[0]", "dz", 4) + _SYNC + _summed(_ACCUMULATE, 2)
+    masked = _MASKED.replace("LAYER", _EARLY).replace("OUT", "dy")
     body += product("dz", f"weights + {at['W2T']}", 4, 8, masked)
-    body += _SYNC + _staged(0, "dy", 4) + _staged(1, "x", 2) + _SYNC
-    body += _summed(_ACCUMULATE, 1, 0, 0)
-    body += product("dy", f"weights + {at['W1T']}", 4, 4, _FEATURES) + _SYNC
-    text = _BACKWARD.replace("PIXELS", _PIXELS).replace("BODY", body)
+    body += _NEXT_STAGE + _READ_X + _staged("stage[0]", "dy", 4) + _staged("stage[1]", "x", 2) + _SYNC
+    body += _summed(_ACCUMULATE, 1)
+    body += product("dy", f"weights + {at['W1T']}", 4, 4, _FEATURES) + _NEXT_STAGE
+    text = _BACKWARD.replace("PIXELS", _PIXELS).replace("READ_X", _READ_X).replace("BODY", body)
     text += _summed(_KEEP, 1, FEATURES, 0)
     text += _summed(_KEEP, 2, WIDTH, GRADIENTS[0])
     text += _summed(_KEEP, 3, WIDTH, GRADIENTS[0] + GRADIENTS[1])

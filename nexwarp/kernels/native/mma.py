@@ -31,7 +31,7 @@ PRELUDE = """
         *reinterpret_cast<uint4*>(to) = make_uint4(from[0][0], from[1][0], from[2][0], from[3][0]);
     };
     auto multiply_add = [](wp::float32 (*d)[1], const unsigned (*a)[1], const unsigned (*b)[1]) {
-        asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
             : "+f"(d[0][0]), "+f"(d[1][0]), "+f"(d[2][0]), "+f"(d[3][0])
             : "r"(a[0][0]), "r"(a[1][0]), "r"(a[2][0]), "r"(a[3][0]), "r"(b[0][0]), "r"(b[1][0]));
     };
@@ -93,23 +93,34 @@ PRELUDE = """
 """
 
 # A product of fragments with packed matrices; CONSUME uses D of tile n. Two tiles of k share a load of four words.
+# Several tiles of columns take turns: a product waits for the one before it in its own tile alone.
 _PRODUCT = """
     UNROLL
-    for (int n = 0; n < N_TILES; ++n) {
-        float d[4][LANES] = {};
+    for (int first_n = 0; first_n < N_TILES; first_n += TURNS) {
+        wp::float32 sums[TURNS][4][LANES] = {};
         UNROLL
         for (int k = 0; k < K_PAIRS; ++k) {
-            unsigned b[4][LANES];
-            EACH_LANE read_four(WEIGHTS + ((n * K_PAIRS + k) * 32 + lane) * 4, b, l);
-            multiply_add(d, SOURCE[2 * k], b);
-            if (2 * k + 1 < K_TILES) multiply_add(d, SOURCE[2 * k + 1 < K_TILES ? 2 * k + 1 : 0], b + 2);
+            unsigned b[TURNS][4][LANES];
+            UNROLL
+            for (int i = 0; i < TURNS; ++i)
+                EACH_LANE read_four(WEIGHTS + (((first_n + i) * K_PAIRS + k) * 32 + lane) * 4, b[i], l);
+            UNROLL
+            for (int i = 0; i < TURNS; ++i) multiply_add(sums[i], SOURCE[2 * k], b[i]);
+            UNROLL
+            for (int i = 0; i < TURNS; ++i)
+                if (2 * k + 1 < K_TILES) multiply_add(sums[i], SOURCE[2 * k + 1 < K_TILES ? 2 * k + 1 : 0], b[i] + 2);
         }
-        CONSUME
+        UNROLL
+        for (int i = 0; i < TURNS; ++i) {
+            const int n = first_n + i;
+            wp::float32 (*d)[LANES] = sums[i];
+            CONSUME
+        }
     }
 """
 
 
-def product(source: str, weights: str, k_tiles: int, n_tiles: int, consume: str) -> str:
+def product(source: str, weights: str, k_tiles: int, n_tiles: int, consume: str, turns: int = 2) -> str:
     """Return the text of a product of fragments `source[k_tiles]` with a packed matrix of `n_tiles` tiles of columns.
 
     Args:
@@ -118,10 +129,11 @@ def product(source: str, weights: str, k_tiles: int, n_tiles: int, consume: str)
         k_tiles: tiles of 16 of the inner dimension.
         n_tiles: tiles of 8 columns.
         consume: statements that use D, float d[4][LANES], of tile n.
+        turns: how many tiles of columns take turns; divides n_tiles.
     """
     text = _PRODUCT.replace("CONSUME", consume).replace("SOURCE", source).replace("WEIGHTS", weights)
     text = text.replace("N_TILES", str(n_tiles)).replace("K_PAIRS", str((k_tiles + 1) // 2))
-    return text.replace("K_TILES", str(k_tiles))
+    return text.replace("K_TILES", str(k_tiles)).replace("TURNS", str(turns))
 
 
 # A (16, 16) or B (16, 16: two tiles of columns) from rows of points in shared memory, transposed on the way.
