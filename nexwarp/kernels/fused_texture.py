@@ -28,6 +28,72 @@ Half, Word = wp.array(dtype=wp.float16), wp.array(dtype=wp.int32)
 Real, Vec3 = wp.array(dtype=wp.float32), wp.array(dtype=wp.vec3)
 
 
+@wp.func_native("""
+    union { int bits; float value; } power;
+    power.bits = (exponent + 127) << 23;
+    return power.value;
+""")
+def power_of_two(exponent: wp.int32) -> wp.float32:
+    """Return 2^exponent, exactly."""
+    ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def half_scale(
+    first: wp.int32,
+    largest: Real,
+    target: wp.float32,
+    # outputs
+    scale: Real,
+    unscale: Real,
+):
+    """Power of two that brings `largest` near `target`, and its inverse."""
+    exponent = wp.clamp(int(wp.floor(wp.log2(target / wp.max(largest[0], 1.0e-30)))), -24, 60)
+    scale[first + wp.tid()] = power_of_two(exponent)
+    unscale[first + wp.tid()] = power_of_two(-exponent)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def pack_matrices(
+    first: wp.int32,
+    matrix1: Real,
+    matrix2: Real,
+    matrix3: Real,
+    sources: Word,
+    # outputs
+    packed: wp.array(dtype=wp.float16),
+):
+    """Gather the matrices' values, one matrix after another; what lies after the last one is 0."""
+    i = first + wp.tid()
+    source = sources[i]
+    value = float(0.0)
+    if source < matrix1.shape[0]:
+        value = matrix1[source]
+    else:
+        source -= matrix1.shape[0]
+        if source < matrix2.shape[0]:
+            value = matrix2[source]
+        else:
+            source -= matrix2.shape[0]
+            if source < matrix3.shape[0]:
+                value = matrix3[source]
+    packed[i] = wp.float16(value)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def order_gradients(
+    first: wp.int32,
+    sums: Real,
+    order: Word,
+    unscale: Real,
+    # outputs
+    gradients: Real,
+):
+    """Put the matrices' gradients into the order of the matrices' values."""
+    i = first + wp.tid()
+    gradients[i] = sums[order[i]] * unscale[0]
+
+
 @functools.cache
 def fused_kernels(
     features: int, forward_bounds: tuple[int, int] = (128, 4), backward_blocks: int = 3

@@ -10,7 +10,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.fused_scatter import fused_scatter_kernel
-from nexwarp.kernels.fused_texture import fused_kernels
+from nexwarp.kernels.fused_texture import fused_kernels, half_scale, order_gradients, pack_matrices
 from nexwarp.kernels.native.fused_texture import (
     FEATURES,
     GRADIENTS,
@@ -23,7 +23,7 @@ from nexwarp.kernels.native.fused_texture import (
 )
 from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
-from nexwarp.ops.half_gradients import gradient_scale
+from nexwarp.ops.half_gradients import HALF_GRADIENT
 
 # Blocks of each multiprocessor that share out the tiles.
 FORWARD_BLOCKS, BACKWARD_BLOCKS = 8, 3
@@ -152,9 +152,8 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, directions, table, resolutions, focal, result, encoded, packed, *weights = ctx.saved_tensors
         need_positions, need_depths, _, need_grid, *_ = ctx.needs_input_grad
-        scale, grad = gradient_scale(grad, torch.float16), grad.contiguous()
         given = (positions, depths, directions, table, weights, resolutions, focal, encoded, packed, result, ctx.shape)
-        grad_grid, grad_points, grad_matrices = backward(grad, scale, *given, need_positions or need_depths)
+        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), *given, need_positions or need_depths)
         return (
             grad_points[:, :3] if need_positions and grad_points is not None else None,
             grad_points[:, 3] if need_depths and grad_points is not None else None,
@@ -218,7 +217,6 @@ def forward(
 
 def backward(
     grad_colors: torch.Tensor,
-    scale: torch.Tensor,
     positions: torch.Tensor,
     depths: torch.Tensor,
     directions: torch.Tensor,
@@ -236,7 +234,6 @@ def backward(
 
     Args:
         grad_colors: (n, 3).
-        scale: (1,) factor of gradients in half precision.
         encoded, packed: of `forward`.
         colors: of `forward` if they were clamped.
         need_points: whether positions or depths need a gradient.
@@ -244,7 +241,7 @@ def backward(
     The others are those of `forward`.
     """
     levels, size, features = table.shape
-    unscale = scale.reciprocal()
+    scale, unscale = _scales(grad_colors)
     grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=table.device)
     warps = _warps(positions, shape.units, BACKWARD_BLOCKS * WARPS)
     sums = positions.new_empty(warps // (WARPS if positions.is_cuda else 1), sum(GRADIENTS))
@@ -265,7 +262,10 @@ def backward(
         [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
         32 * WARPS,
     )
-    flat = sums.sum(0).index_select(0, _order(features, len(weights[-1]), positions.device)) * unscale
+    order = _order(features, len(weights[-1]), positions.device)
+    flat = positions.new_empty(len(order))
+    given = [array(sums.sum(0), wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
+    launch(positions, order_gradients, len(order), given, [array(flat, wp.float32)])
     ends = np.cumsum([0, *(matrix.numel() for matrix in weights)]).tolist()
     grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
@@ -312,8 +312,21 @@ def _warps(like: torch.Tensor, most: int, each: int) -> int:
 
 def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:
     """Return the matrices as words of two halves, in the order in which the kernels' lanes load them."""
-    padded = torch.cat([*(matrix.reshape(-1) for matrix in weights), weights[0].new_zeros(1)])
-    return padded.index_select(0, _sources(features, len(weights[-1]), padded.device)).half().view(torch.int32)
+    sources = _sources(features, len(weights[-1]), weights[0].device)
+    packed = torch.empty(len(sources), dtype=torch.float16, device=sources.device)
+    matrices = [array(matrix.reshape(-1), wp.float32) for matrix in weights]
+    given = [*matrices, array(sources, wp.int32)]
+    launch(packed, pack_matrices, len(packed), given, [array(packed, wp.float16)])
+    return packed.view(torch.int32)
+
+
+def _scales(grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the factor (1,) that gradients in half precision are multiplied by, and its inverse."""
+    largest = torch.linalg.vector_norm(grad, float("inf")).view(1)
+    scale, unscale = torch.empty_like(largest), torch.empty_like(largest)
+    given = [array(largest, wp.float32), HALF_GRADIENT]
+    launch(grad, half_scale, 1, given, [array(x, wp.float32) for x in (scale, unscale)])
+    return scale, unscale
 
 
 @functools.cache
@@ -335,7 +348,7 @@ def _sources(features: int, outputs: int, device: torch.device) -> torch.Tensor:
         # k = pair * 32 + tile * 16 + part * 8 + q * 2 + half; column = n * 8 + g.
         split = matrix.reshape(pairs, 2, 2, 4, 2, n_tiles, 8)
         parts.append(split.transpose(5, 0, 6, 3, 1, 2, 4).reshape(-1))  # n, pair, g, q, tile, part, half
-    return torch.from_numpy(np.concatenate(parts).astype(np.int64)).to(device)
+    return torch.from_numpy(np.concatenate(parts).astype(np.int32)).to(device)
 
 
 @functools.cache
@@ -346,4 +359,4 @@ def _order(features: int, outputs: int, device: torch.device) -> torch.Tensor:
     w2 = WIDTH * FEATURES + np.arange(WIDTH**2)
     rows = np.argsort([logical_output(c) for c in range(OUTPUTS)])[:outputs]
     w3 = WIDTH * (FEATURES + WIDTH) + rows[:, None] * WIDTH + np.arange(WIDTH)
-    return torch.from_numpy(np.concatenate([x.reshape(-1) for x in (w1, w2, w3)]).astype(np.int64)).to(device)
+    return torch.from_numpy(np.concatenate([x.reshape(-1) for x in (w1, w2, w3)]).astype(np.int32)).to(device)
