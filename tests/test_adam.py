@@ -91,7 +91,9 @@ def test_parameters_without_a_gradient_stay(device: torch.device) -> None:
     optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 1.0))
     optimizer.step()
     assert torch.equal(parameters["small"], before["small"]) and parameters["small"] not in optimizer.state
-    assert (parameters["grid"].abs() < before["grid"].abs()).float().mean() > 0.9  # Adam's first step has the rate's size
+    assert (
+        parameters["grid"].abs() < before["grid"].abs()
+    ).float().mean() > 0.9  # Adam's first step has the rate's size
     with pytest.raises(TypeError, match=r"^closure: expected None"):
         optimizer.step(lambda: 0.0)
 

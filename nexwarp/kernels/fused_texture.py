@@ -24,6 +24,10 @@ import warp as wp
 
 from nexwarp.kernels.native.fused_texture import WARPS, backward_text, forward_text
 
+FORWARD_THREADS, BACKWARD_THREADS = 256, 32 * WARPS  # of a block
+# Blocks that a multiprocessor holds at least, for which the compiler limits registers.
+FORWARD_BLOCKS, BACKWARD_BLOCKS = 3, 3
+
 Half, Word = wp.array(dtype=wp.float16), wp.array(dtype=wp.int32)
 Real, Vec3 = wp.array(dtype=wp.float32), wp.array(dtype=wp.vec3)
 
@@ -95,17 +99,10 @@ def order_gradients(
 
 
 @functools.cache
-def fused_kernels(
-    features: int, forward_bounds: tuple[int, int] = (128, 4), backward_blocks: int = 3
-) -> SimpleNamespace:
-    """Make the kernels of the forward pass and of the backward pass down to the features.
+def fused_kernels(features: int) -> SimpleNamespace:
+    """Make the kernels of the forward pass and of the backward pass down to the features, for F = 2 or 4.
 
     Both take threads = 32 times a number of warps, on a CPU the number of warps, which share out the tiles.
-
-    Args:
-        features: F, 2 or 4.
-        forward_bounds: threads of a block of the forward kernel, and how many blocks a multiprocessor holds at least.
-        backward_blocks: the latter for the backward kernel, whose blocks have 32 * WARPS threads.
     """
 
     @wp.func_native(forward_text(features))
@@ -148,7 +145,9 @@ def fused_kernels(
         grad_matrices: Real,
     ): ...
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=forward_bounds)
+    @wp.kernel(
+        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
+    )
     def fused_forward(
         first: wp.int32,
         threads: wp.int32,
@@ -192,7 +191,7 @@ def fused_kernels(
         )
 
     @wp.kernel(
-        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(32 * WARPS, backward_blocks)
+        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
     )
     def fused_backward(
         first: wp.int32,

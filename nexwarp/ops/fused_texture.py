@@ -10,7 +10,16 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.fused_scatter import fused_scatter_kernel
-from nexwarp.kernels.fused_texture import fused_kernels, half_scale, order_gradients, pack_matrices
+from nexwarp.kernels.fused_texture import (
+    BACKWARD_BLOCKS,
+    BACKWARD_THREADS,
+    FORWARD_BLOCKS,
+    FORWARD_THREADS,
+    fused_kernels,
+    half_scale,
+    order_gradients,
+    pack_matrices,
+)
 from nexwarp.kernels.native.fused_texture import (
     FEATURES,
     GRADIENTS,
@@ -25,9 +34,6 @@ from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
 
-# Blocks of each multiprocessor that share out the tiles.
-FORWARD_BLOCKS, BACKWARD_BLOCKS = 8, 3
-FORWARD_THREADS = 128
 # Runs of levels that different threads of the scatter kernel take.
 SCATTER_RUNS = 1
 
@@ -62,16 +68,19 @@ class Shape(NamedTuple):
         return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits * 32
 
 
+def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
+    """Whether the fused kernels take textures of a shape: L * F = 32, F 2 or 4, two hidden layers of 64."""
+    return levels * features == FEATURES and features in (2, 4) and width == WIDTH and hidden_layers == 2
+
+
 def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bool:
-    """Whether the fused kernels take a texture: L * F = 32, F 2 or 4, two hidden layers of 64, at most degree 3."""
+    """Whether the fused kernels take a grid (L, T, F) and matrices, of SH degree 0 to 3, for so many points."""
     levels, size, features = grid.shape
     shapes = [tuple(matrix.shape) for matrix in weights]
-    outputs = [(3 * (degree + 1) ** 2, WIDTH) for degree in range(4)]
+    hidden = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
     return (
-        levels * features == FEATURES
-        and features in (2, 4)
-        and shapes[:-1] == [(WIDTH, FEATURES), (WIDTH, WIDTH)]
-        and shapes[-1] in outputs
+        takes_shape(levels, features, len(weights[0]), len(weights) - 1)
+        and shapes in ([*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
         and levels * size * features <= LARGEST_INT
         and points <= LARGEST_INT // 64
     )
@@ -260,7 +269,7 @@ def backward(
             array(grad_colors, wp.vec3),
         ],
         [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
-        32 * WARPS,
+        BACKWARD_THREADS,
     )
     order = _order(features, len(weights[-1]), positions.device)
     flat = positions.new_empty(len(order))
@@ -332,7 +341,9 @@ def _scales(grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 @functools.cache
 def _sources(features: int, outputs: int, device: torch.device) -> torch.Tensor:
     """Return where each packed half is among the matrices' values, one after another; a zero stands after them."""
-    w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[:, [logical_feature(c, features) for c in range(FEATURES)]]
+    w1 = np.arange(WIDTH * FEATURES).reshape(WIDTH, FEATURES)[
+        :, [logical_feature(c, features) for c in range(FEATURES)]
+    ]
     w2 = WIDTH * FEATURES + np.arange(WIDTH**2).reshape(WIDTH, WIDTH)
     start = WIDTH * (FEATURES + WIDTH)
     zero = start + outputs * WIDTH

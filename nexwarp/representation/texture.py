@@ -8,6 +8,7 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.checks import check_range, check_tensors
+from nexwarp.ops import fused_texture
 
 GRID_INIT = 0.01
 
@@ -116,15 +117,20 @@ class NeuralTexture(nn.Module):
         return self.grid.device
 
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
-        """Return how many values an evaluation keeps for each point (features, hidden layers, output), and their dtype.
+        """Return how many values an evaluation keeps for each point, at least, and their dtype.
+
+        Features, hidden layers and output; without gradients no hidden layers; in one kernel the features alone.
 
         Args:
             sh_degree: SH degree of the evaluation.
         """
-        *hidden, _ = self.mlp.parameters()
-        features = self.grid.shape[0] * self.grid.shape[2]
+        *hidden, last = self.mlp.parameters()
+        features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
+        kept = torch.is_grad_enabled()
+        if self._in_half() and fused_texture.fits(self.grid, [*hidden, last[:outputs]], 0):
+            return features * kept, torch.float16
         dtype = torch.float16 if self._in_half() else self.grid.dtype
-        return features + sum(map(len, hidden)) + 3 * (min(sh_degree, self.sh_degree) + 1) ** 2, dtype
+        return features + outputs + sum(map(len, hidden)) * kept, dtype
 
     def _in_half(self) -> bool:
         return self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32

@@ -204,9 +204,7 @@ class Trainer:
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             given = (taken, target, self.surfels, self.texture, self.config)
-            losses = step_losses(
-                *given, cells_unit=self.cells_unit, own=self.own_losses, grid_term=fused is None
-            )
+            losses = step_losses(*given, cells_unit=self.cells_unit, own=self.own_losses, grid_term=fused is None)
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)

@@ -472,5 +472,3 @@ def backward_text(features: int) -> str:
         SUMS=sum(GRADIENTS),
     )
     return PRELUDE + head + TRANSPOSED + _BASIS + text
-
-
