@@ -1,4 +1,4 @@
-"""The fused texturing kernels agree with the layer-by-layer computation, on a CPU, which emulates a warp, and on CUDA."""
+"""The fused texturing kernels agree with the reference, on a CPU, which emulates a warp, and on CUDA."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -93,10 +93,10 @@ def make_case(
 def fused_on_cpu(case: Case) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return colours and gradients as the kernels' CPU branch computes them."""
     positions, depths, grid, *weights = (x.detach() for x in case.leaves)
-    geometry = (positions, depths, case.directions, grid.half(), weights, case.resolutions, case.focal)
-    colors, encoded, packed = fused_texture.forward(*geometry, case.shape, 0.1, case.clamp, True)
-    kept = (encoded, packed, colors if case.clamp else None, case.shape)
-    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, *geometry, *kept, True)
+    points = (positions, depths, case.directions, grid.half())
+    inputs = fused_texture.Inputs(*points, weights, case.resolutions, case.focal, case.shape)
+    colors, kept = fused_texture.forward(inputs, 0.1, case.clamp, True)
+    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True)
     assert grad_points is not None
     return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
 
@@ -136,9 +136,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     calls: list[int] = []
     forward = fused_texture.forward
 
-    def spy(positions: torch.Tensor, *arguments: object) -> object:
-        calls.append(len(positions))
-        return forward(positions, *arguments)  # type: ignore[arg-type]
+    def spy(inputs: fused_texture.Inputs, *options: bool) -> tuple[torch.Tensor, fused_texture.Kept]:
+        calls.append(len(inputs.positions))
+        return forward(inputs, *options)
 
     monkeypatch.setattr(fused_texture, "forward", spy)
     yield calls
