@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.fused_scatter import fused_scatter_kernel
+from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_BLOCKS,
     BACKWARD_THREADS,
@@ -33,9 +33,6 @@ from nexwarp.kernels.native.fused_texture import (
 from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
-
-# Runs of levels that different threads of the scatter kernel take.
-SCATTER_RUNS = 1
 
 
 class Shape(NamedTuple):
@@ -62,10 +59,10 @@ class Shape(NamedTuple):
         return -(-self.width // wide) * -(-self.height // high) * self.hits
 
     @property
-    def threads(self) -> int:
-        """Threads of a run of `fused_scatter`."""
+    def blocks(self) -> int:
+        """Warps of `fused_scatter`: blocks of two tiles times hits."""
         wide = 2 * self.shift - 3
-        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits * 32
+        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits
 
 
 def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
@@ -289,11 +286,12 @@ def _scatter(
     """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
     table, positions, shape = inputs.table, inputs.positions, inputs.shape
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    grad_points = positions.new_empty(SCATTER_RUNS * need_points, len(positions), 4)
+    count = shape.blocks * (32 if positions.is_cuda else 1)
+    grad_points = positions.new_empty(len(positions) * need_points, 4)
     launch(
         positions,
         fused_scatter_kernel(table.shape[2]),
-        shape.threads * SCATTER_RUNS,
+        count,
         [
             array(table.view(-1), wp.float16),
             array(positions, wp.vec3),
@@ -306,14 +304,12 @@ def _scatter(
             array(unscale, wp.float32),
             *shape,
             shape.shift,
-            -(-len(table) // SCATTER_RUNS),
         ],
         [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
-        smallest=shape.threads * SCATTER_RUNS,  # in one thread on a CPU
+        block_dim=SCATTER_THREADS,
+        smallest=count,  # in one thread on a CPU
     )
-    if not need_points:
-        return grad_grid, None
-    return grad_grid, grad_points.sum(0) if SCATTER_RUNS > 1 else grad_points[0]
+    return grad_grid, grad_points if need_points else None
 
 
 def _launch(
