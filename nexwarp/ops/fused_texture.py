@@ -74,10 +74,10 @@ def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bo
     """Whether the fused kernels take a grid (L, T, F) and matrices, of SH degree 0 to 3, for so many points."""
     levels, size, features = grid.shape
     shapes = [tuple(matrix.shape) for matrix in weights]
-    hidden = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
+    hidden: list[tuple[int, ...]] = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
     return (
         takes_shape(levels, features, len(weights[0]), len(weights) - 1)
-        and shapes in ([*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
+        and any(shapes == [*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
         and levels * size * features <= LARGEST_INT
         and points <= LARGEST_INT // 64
     )
@@ -124,12 +124,12 @@ class Kept(NamedTuple):
     Attributes:
         encoded: the features as fragments, 64 bytes a point; empty if there will be no backward pass.
         packed: the matrices in half precision, in the order in which the kernels' lanes load them.
-        colors: (n, 3) the result if it was clamped.
+        colors: (n, 3) the result if it was clamped, else empty.
     """
 
     encoded: torch.Tensor
     packed: torch.Tensor
-    colors: torch.Tensor | None
+    colors: torch.Tensor
 
 
 def colors(inputs: Inputs, grid: torch.Tensor, offset: float, clamp: bool, *, keep: bool) -> torch.Tensor:
@@ -227,7 +227,7 @@ def forward(inputs: Inputs, offset: float, clamp: bool, keep: bool) -> tuple[tor
         [array(encoded, wp.int32), array(result, wp.vec3)],
         FORWARD_THREADS,
     )
-    return result, Kept(encoded, packed, result if clamp else None)
+    return result, Kept(encoded, packed, result if clamp else result.new_empty(0, 3))
 
 
 def backward(
