@@ -51,6 +51,16 @@ _LOAD_HALF4 = """
 #endif
 """
 
+# Without the strides, which rows of whole arrays do not need: the address of a row serves all four.
+_RECORD_ROW = """
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(records.data) + (4u * (unsigned)i + j));
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
+#else
+    return records.data[4 * (size_t)i + j];
+#endif
+"""
+
 _SNIPPETS = {
     (4, wp.float32): _LOAD_FLOAT4,
     (2, wp.float32): _LOAD_FLOAT2,
@@ -69,3 +79,15 @@ def load_function(length: int, scalar: type) -> wp.Function:
     def load(rows: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
 
     return load
+
+
+@functools.cache
+def record_row_function(real: type) -> wp.Function:
+    """Make the function that returns row j of the record i (see `surfel`), records being contiguous, (N, 4) vec4."""
+    row = wp.types.vector(length=4, dtype=real)
+    exact = "    return records.data[4 * (size_t)i + j];"
+
+    @wp.func_native(_RECORD_ROW if real is wp.float32 else exact)
+    def record_row(records: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
+
+    return record_row
