@@ -143,7 +143,7 @@ def gsplat_call(g: Geometry, gsplat: Any, primitive: str = "2DGS") -> Call:
     p = g.pinhole
     call = {"viewmats": g.viewmat[None], "Ks": p.K[None], "width": p.width, "height": p.height, "near_plane": p.near}
 
-    def rasterize() -> tuple[torch.Tensor, ...]:
+    def rasterize() -> tuple[Any, ...]:
         return (gsplat.rasterization_2dgs if primitive == "2DGS" else gsplat.rasterization)(*leaves, **call)
 
     def walked() -> tuple[int, float]:
@@ -172,7 +172,8 @@ def last_entries(image: torch.Tensor) -> torch.Tensor:
         seen.add(node)
         if "RasterizeToPixels" in node.name():
             size = image.shape[1:3]
-            kept = [x for x in node.saved_tensors if x.dtype == torch.int32 and x.shape[-2:] == size]
+            saved = [x for x in getattr(node, "saved_tensors", ()) if x is not None]
+            kept = [x for x in saved if x.dtype == torch.int32 and x.shape[-2:] == size]
             # 2DGS also keeps the entries of the median depths, which are not behind the last ones.
             return torch.stack([x.reshape(size) for x in kept]).amax(0)
         pending += [parent for parent, _ in node.next_functions]

@@ -70,8 +70,8 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        # Threads outside the image cull along, since all lanes of a warp must reach the votes together, but hit nothing:
-        # light no longer reaches them, as it does pixels whose walk has ended.
+        # Threads outside the image cull along: all lanes of a warp must reach the votes together. They hit nothing, as
+        # pixels whose walk has ended: their transmittance is too low.
         transmittance = real(1.0)
         if not inside:
             transmittance = real(0.0)
@@ -123,9 +123,8 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)
                     stop = batch + source + 1
-                    color += vec3(rc[0], rc[1], rc[2]) * weight
                     # Insert into the buffer before the first lighter hit, and move that and all behind it down by one,
-                    # so that of equal ones the nearer stays.
+                    # so that of equal ones the nearer stays; what falls out is blended as plain.
                     displaced = bool(False)
                     out_id = int(i)
                     out_weight = real(weight)
@@ -137,12 +136,16 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                         buffer_ids[j] = wp.where(displaced, out_id, i_)
                         out_weight = wp.where(displaced, w_, out_weight)
                         out_id = wp.where(displaced, i_, out_id)
+                    # Its colour is read again: colours in the buffer would cost registers and moves. Out of an empty
+                    # slot comes the weight 0.
+                    if wp.static(max_hits > 0):
+                        rc = load(records, wp.max(out_id, 0), 3)
+                    color += vec3(rc[0], rc[1], rc[2]) * out_weight
         if not inside:
             return
         p = xy[1] * size[0] + xy[0]
-        # Depths and colours of the buffer are read again: in the loop they would cost registers and moves.
+        plain[p] = color
         kept = vec3()
-        full = bool(True)
         for j in range(wp.static(max_hits)):
             i = buffer_ids[j]
             depth = real(0.0)
@@ -155,15 +158,9 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                 u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
                 if wp.static(low_pass):
                     _alpha, depth = h.kernel(u, v, depth, ra, rb, rn, centers[i], d[0], d[1], focal, near)
-            else:
-                full = False
             ids[p, j] = i
             depths[p, j] = depth
             weights[p, j] = buffer_weights[j]
-        # With room in the buffer there is no other hit: no rounding is left over.
-        if not full:
-            kept = color
-        plain[p] = color - kept
         base[p] = kept
         alphas[p] = ONE - transmittance
         stops[p] = stop

@@ -18,8 +18,9 @@ where the sum over all i is known from the outputs,
 
     rest = gN . N + gB . B + sum_k gW_k W_k + gA A,
 
-and the walk subtracts its terms one by one. Of each hit, ten derivatives are computed, of a . d, b . d, n . d and the
-like (see `surfel`), from which the record's sixteen follow by products with the ray. Frozen: the lists, which hits count, which are in the buffer, where the walk ends.
+and the walk subtracts its terms one by one. Of each hit, seven derivatives are computed, with respect to a . d, b . d,
+n . d and the like (see `hit_gradients`); the record's follow by products with the ray and the weight. Frozen: the
+lists, which hits count, which are in the buffer, where the walk ends.
 """
 
 import functools

@@ -10,7 +10,9 @@ from torch import nn
 from typing_extensions import Unpack
 
 from nexwarp.camera import Camera
+from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
+from nexwarp.model import frames
 from nexwarp.model.options import RenderChanges, RenderOptions
 from nexwarp.render import Color, Rendering, render
 from nexwarp.representation.detail_limits import DetailLimits
@@ -133,20 +135,40 @@ class Model(nn.Module):
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
         options = self.options.changed(**changes) if changes else self.options
-        return render(
-            self.surfels,
-            self.texture if options.max_hits else None,
-            camera if camera.device == self.device else camera.to(self.device),
-            options.max_hits,
-            options.background if background is None else background,
-            options.sh_degree,
-            options.low_pass,
-            options.clamp_texture,
-            depth_jitter,
-            generator,
-            exposures=self.exposures if options.exposure == "photos" else None,
-            detail_limits=self.detail_limits if options.detail_limits else None,
-        )
+        shown = options.background if background is None else background
+        texture = self.texture if options.max_hits else None
+        exposures = self.exposures if options.exposure == "photos" else None
+        limits = self.detail_limits if options.detail_limits else None
+
+        def work(camera: Camera, background: Color) -> Rendering:
+            return render(
+                self.surfels,
+                texture,
+                camera,
+                options.max_hits,
+                background,
+                options.sh_degree,
+                options.low_pass,
+                options.clamp_texture,
+                depth_jitter,
+                generator,
+                exposures=exposures,
+                detail_limits=limits,
+            )
+
+        if not isinstance(depth_jitter, torch.Tensor) and depth_jitter == 0:
+            parts = frames.Parts(self.surfels, texture, exposures, limits)
+            rendering = frames.render_by_graph(work, parts, options, camera, shown)
+            if rendering is not None:
+                return rendering
+        camera = camera if camera.device == self.device else camera.to(self.device)
+        try:
+            return work(camera, shown)
+        except OutOfMemoryError:
+            if not frames.release_graphs():
+                raise
+        # Outside of the handler: the error's traceback would keep alive what has been allocated.
+        return work(camera, shown)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.

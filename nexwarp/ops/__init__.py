@@ -11,7 +11,7 @@ from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import Surface, surface
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import ListCapacity, Tiles, fits, intersect_tiles
+from nexwarp.ops.tiles import ListCapacity, Tiles, fits, held, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "collect",
     "compose",
     "fits",
+    "held",
     "intersect_tiles",
     "plain_colors",
     "project",

@@ -25,7 +25,7 @@ from nexwarp.ops.project import Projection
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
 SHARING = 8
-# Of the arrays that `intersect_tiles` makes.
+# Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
 
@@ -52,7 +52,7 @@ class Tiles:
         order: (N,) int32, surfels by signed z-depth of their centres (as float32), ties by index.
         ends: (N,) int32, end of the entries of the surfel order[rank] in emission order.
         surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
-        entries: (M,) int32, emission index of each of those.
+        entries: (M,) int32, emission index of each of those; empty unless `exact`.
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
         reaches: (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed.
         tile_size: pixels along a tile's side.
@@ -130,15 +130,21 @@ def intersect_tiles(
     if room is None:
         room = _total(ends, columns * rows) if exact else _room(ends, kind)
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    entries, tile_ids = order.new_zeros(2 * room), order.new_full((2 * room,), columns * rows)
-    surfels, surfel_ids = order.new_zeros(room), order.new_empty(room)
-    emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
+    values, tile_ids = order.new_empty(2 * room), order.new_empty(2 * room)
+    values[:room] = 0
+    tile_ids[:room] = columns * rows
+    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
+    surfels = order.new_zeros(room) if exact else None
+    emitted = [array(x, wp.int32) for x in (tile_ids[:room], values[:room], surfels)]
     launch(means, kernels.emit, count * sharing, [*arguments, array(counts, wp.int32)], emitted)
-    _sort(tile_ids, entries, room, (columns * rows).bit_length())
-    launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    _sort(tile_ids, values, room, (columns * rows).bit_length())
+    surfel_ids, entries = values[:room], values[:0]
+    if exact:
+        surfel_ids, entries = order.new_empty(room), values[:room]
+        launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     offsets = order.new_empty(columns * rows + 1)
     launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact, kind)
+    return Tiles(order, ends, surfel_ids, entries, offsets, reaches, tile_size, columns, exact, kind)
 
 
 def _tile_polygons(
@@ -215,14 +221,18 @@ def _total(ends: torch.Tensor, tiles: int) -> int:
 
 @dataclass
 class _Need:
-    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later."""
+    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later.
+
+    `room` is what was given to them, `most` the largest number that is known.
+    """
 
     room: int
     total: torch.Tensor
     copied: torch.cuda.Event
+    most: int = 0
 
 
-_needs: dict[tuple[object, ...], _Need] = {}
+_needs: dict[tuple[int | None, int, int, int, bool], _Need] = {}
 
 
 def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
@@ -234,8 +244,7 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     """
     if len(ends) == 0:
         return 0
-    bits = len(ends).bit_length()
-    key = (ends.device.index, bits, *kind)
+    key = _key(ends, kind)
     need = _needs.get(key)
     if torch.cuda.is_current_stream_capturing():
         if need is None:
@@ -249,13 +258,14 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     if need is None:
         room = _with_margin(_total(ends, kind[0] * kind[1]))
         # A scene that grew by splitting has at least the needs it had: one view may show little of it.
-        if fewer := _needs.get((ends.device.index, bits - 1, *kind)):
+        if fewer := _needs.get((key[0], key[1] - 1, *kind)):
             room = max(room, fewer.room)
         with torch.inference_mode(False):  # later renderings write to it in any mode
             total = torch.empty(1, dtype=torch.int32, pin_memory=True)
         need = _needs[key] = _Need(room, total, torch.cuda.Event())
     elif arrived:
-        need.room = max(need.room, _with_margin(int(need.total)))
+        need.most = max(need.most, int(need.total))
+        need.room = max(need.room, _with_margin(need.most))
     else:
         return need.room
     need.total.copy_(ends[-1:], non_blocking=True)
@@ -263,9 +273,25 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     return need.room
 
 
+def _key(ends: torch.Tensor, kind: tuple[int, int, bool]) -> tuple[int | None, int, int, int, bool]:
+    return (ends.device.index, len(ends).bit_length(), *kind)
+
+
 def fits(room: ListCapacity) -> bool:
     """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay."""
     return _room(room.ends, room.kind) <= room.entries
+
+
+def held(room: ListCapacity) -> bool:
+    """Whether lists that a CUDA graph fills have held all entries as far as is known now; call after each replay.
+
+    Unlike `fits` it asks for no margin: cameras that move would need a new graph whenever they see a little more.
+    """
+    if len(room.ends) == 0:
+        return True
+    _room(room.ends, room.kind)
+    need = _needs.get(_key(room.ends, room.kind))
+    return need is None or need.most <= room.entries
 
 
 def _with_margin(total: int) -> int:

@@ -24,8 +24,9 @@ def simd_functions(real: type, width: int, for_gradients: bool = False) -> Simpl
     Returns:
         `reals`, the type of values (`real` itself for width 1), and the differentiable functions splat(x),
         scaled(s, a), times(a, b), over(a, b), power_of_e(v), power_of_2(v), binary_logarithm(v), inner(a, b) to a
-        scalar, at_least(a, low), at_most(a, high), below(a, b) to a mask, pick(mask, a, b). For widths over 1 also `integers`, the type of masks
-        and of whole numbers, `integer`, an element of it, as wide as `real`, and the rest of `mask_functions`.
+        scalar, at_least(a, low), at_most(a, high), below(a, b) to a mask, pick(mask, a, b). With width 1, powers of 2
+        and binary logarithms have no derivative. For widths over 1 also `integers`, the type of masks and of whole
+        numbers, `integer`, an element of it, as wide as `real`, and the rest of `mask_functions`.
     """
     if width == 1:
         return _scalar_functions(real)

@@ -134,7 +134,9 @@ def exp_log_functions(real: type, width: int) -> SimpleNamespace:
     @wp.func_native(snippet(exp2_body, _RETURN), adj_snippet=snippet(exp2_body, _ADJOINT, DERIVATIVE=f"g * p * {LN_2}"))
     def power_of_2(v: reals) -> reals: ...
 
-    @wp.func_native(snippet(log2_body, _RETURN), adj_snippet=snippet(log2_body, _ADJOINT, DERIVATIVE=f"g / (x * {LN_2})"))
+    @wp.func_native(
+        snippet(log2_body, _RETURN), adj_snippet=snippet(log2_body, _ADJOINT, DERIVATIVE=f"g / (x * {LN_2})")
+    )
     def binary_logarithm(v: reals) -> reals: ...
 
     return SimpleNamespace(power_of_e=power_of_e, power_of_2=power_of_2, binary_logarithm=binary_logarithm)
