@@ -5,6 +5,7 @@ from nexwarp.ops.antialias import antialias
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.graphs import captured
+from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
@@ -31,6 +32,7 @@ __all__ = [
     "fits",
     "held",
     "intersect_tiles",
+    "limit_depths",
     "plain_colors",
     "project",
     "splat_error",

@@ -129,21 +129,10 @@ def intersect_tiles(
     exact = means.device.type == "cpu" and room is None
     if room is None:
         room = _total(ends, columns * rows) if exact else _room(ends, kind)
-    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    values, tile_ids = order.new_empty(2 * room), order.new_empty(2 * room)
-    values[:room] = 0
-    tile_ids[:room] = columns * rows
-    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
-    surfels = order.new_zeros(room) if exact else None
-    emitted = [array(x, wp.int32) for x in (tile_ids[:room], values[:room], surfels)]
-    launch(means, kernels.emit, count * sharing, [*arguments, array(counts, wp.int32)], emitted)
-    _sort(tile_ids, values, room, (columns * rows).bit_length())
-    surfel_ids, entries = values[:room], values[:0]
-    if exact:
-        surfel_ids, entries = order.new_empty(room), values[:room]
-        launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    emission = [*arguments, array(counts, wp.int32)]
+    surfel_ids, entries, tile_ids = _sorted_entries(order, kernels.emit, emission, room, columns * rows, sharing, exact)
     offsets = order.new_empty(columns * rows + 1)
-    launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
+    launch(means, tile_offsets_kernel, len(offsets), [array(tile_ids, wp.int32), room], [array(offsets, wp.int32)])
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, tile_size, columns, exact, kind)
 
 
@@ -169,6 +158,32 @@ def _tile_polygons(
     kernel = tile_polygon_kernel(real, low_pass, tile_size)
     launch(like, kernel, count, arguments, [array(reaches, t.vec2), *polygons])
     return polygons, reaches
+
+
+def _sorted_entries(
+    order: torch.Tensor,
+    emit: wp.Kernel,
+    emission: list[Argument],
+    room: int,
+    tiles: int,
+    sharing: int,
+    exact: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Emit `room` entries and sort them by tile; return `Tiles.surfel_ids`, `Tiles.entries` and the sorted tiles."""
+    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
+    values, tile_ids = order.new_empty(2 * room), order.new_empty(2 * room)
+    values[:room] = 0
+    tile_ids[:room] = tiles
+    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
+    surfels = array(order.new_zeros(room) if exact else None, wp.int32)
+    emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
+    launch(order, emit, len(order) * sharing, emission, emitted)
+    _sort(tile_ids, values, room, tiles.bit_length())
+    if not exact:
+        return values[:room], values[:0], tile_ids[:room]
+    surfel_ids = order.new_empty(room)
+    launch(order, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    return surfel_ids, values[:room], tile_ids[:room]
 
 
 def _depth_order(centers: torch.Tensor) -> torch.Tensor:

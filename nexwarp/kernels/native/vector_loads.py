@@ -1,4 +1,4 @@
-"""Vector loads. Warp reads a vector one component at a time; one wide load is what a GPU's memory wants.
+"""Vector loads and stores. Warp moves a vector one component at a time; one wide access is what a GPU's memory wants.
 
 Rows must be aligned to their own size, as rows of whole arrays from an allocator are.
 """
@@ -61,6 +61,20 @@ _RECORD_ROW = """
 #endif
 """
 
+_STORE_RECORD_ROW = """
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float4*>(records.data)[4u * (unsigned)i + j] = make_float4(row.c[0], row.c[1], row.c[2], row.c[3]);
+#else
+    records.data[4 * (size_t)i + j] = row;
+#endif
+"""
+
+# Gradients of arrays are in the arrays themselves on a tape, and else in an array of their own.
+_ADJOINT_STORE = """
+    if (records.grad) adj_row += records.grad[4 * (size_t)i + j];
+    else if (adj_records.data) adj_row += adj_records.data[4 * (size_t)i + j];
+"""
+
 _SNIPPETS = {
     (4, wp.float32): _LOAD_FLOAT4,
     (2, wp.float32): _LOAD_FLOAT2,
@@ -91,3 +105,15 @@ def record_row_function(real: type) -> wp.Function:
     def record_row(records: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
 
     return record_row
+
+
+@functools.cache
+def store_record_row_function(real: type) -> wp.Function:
+    """Make the function that writes row j of the record i; differentiable."""
+    row_type = wp.types.vector(length=4, dtype=real)
+    exact = "    records.data[4 * (size_t)i + j] = row;"
+
+    @wp.func_native(_STORE_RECORD_ROW if real is wp.float32 else exact, adj_snippet=_ADJOINT_STORE)
+    def store_record_row(records: wp.array2d(dtype=row_type), i: wp.int32, j: wp.int32, row: row_type): ...
+
+    return store_record_row
