@@ -39,7 +39,7 @@ class PeerSettings:
     Attributes:
         primitive: "3dgs" or "2dgs".
         strategy: "mcmc", or "default" for gradients that split and duplicate; 2DGS has the default strategy alone.
-            The default strategy has no budget: it stops growing once there are as many primitives as the budget.
+            The default strategy has no budget: it does not grow while there are as many primitives as the budget.
         background: put the photos' mean colour behind everything instead of black.
         exposures: train at the photos' mean exposure and render with predicted gains, as our default does, where our
             gate uses exposures.
@@ -197,6 +197,7 @@ class _Control:
                 key_for_gradient=key,
                 **times,
             )
+            self.threshold = self.strategy.grow_grad2d
             self.state = self.strategy.initialize_state(scene_scale=extent)
         self.strategy.check_sanity(self.splats, optimizers)
 
@@ -211,8 +212,7 @@ class _Control:
             rate = self.optimizers["means"].param_groups[0]["lr"]
             self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, lr=rate)
             return
-        if len(self.splats["means"]) >= self.count:
-            self.strategy.grow_grad2d = math.inf
+        self.strategy.grow_grad2d = self.threshold if len(self.splats["means"]) < self.count else math.inf
         self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=False)
 
 
