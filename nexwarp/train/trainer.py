@@ -28,6 +28,7 @@ from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
+from nexwarp.train.insertion import new_surfels
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
@@ -181,10 +182,13 @@ class Trainer:
             else:
                 result = self.graphs.run(target, self._optimize, self._graph_key())
             if self.densifier.due(self.iteration):
-                self.densifier.step(self.surfels, self.optimizer, self.generator)
+                self.densifier.step(self.surfels, self.optimizer, self.generator, self._new_surfels)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+
+    def _new_surfels(self, count: int) -> dict[str, torch.Tensor] | None:
+        return new_surfels(self.model(), self.views, self.scene.train, count, self.generator, self.noise)
 
     def _next_view(self) -> int:
         if not self.order:
