@@ -22,6 +22,8 @@ class LossWeights:
 
     dssim: float = 0.2
     """Share of D-SSIM in the image loss; L1 has the rest."""
+    l2: float = 0.0
+    """Factor of the mean squared error of the image, beside the image loss."""
     alpha: float = 0.005
     """Factor of the penalty on blending weight that is not textured."""
     alpha_hits: int = 2
@@ -42,7 +44,7 @@ class LossWeights:
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
         check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
+        for name in ("l2", "alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
 
