@@ -17,13 +17,11 @@ def test_paper_is_the_paper():
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert p.more_hits_from == 0
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
-    assert (p.clamp_image, p.clamp_texture, p.filter_points, p.orient_points) == (True, False, False, False)
+    assert (p.clamp_image, p.filter_points, p.orient_points) == (True, False, False)
     assert p.coarse == 0.0
-    assert p.losses == LossWeights(
-        dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0, alpha_hits=8
-    )
+    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
     assert (p.border, p.mask_mode, p.footprints, p.smooth_sh) == (0.0, "ignore", False, 0.0)
-    assert (p.exposures, p.metering, p.vignetting) == (False, False, False)
+    assert (p.exposures, p.metering) == (False, False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
         quats=1e-3,

@@ -67,13 +67,6 @@ def test_types():
     assert with_settings(config, {"background": None}).background is None
 
 
-def test_settings_are_checked_together():
-    """The order in which they are given does not matter, where one value allows another."""
-    for names in (("clamp_texture", "texture.residual"), ("texture.residual", "clamp_texture")):
-        values = {"clamp_texture": True, "texture.residual": False}
-        assert with_settings(Config(), {name: values[name] for name in names}).clamp_texture
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -158,7 +151,7 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
         (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
         (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),
         (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
-        (["--set", "clamp_texture=true"], ["clamp_texture: expected False with texture.residual"]),
+        (["--set", "mask_mode=hide"], ["mask_mode: expected one of ignore, background, got 'hide'"]),
     ],
 )
 def test_bad_flags_leave_nothing_behind(scene, tmp_path, capsys, flags, words):

@@ -70,7 +70,6 @@ def test_unknown_settings_are_refused(name: str) -> None:
     [
         ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
         ({"border": 0.7}, "border: expected at least 0 and at most 0.5, got 0.7"),
-        ({"clamp_texture": True}, "clamp_texture: expected False with texture.residual, got True"),
         ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
     ],
 )

@@ -108,14 +108,12 @@ class Config:
     that no training view has. A larger strength changes the colours in the training views more; 0 keeps the SH as
     trained."""
     exposures: bool = True
-    """Estimate each photo's exposure and white balance before training, as gains of red, green and blue, and train at
-    the mean exposure. Rendered views get gains that are predicted from nearby photos. Photos of one exposure are left
-    alone."""
+    """Estimate each photo's exposure and white balance, as gains of red, green and blue, and the vignetting of the lens
+    before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos.
+    Both are left out where the photos do not show them."""
     metering: bool = True
     """Auto exposure, with `exposures`: if the photos' gains depend on the brightness of what they show, predict the
     gains of rendered views from brightness, too."""
-    vignetting: bool = True
-    """With `exposures`: estimate the vignetting of the lens, and apply it to rendered views if the photos show it."""
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""
@@ -129,8 +127,6 @@ class Config:
     evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
-    clamp_texture: bool = False
-    """Limit textured colours to >= 0."""
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
@@ -168,8 +164,6 @@ class Config:
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
-        if self.clamp_texture and self.texture.residual:
-            raise ValueError("clamp_texture: expected False with texture.residual, got True")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

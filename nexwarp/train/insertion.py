@@ -119,9 +119,7 @@ def _raw(
 ) -> dict[str, torch.Tensor]:
     """Return the raw parameters of surfels at pixels (M,) and z-depths (M,).
 
-    Args:
-        correction: (M, 3) what the rendering lacks there, at the mean exposure.
-        seen: (M, 3) the photo there, at the mean exposure.
+    `correction` (M, 3) is what the rendering lacks there, and `seen` (M, 3) the photo, both at the mean exposure.
     """
     surfels = model.surfels
     top = out.ids[..., 0].flatten()[pixels].long()

@@ -11,9 +11,10 @@ import torch
 
 from nexwarp.checks import check_range, check_tensors
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
-from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
+
+ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,7 @@ class LossWeights:
     l2: float = 0.0
     """Factor of the mean squared error of the image, beside the image loss."""
     alpha: float = 0.005
-    """Factor of the penalty on blending weight that is not textured."""
-    alpha_hits: int = 2
-    """Number of the heaviest textured hits whose weights `alpha` counts."""
+    """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
     texture: float = 0.5
     """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
     opacity: float = 0.01
@@ -43,7 +42,6 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
         for name in ("l2", "alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
             check_range(name, getattr(self, name), 0.0)
 
@@ -86,7 +84,7 @@ def training_losses(
     _check_masks(image, mask=mask, empty=empty)
     image, textured, weights = _counted(image, textured, weights, target, mask, empty)
     # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
-    all_count = weights.shape[-1] <= factors.alpha_hits
+    all_count = weights.shape[-1] <= ALPHA_HITS
     shares = {
         "l1": 1.0 - factors.dssim,
         "texture": factors.texture * has_slots,
@@ -96,7 +94,7 @@ def training_losses(
         image, textured, weights, target, **shares, saturation=saturation
     )
     if not all_count and factors.alpha > 0.0:
-        alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
+        alpha_term = factors.alpha * alpha_loss(weights[..., :ALPHA_HITS].contiguous())
     terms = {
         "l1": l1_term,
         "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,
