@@ -117,6 +117,8 @@ class Config:
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""
+    dropout: float = 0.0
+    """Share of the surfels that a step leaves out at random, at the end of the run; it grows linearly from 0."""
     border: float = 0.08
     """Largest shift of border steps, as a fraction of the frame; 0 does none. A border step renders a window that is
     shifted beyond the photo's frame; there its target is the photo's repeated edge."""
@@ -156,6 +158,7 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
+        check_range("dropout", self.dropout, 0.0, 0.9)
         check_range("border", self.border, 0.0, 0.5)
         check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)

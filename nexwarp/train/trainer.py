@@ -53,6 +53,8 @@ from nexwarp.train.views import TrainingViews, mean_color
 CHECK_EVERY = 100
 SNAPSHOTS = 10
 
+DROPPED = -30.0  # logit of the opacity of a surfel that a step leaves out
+
 # Rounds of densification from one search for floaters to the next.
 FLOATERS_EVERY = 10
 
@@ -197,7 +199,11 @@ class Trainer:
 
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
+        logits = self.surfels.logit_opacities.data
+        kept = None if target.dropped is None else logits.clone()
         try:
+            if target.dropped is not None:
+                logits.masked_fill_(target.dropped[: len(logits)], DROPPED)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             losses = step_losses(
@@ -214,6 +220,8 @@ class Trainer:
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
+            if kept is not None:
+                logits.copy_(kept)
             with updating():
                 self.optimizer.step()
                 if request is not None and request.sums_after_backward is not None:
