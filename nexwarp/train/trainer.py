@@ -12,6 +12,7 @@ from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
+from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.memory import needed_memory
@@ -177,8 +178,12 @@ class Trainer:
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
             self.iteration += 1
+            smoothed = self.config.smoothed_after
+            if self.iteration - 1 == smoothed:
+                self._smooth_sh()
             target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
-            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
+            fixed = ("shN",) if smoothed is not None and self.iteration > smoothed else ()
+            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor, fixed)
             if self.graphs is None:
                 result = self._optimize(target)
             else:
@@ -191,6 +196,11 @@ class Trainer:
 
     def _new_surfels(self, count: int) -> dict[str, torch.Tensor] | None:
         return new_surfels(self.model(), self.views, self.scene.train, count, self.generator, self.noise)
+
+    def _smooth_sh(self) -> None:
+        sh0, shN = smooth_sh(self.model(), self.scene.train, self.config.smooth_sh)
+        self.surfels.sh0.data.copy_(sh0)
+        self.surfels.shN.data.copy_(shN)
 
     def _next_view(self) -> int:
         if not self.order:
@@ -284,7 +294,8 @@ class Trainer:
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
+        strength = config.smooth_sh if config.smoothed_after is None else 0.0
+        settings = FinishSettings(strength, config.footprints, config.metering, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
