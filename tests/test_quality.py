@@ -224,6 +224,13 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     assert not (tmp_path / "out.jsonl").exists()
 
 
+def test_near_planes_are_moved_alone(scene: Scene) -> None:
+    other = with_near(scene, near=0.5)
+    for one, two in zip((*scene.train, *scene.test), (*other.train, *other.test), strict=True):
+        assert two.camera.near == 0.5 and torch.equal(one.camera.viewmat, two.camera.viewmat)
+    assert torch.equal(scene.points, other.points)
+
+
 def test_validation_views_are_training_views(scene: Scene) -> None:
     part = inner_validation(scene)
     names = [view.name for view in scene.train]
