@@ -18,7 +18,15 @@ from benchmarks.quality.jobs import TABLES, JobGroup, TrainingJob, group_jobs, t
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import GSPLAT, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
-from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, inner_validation, moved, of_training_views
+from benchmarks.quality.scenes import (
+    ARC_VIEWS,
+    VARIANTS,
+    held_out_arc,
+    inner_validation,
+    moved,
+    of_training_views,
+    with_near,
+)
 from benchmarks.timing import ROOT
 from nexwarp.data import Scene, View
 from nexwarp.data.demo import write_demo
