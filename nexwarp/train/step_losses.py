@@ -86,9 +86,6 @@ def step_losses(
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
-    if factors.l2 > 0:
-        missing = (out.image - target.photo).square()
-        losses["l2"] = factors.l2 * (missing if target.counts is None else missing * target.counts[..., None]).mean()
     if target.beyond is not None and factors.border > 0:
         losses["border"] = factors.border * border_loss(out.image, target.photo, target.beyond)
     if target.empty is not None and factors.empty > 0:
