@@ -248,7 +248,7 @@ def test_wrong_inputs_name_the_argument() -> None:
         LossWeights(grid=-1)
 
 
-# What does not count, what is empty, what lies beyond the frame, and depths
+# What does not count, what is empty, and depths
 
 
 def scene_of_losses() -> dict[str, torch.Tensor]:
@@ -298,13 +298,6 @@ def test_where_nothing_is_only_the_image_counts() -> None:
     for name in ("textured", "weights"):
         gradient = present(tensors[name].grad)
         assert not gradient[empty].any() and gradient[~empty].any(), name
-
-
-def test_border_loss_by_hand() -> None:
-    image, target = torch.full((2, 4, 3), 0.5), torch.full((2, 4, 3), 0.2)
-    beyond = torch.zeros(2, 4, dtype=torch.bool)
-    beyond[:, 3] = True
-    assert losses.border_loss(image, target, beyond).item() == pytest.approx(0.3 * 2 / 8)
 
 
 def test_visible_points_by_hand() -> None:

@@ -20,7 +20,7 @@ def test_paper_is_the_paper():
     assert (p.clamp_image, p.filter_points, p.orient_points) == (True, False, False)
     assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
-    assert (p.border, p.mask_mode, p.footprints, p.smooth_sh) == (0.0, "ignore", False, 0.0)
+    assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
     assert (p.exposures, p.metering) == (False, False)
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
@@ -54,7 +54,7 @@ def test_default_prunes_at_the_cap_and_filters_points():
     p = preset("default")
     assert p == Config() and p.densify.prune_at_cap and p.densify.floaters and p.filter_points and not p.clamp_image
     assert p.texture.min_resolution is None and p.texture.max_resolution is None
-    assert p.texture.residual and p.background is None and p.border > 0 and p.losses.depth > 0
+    assert p.texture.residual and p.background is None and p.losses.depth > 0
 
 
 def test_unknown_preset_is_refused():

@@ -117,11 +117,6 @@ class Config:
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""
-    border: float = 0.08
-    """Largest shift of border steps, as a fraction of the frame; 0 does none. A border step renders a window that is
-    shifted beyond the photo's frame; there its target is the photo's repeated edge."""
-    border_every: int = 4
-    """One of this many steps is a border step."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
@@ -156,8 +151,6 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
-        check_range("border", self.border, 0.0, 0.5)
-        check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
