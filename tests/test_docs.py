@@ -48,7 +48,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "footprints": ("", ""),
     "smooth_sh": ("", ""),
     "exposures": ("", ""),
-    "metering": ("", ""),
     "mask_mode": ("", ""),
     "depth_jitter": ("", ""),
     "low_pass": ("", ""),

@@ -21,7 +21,7 @@ def test_paper_is_the_paper():
     assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
     assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
-    assert (p.exposures, p.metering) == (False, False)
+    assert not p.exposures
     assert p.rates == LearningRates(
         means=(1.6e-4, 1.6e-6),
         quats=1e-3,

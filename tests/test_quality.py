@@ -159,7 +159,7 @@ def test_rows_that_differ_late_share_their_first_iterations() -> None:
 def test_rows_of_finishing_share_their_first_iterations() -> None:
     jobs = list(table_jobs("changes", ("fox",), (0,), 300, 40))
     shared = {tuple(job.row for job in g.jobs): g.iterations for g in group_jobs(jobs, ROWS) if g.iterations}
-    finished = ("no footprints", "no SH smoothing", "no metering")
+    finished = ("no footprints", "no SH smoothing")
     assert shared == {("default", *finished, "floaters left"): 249}
 
 

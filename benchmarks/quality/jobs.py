@@ -152,7 +152,6 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         config,
         max_hits=min(config.max_hits, 2),
         densify=dataclasses.replace(config.densify, floaters=False),
-        metering=False,
         footprints=False,
         smooth_sh=0.0,
     )

@@ -56,7 +56,6 @@ CHANGES = (
     Row("no footprints", settings={"footprints": False}),
     Row("no SH smoothing", settings={"smooth_sh": 0.0}),
     Row("no exposures", settings={"exposures": False}),
-    Row("no metering", settings={"metering": False}),
     Row("no depth loss", settings={"losses.depth": 0.0}),
     Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
     Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),

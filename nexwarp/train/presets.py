@@ -83,7 +83,6 @@ PRESETS: dict[str, Config] = {
         footprints=False,
         smooth_sh=0.0,
         exposures=False,
-        metering=False,
         clamp_image=True,
         filter_points=False,
         orient_points=False,
