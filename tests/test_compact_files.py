@@ -139,7 +139,7 @@ def put(name: str, value: torch.Tensor) -> Callable[[dict[str, torch.Tensor], di
         (put("surfels.sh0.code", torch.full((2, 1, 3), float("nan"))), "surfels.sh0"),
         (put("surfels.raw_quats", torch.zeros(24, 4, dtype=torch.int16)), "surfels.raw_quats"),
         (lambda _, meta: meta.update(format_version=1), "surfels"),
-        (lambda _, meta: meta.update(format_version=3), "version 2, got 3; a newer nexwarp"),
+        (lambda _, meta: meta.update(format_version=3), "version 1 to 2, got 3; a newer nexwarp"),
     ],
 )
 def test_damage_is_one_clear_line(tmp_path: Path, change: Callable[..., Any], match: str) -> None:
