@@ -145,9 +145,8 @@ def test_progress_tells_what_happened(scene):
         assert p.loss() == pytest.approx(sum(x.item() for x in p.losses.values()), rel=1e-6)
         error = (p.image.detach().double().clamp(0, 1) - p.target.double()).square().mean().item()
         assert p.psnr() == pytest.approx(-10 * math.log10(error), abs=1e-4)
-    always = {"l1", "dssim", "texture", "alpha", "opacity", "grid"}
     for p in seen:
-        assert set(p.losses) == always | ({"border"} if p.iteration % 4 == 0 else {"depth"})
+        assert set(p.losses) == {"l1", "dssim", "texture", "alpha", "opacity", "grid", "depth"}
     counts = [p.surfels for p in seen]
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
     assert counts[2] == 63 == int(1.05 * counts[0])
@@ -245,7 +244,7 @@ def test_surfels_settle_with_two_hits(scene):
 
 
 def test_views_are_drawn_without_replacement(scene):
-    trainer, drawn = Trainer(scene, small(iterations=24, border=0.0, exposures=False), "cpu"), []
+    trainer, drawn = Trainer(scene, small(iterations=24, exposures=False), "cpu"), []
     photos = [view.image.float() / 255 for view in scene.train]
 
     def note(progress: Any) -> None:
