@@ -9,7 +9,7 @@ from nexwarp.kernels.adam import adam_kernel
 from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
-from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
@@ -22,8 +22,9 @@ from nexwarp.kernels.fused_texture import (
     pack_matrices,
 )
 from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.limit_depths import limit_depths_kernel
 from nexwarp.kernels.photometric import photometric_kernels
-from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
@@ -37,7 +38,7 @@ from nexwarp.kernels.tiles import (
     tile_polygon_kernel,
 )
 from nexwarp.kernels.types import MAX_HITS, types
-from nexwarp.kernels.unproject import unproject_kernel
+from nexwarp.kernels.unproject import unproject_kernels
 
 
 def all_kernels(
@@ -71,9 +72,11 @@ def thread_kernels(
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
-    yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
+    yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
+    for kernels in (unproject_kernels(real), compose_kernels(real)):
+        yield from (kernels.forward, kernels.backward)
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
-    yield antialias_kernels(real).forward
+    yield from (antialias_kernels(real).forward, limit_depths_kernel(real))
     yield from (surfel_ids_kernel, tile_offsets_kernel)
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     if not cpu:

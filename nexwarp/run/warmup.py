@@ -54,7 +54,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         TILE_SIZE,
         degrees=range(config.sh_degree + 1),
         features=(config.texture.features,) * textured,
-        clamps=(config.clamp_texture,) * textured,
+        clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH if cpu else 1,),
         cpu=cpu,

@@ -135,7 +135,6 @@ def options_at(
         background=background,
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
         low_pass=config.low_pass,
-        clamp_texture=config.clamp_texture,
     )
 
 

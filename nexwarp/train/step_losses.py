@@ -9,13 +9,13 @@ from nexwarp.render import Rendering
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
-from nexwarp.train.losses import border_loss, depth_loss, training_losses
+from nexwarp.train.losses import depth_loss, training_losses
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "border", "empty", "depth")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -88,8 +88,6 @@ def step_losses(
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
-    if target.beyond is not None and factors.border > 0:
-        losses["border"] = factors.border * border_loss(out.image, target.photo, target.beyond)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

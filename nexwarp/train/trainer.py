@@ -276,7 +276,7 @@ class Trainer:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
