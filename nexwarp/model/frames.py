@@ -295,6 +295,7 @@ class Parts(NamedTuple):
         return (
             *((x.data_ptr(), x.shape) for x in self.tensors),
             texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            texture and texture.half_copy_key(),
             exposures and exposures.lens,
             self.detail_limits is None,
             torch.are_deterministic_algorithms_enabled(),
