@@ -1,4 +1,4 @@
-"""Texturing in one kernel each way: hash lookup (paper Eq. 2, 4), MLP (paper Eq. 5) and SH by tensor cores.
+"""Texturing on tensor cores: lookup in the hash grid (paper Eq. 2), MLP and SH in one kernel each way.
 
 For L * F = 32 features of F = 2 or 4, two hidden layers of 64, and half-precision tables, matrices and activations,
 summed in float32. A warp takes 16 neighbouring pixels, a tile, and one hit of each at a time: 16 points are the rows
