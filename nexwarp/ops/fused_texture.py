@@ -83,14 +83,18 @@ def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bo
     )
 
 
+def supported(device: torch.device) -> bool:
+    """Whether a GPU has the tensor cores' instructions that the fused kernels use."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
+
+
 def usable(
     positions: torch.Tensor, directions: torch.Tensor, grid: torch.Tensor, weights: Sequence[torch.Tensor]
 ) -> bool:
     """Whether the fused kernels compute these colours; see `nexwarp.ops.texture`."""
     return (
-        positions.is_cuda
+        supported(positions.device)
         and positions.dtype == torch.float32
-        and torch.cuda.get_device_capability(positions.device) >= (8, 0)
         and not (torch.is_grad_enabled() and directions.requires_grad)
         and not torch.are_deterministic_algorithms_enabled()
         and len(positions) > 0

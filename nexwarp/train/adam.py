@@ -40,6 +40,7 @@ class FusedAdam(torch.optim.Adam):
             factors: (L,) factors; None adds nothing.
         """
         self._texture, self._factors = texture, factors
+        texture.half_copy()  # before any step is captured
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]

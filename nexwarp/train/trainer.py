@@ -219,7 +219,7 @@ class Trainer:
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
         if fused is not None and fused.grid_loss is not None:
-            losses["grid"] = fused.grid_loss
+            losses["grid"], fused.grid_loss = fused.grid_loss, None
         return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room)
 
     def _graph_key(self) -> Hashable:
