@@ -18,6 +18,7 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config, LearningRates, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.trainer import Trainer
+from tests.exposed import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
 
@@ -81,9 +82,9 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
 
 @pytest.mark.cuda
 def test_deterministic_runs_are_the_same_on_cuda(scene):
-    runs = []
+    runs, exposed = [], with_exposures(scene)
     for _ in range(3):
-        trainer = Trainer(scene, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
+        trainer = Trainer(exposed, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
         trainer.run()
         runs.append(trainer)
     assert not torch.are_deterministic_algorithms_enabled()

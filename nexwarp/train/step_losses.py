@@ -57,6 +57,7 @@ def step_losses(
     *,
     cells_unit: float = 1.0,
     own: Mapping[str, OwnLoss] | None = None,
+    grid_term: bool = True,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
@@ -68,6 +69,7 @@ def step_losses(
         config: settings.
         cells_unit: world units in which the grid's loss counts its cells.
         own: losses of one's own, added as they are.
+        grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
 
     Raises:
         TypeError, ValueError: an own loss returned no scalar; the message names it.
@@ -79,8 +81,8 @@ def step_losses(
         weights=out.weights,
         target=target.photo,
         opacities=surfels.opacities,
-        grid=texture.grid if textured else None,
-        resolutions=texture.resolutions * cells_unit if textured else None,
+        grid=texture.grid if textured and grid_term else None,
+        resolutions=texture.resolutions * cells_unit if textured and grid_term else None,
         loss_weights=factors,
         mask=target.counts,
         empty=target.empty,
