@@ -27,7 +27,6 @@ class Target:
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.render` takes it.
-        dropped: (P,) bool, of the budget's P surfels those that this step leaves out; None leaves out none.
     """
 
     camera: Camera
@@ -39,7 +38,6 @@ class Target:
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
-    dropped: torch.Tensor | None = None
 
 
 class TargetMaker:
@@ -84,10 +82,6 @@ class TargetMaker:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
             target = dataclasses.replace(target, depth_jitter=drawn)
-        if config.dropout > 0:
-            share = config.dropout * iteration / config.iterations
-            drawn = torch.rand(config.max_surfels, generator=self.noise, device=self.views.device)
-            target = dataclasses.replace(target, dropped=drawn < share)
         return target
 
     def from_view(self, index: int, factor: int, upcoming: list[int] | None = None) -> Target:

@@ -12,7 +12,6 @@ from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
-from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.memory import needed_memory
@@ -30,7 +29,6 @@ from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.train.insertion import new_surfels
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
@@ -54,8 +52,6 @@ from nexwarp.train.views import TrainingViews, mean_color
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
 CHECK_EVERY = 100
 SNAPSHOTS = 10
-
-DROPPED = -30.0  # logit of the opacity of a surfel that a step leaves out
 
 # Rounds of densification from one search for floaters to the next.
 FLOATERS_EVERY = 10
@@ -179,18 +175,14 @@ class Trainer:
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
             self.iteration += 1
-            smoothed = self.config.smoothed_after
-            if self.iteration - 1 == smoothed:
-                self._smooth_sh()
             target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
-            fixed = ("shN",) if smoothed is not None and self.iteration > smoothed else ()
-            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor, fixed)
+            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             if self.graphs is None:
                 result = self._optimize(target)
             else:
                 result = self.graphs.run(target, self._optimize, self._graph_key())
             if self.densifier.due(self.iteration):
-                self.densifier.step(self.surfels, self.optimizer, self.generator, self._new_surfels)
+                self.densifier.step(self.surfels, self.optimizer, self.generator)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
@@ -200,14 +192,6 @@ class Trainer:
             self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer, self.cells_unit
         )
 
-    def _new_surfels(self, count: int) -> dict[str, torch.Tensor] | None:
-        return new_surfels(self.model(), self.views, self.scene.train, count, self.generator, self.noise)
-
-    def _smooth_sh(self) -> None:
-        sh0, shN = smooth_sh(self.model(), self.scene.train, self.config.smooth_sh)
-        self.surfels.sh0.data.copy_(sh0)
-        self.surfels.shN.data.copy_(shN)
-
     def _next_view(self) -> int:
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
@@ -216,11 +200,7 @@ class Trainer:
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
-        logits = self.surfels.logit_opacities.data
-        kept = None if target.dropped is None else logits.clone()
         try:
-            if target.dropped is not None:
-                logits.masked_fill_(target.dropped[: len(logits)], DROPPED)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             given = (taken, target, self.surfels, self.texture, self.config)
@@ -230,8 +210,6 @@ class Trainer:
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             reduce(torch.add, losses.values()).backward()
-            if kept is not None:
-                logits.copy_(kept)
             with updating():
                 self.optimizer.step()
                 if request is not None and request.sums_after_backward is not None:
@@ -298,8 +276,7 @@ class Trainer:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
         config = self.config
-        strength = config.smooth_sh if config.smoothed_after is None else 0.0
-        settings = FinishSettings(strength, config.footprints, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
