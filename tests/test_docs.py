@@ -333,6 +333,12 @@ def test_the_api_page_has_every_public_name():
     assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
 
 
+def test_every_setting_has_a_row_of_evidence() -> None:
+    rows = re.findall(r"^\| (`.+?`) \|", (DOCS / "evidence.md").read_text(encoding="utf-8"), re.M)
+    named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    assert sorted(named) == sorted(SYMBOLS)
+
+
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
 def test_the_site_builds(tmp_path):
     """All links and anchors between pages lead somewhere, and all names of the API are found."""
