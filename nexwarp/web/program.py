@@ -1,0 +1,173 @@
+"""What the hosts of the WGSL renderer share: constants of the shaders, layout of the buffers, values of a frame.
+
+`page/renderer.js` does the same in the browser; a test compares the constants and buffers of both.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from nexwarp.camera import Camera
+from nexwarp.representation.texture import FOCAL_WITHOUT_DOWN_WEIGHTING
+from nexwarp.web.scene_data import ExposureData, SceneData
+
+TILE = 16
+SCAN_BLOCK = 1024  # elements of a workgroup of scan.wgsl
+SORT_BLOCK = 2048  # pairs of a workgroup of sort.wgsl
+MODES = ("image", "plain", "textured", "ids", "depth", "weights", "normals", "alpha")
+FRAME_BYTES = 12 * 16
+
+
+@dataclass(frozen=True)
+class Program:
+    """Constants of the shaders for one scene.
+
+    Attributes:
+        constants: names to WGSL literals.
+        features: features an entry of the grid.
+    """
+
+    constants: dict[str, str]
+    features: int
+
+    @classmethod
+    def of(cls, scene: SceneData, sharing: int) -> "Program":
+        """Derive the constants; `sharing` threads share a surfel's tile rows."""
+        options, texture = scene.options, scene.texture
+        stored = scene.sh.shape[1]
+        plain_degree = min(options.sh_degree, round(stored**0.5) - 1)
+        shape = None if texture is None else texture.shape
+        degree = 0 if shape is None else shape["sh_degree"]
+        used = (min(options.sh_degree, degree) + 1) ** 2
+        features = 2 if shape is None else shape["features"]
+        levels = 1 if shape is None else shape["levels"]
+        unsigned = {
+            "K": options.max_hits,
+            "SHARING": sharing,
+            "RECORD": 5 if options.low_pass else 4,
+            "SH_COEFFICIENTS": stored,
+            "PLAIN_COEFFICIENTS": (plain_degree + 1) ** 2,
+            "TOTAL": -(-len(scene) * sharing // SCAN_BLOCK),
+            "LEVELS": levels,
+            "MASK": 0 if shape is None else shape["table_size"] - 1,
+            "INPUTS": -(-levels * features // 4),
+            "WIDTH": 1 if shape is None else -(-shape["width"] // 4),
+            "HIDDEN": 0 if shape is None else shape["hidden_layers"],
+            "BLOCKS": -(-((degree + 1) ** 2) // 4),
+            "USED_COEFFICIENTS": used,
+            "USED_BLOCKS": -(-used // 4),
+        }
+        flags = {
+            "LOW_PASS": options.low_pass,
+            "LIMITS": scene.limits is not None,
+            "TEXTURED": texture is not None,
+            "RESIDUAL": shape is not None and shape["residual"],
+            "CLAMP": options.clamp_texture,
+        }
+        constants = {name: f"{value}u" for name, value in unsigned.items()}
+        return cls(constants | {name: "true" if value else "false" for name, value in flags.items()}, features)
+
+    def source(self, name: str) -> str:
+        """Return the WGSL text of a shader, with constants and what it includes."""
+        if name in ("scan", "sort"):
+            return shader(name)
+        parts = [shader("common"), shader(name)]
+        if name == "shade":
+            parts.insert(1, shader(f"features{self.features}"))
+        lines = [
+            f"const {name}: {'u32' if value.endswith('u') else 'bool'} = {value};"
+            for name, value in self.constants.items()
+        ]
+        return "\n".join([*lines, *parts])
+
+
+@cache
+def shader(name: str) -> str:
+    """Return the text of a .wgsl file."""
+    return files("nexwarp.web").joinpath(f"shaders/{name}.wgsl").read_text(encoding="utf-8")
+
+
+def geometry_rows(scene: SceneData) -> np.ndarray:
+    """Return (N, 12) float32: mean, opacity; quaternion; scales, gammas."""
+    columns = [scene.means, scene.opacities[:, None], scene.quats, scene.scales, scene.gammas]
+    return np.concatenate(columns, axis=1, dtype=np.float32)
+
+
+def packed_matrices(matrices: list[np.ndarray]) -> np.ndarray:
+    """Return the MLP's matrices in the order of shade.wgsl: (blocks, 4 columns, 4 rows) float32."""
+    *hidden, last = matrices
+    coefficients = len(last) // 3
+    padded = -(-coefficients // 4) * 4
+    by_channel = np.zeros((3, padded, last.shape[1]), np.float32)
+    by_channel[:, :coefficients] = last.reshape(coefficients, 3, -1).transpose(1, 0, 2)
+    blocks = []
+    for matrix in (*hidden, by_channel.reshape(3 * padded, -1)):
+        rows, columns = (-(-size // 4) * 4 for size in matrix.shape)
+        whole = np.zeros((rows, columns), np.float32)
+        whole[: matrix.shape[0], : matrix.shape[1]] = matrix
+        # (row block, row, column block, column) to (row block, column block, column, row)
+        blocks.append(whole.reshape(rows // 4, 4, columns // 4, 4).transpose(0, 2, 3, 1).reshape(-1, 4, 4))
+    return np.concatenate(blocks)
+
+
+def level_rows(resolutions: np.ndarray) -> np.ndarray:
+    """Return the resolutions padded to (64,), the length of the uniform array."""
+    padded = np.zeros(64, np.float32)
+    padded[: len(resolutions)] = resolutions
+    return padded
+
+
+def frame_values(
+    scene: SceneData,
+    camera: Camera,
+    capacity: int,
+    *,
+    mode: str,
+    slot: int,
+    texel_step: int,
+    least_weight: float,
+    exposures: ExposureData | None,
+) -> bytes:
+    """Return the uniform values of a frame, struct Frame of common.wgsl."""
+    viewmat = camera.viewmat.detach().cpu().double().numpy()
+    position = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    texture_focal = camera.focal
+    if scene.texture is not None and not scene.texture.shape["down_weighting"]:
+        texture_focal = FOCAL_WITHOUT_DOWN_WEIGHTING
+    gains, falloff = np.ones(3), np.array([0.0, 0.0, 1.0, 0.0])
+    if exposures is not None:
+        gains = exposures.gains(viewmat)
+        falloff[:3] = exposures.falloff
+        falloff[3] = float(falloff[0] != 0 or falloff[1] != 0)
+    depths = depth_range(scene, viewmat) if mode == "depth" else (0.0, 1.0)
+    floats = [
+        *viewmat[:3].ravel(),
+        *(camera.fx, camera.fy, camera.cx, camera.cy),
+        *(*position, camera.near),
+        *(*scene.options.background, texture_focal),
+        *(*gains, camera.focal),
+        *falloff,
+        *(least_weight, *depths, 0.0),
+    ]
+    columns, rows = tile_grid(camera)
+    size = (-(-camera.width // texel_step), -(-camera.height // texel_step))
+    words = [camera.width, camera.height, columns, rows, len(scene), capacity, MODES.index(mode), slot]
+    words += [*size, texel_step, int(scene.texture is not None)]
+    return np.array(floats, np.float32).tobytes() + np.array(words, np.uint32).tobytes()
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Return the columns and rows of tiles of an image."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+def depth_range(scene: SceneData, viewmat: np.ndarray) -> tuple[float, float]:
+    """Return the 2nd and 98th percentile of the depths of surfels before the camera, for the colour scale."""
+    depths = scene.means @ viewmat[2, :3] + viewmat[2, 3]
+    depths = depths[depths > 0]
+    if len(depths) == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(depths[:: max(len(depths) // 10_000, 1)], [2, 98])
+    return float(low), float(max(high, low * (1 + 1e-6) + 1e-6))
