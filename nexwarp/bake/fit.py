@@ -13,7 +13,9 @@ from nexwarp.camera import Camera
 from nexwarp.model.model import Model
 from nexwarp.representation.surfels import Surfels
 
-STEPS = 300
+WINDOW = 256  # largest width and height that one step renders
+PASSES = 2.0  # over the views' pixels
+FEWEST_STEPS, MOST_STEPS = 70, 800
 RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.1  # relative to the first
 
@@ -24,7 +26,7 @@ def bake(
     *,
     texel: float = 1.0,
     side: int = 4096,
-    steps: int = STEPS,
+    steps: int | None = None,
     done: Callable[[], object] = lambda: None,
 ) -> Baked:
     """Bake a model's texture into an atlas.
@@ -34,7 +36,7 @@ def bake(
         cameras: the views that the baked scene shall look like the model in, at least one.
         texel: size of a texel in pixels of the closest view.
         side: largest width and height of the atlas.
-        steps: steps of the fit; each renders one view.
+        steps: steps of the fit; None derives them from the number of the views' pixels.
         done: called after each step.
     """
     if not cameras:
@@ -42,6 +44,9 @@ def bake(
     seen = observe(model, cameras)
     layout = lay_out(seen, texel=texel, side=side)
     atlas = evaluate(model, seen, layout)
+    if steps is None:
+        windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2
+        steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS)
     return fit(Baked(model, model.surfels, seen, layout, atlas), cameras, steps, done)
 
 
@@ -73,7 +78,7 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
 
 
 def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], object] = lambda: None) -> Baked:
-    """Fit atlas and SH to the model's renderings by least squares (Adam, one view a step)."""
+    """Fit atlas and SH to the model's renderings by least squares: Adam, a window of one view a step."""
     model, degree = baked.model, baked.model.options.sh_degree
     state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
     trained = {"atlas": baked.atlas.clone(), "sh0": state["sh0"], "shN": state["shN"]}
@@ -85,7 +90,7 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], 
     views: list[int] = []
     for _ in range(steps):
         views = views or torch.randperm(len(cameras), generator=order).tolist()
-        camera = cameras[views.pop()].to(model.device)
+        camera = _window(cameras[views.pop()].to(model.device), order)
         with torch.no_grad():
             target = model.render(camera, exposure="mean").image
         hits = hits_of(bare, camera)
@@ -106,3 +111,13 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], 
 def _others(hits: ViewHits) -> torch.Tensor:
     """Return what a pixel (H, W, 3) shows beside the hits: further ones in their plain colours, and the background."""
     return hits.rendering.image - hits.blended(hits.plain_colors())
+
+
+def _window(camera: Camera, generator: torch.Generator) -> Camera:
+    """Return the camera of a random window of an image."""
+    width, height = min(camera.width, WINDOW), min(camera.height, WINDOW)
+    left, top = (
+        int(torch.randint(free + 1, (1,), generator=generator))
+        for free in (camera.width - width, camera.height - height)
+    )
+    return camera.crop(left, top, width, height)

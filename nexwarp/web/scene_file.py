@@ -77,7 +77,7 @@ def encode_scene(
         raise SettingError(f"--quality: expected {' or '.join(QUALITIES)}, got {quality!r:.60}")
     scene = SceneData.of(model) if isinstance(model, Model) else model
     arrays = _arrays(scene, cast(Quality, quality))
-    header = _header(scene, cameras, cast(Quality, quality), title)
+    header = scene_header(scene, cameras, cast(Quality, quality), title)
     stored: list[tuple[dict[str, object], bytes]] = []
     if poster is not None:
         header["poster"] = {"type": "image/jpeg"}
@@ -89,11 +89,11 @@ def encode_scene(
         encoding, content = pack(array.astype(array.dtype.newbyteorder("<")).tobytes())
         entry = {"name": section.name, "dtype": section.dtype, "shape": list(section.shape), "encoding": encoding}
         stored.append((entry, content))
-    return _joined(header, stored)
+    return joined_file(MAGIC, header, stored)
 
 
-def _joined(header: dict[str, object], stored: Sequence[tuple[dict[str, object], bytes]]) -> bytes:
-    """Return the file of a header and its sections."""
+def joined_file(magic: bytes, header: dict[str, object], stored: Sequence[tuple[dict[str, object], bytes]]) -> bytes:
+    """Return the file of a header and its sections, given as entries of the header with the bytes that are stored."""
     # Offsets depend on the header's length and it on them: they are counted from the end of the header.
     position, entries = 0, []
     for entry, content in stored:
@@ -103,13 +103,13 @@ def _joined(header: dict[str, object], stored: Sequence[tuple[dict[str, object],
     text += b" " * (-len(text) % ALIGNMENT)
     if len(text) > LARGEST_HEADER:
         raise FormatError(f"header: expected at most {LARGEST_HEADER:,} bytes, got {len(text):,}")
-    parts = [MAGIC, struct.pack("<II", FORMAT_VERSION, len(text)), text]
+    parts = [magic, struct.pack("<II", FORMAT_VERSION, len(text)), text]
     for _, content in stored:
         parts += [content, bytes(-len(content) % ALIGNMENT)]
     return b"".join(parts)
 
 
-def _header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quality, title: str) -> dict[str, object]:
+def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quality, title: str) -> dict[str, object]:
     """Return the header without its sections."""
     from nexwarp import __version__
 

@@ -2,7 +2,7 @@
 // It has the interface of Renderer in renderer.js, for devices without WebGPU.
 
 import {asset} from "nexwarp/assets.js";
-import {SceneError} from "nexwarp/renderer.js";
+import {SceneError} from "nexwarp/scene.js";
 import {BakedScene, readBaked} from "nexwarp/baked_scene.js";
 import {QUADS_FRAGMENT, QUADS_VERTEX, RESOLVE_FRAGMENT, RESOLVE_VERTEX} from "nexwarp/baked_shaders.js";
 
@@ -29,7 +29,7 @@ export class BakedRenderer {
   }
 
   async load(source = null) {
-    const stream = typeof source === "string" ? await asset(source) : source ?? await asset(BAKED_FILE);
+    const stream = source instanceof ReadableStream ? source : await opened(source ?? BAKED_FILE);
     const {header, arrays} = await readBaked(stream, this.onProgress);
     this.scene = new BakedScene(header, arrays);
     this.header = header;
@@ -42,7 +42,7 @@ export class BakedRenderer {
   }
 
   async #atlasImage({file, width, height}) {
-    const bytes = await new Response(await asset(file)).arrayBuffer();
+    const bytes = await new Response(await opened(file)).arrayBuffer();
     const options = {premultiplyAlpha: "none", colorSpaceConversion: "none"};
     const image = await createImageBitmap(new Blob([bytes], {type: "image/webp"}), options).catch(() => {
       throw new SceneError(`${file}: expected a picture, and this browser cannot read it as one`);
@@ -251,6 +251,14 @@ export class BakedRenderer {
 
   destroy() {
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+}
+
+async function opened(file) {
+  try {
+    return await asset(file);
+  } catch (error) {
+    throw Object.assign(new SceneError(error.message), {missing: true});
   }
 }
 

@@ -1,6 +1,6 @@
 // Reader of baked scenes (docs/web.md), and what the CPU does with one: sorting, exposures, picking.
 
-import {SceneError} from "nexwarp/renderer.js";
+import {SceneError} from "nexwarp/scene.js";
 
 const MAGIC = "NXWBAKED";
 const VERSION = 1;
@@ -38,7 +38,7 @@ export async function readBaked(stream, onProgress = () => {}) {
   for (const [name, dtype, count] of sections(header)) {
     const entry = header.sections.find(one => one?.name === name);
     if (!entry) throw damaged(`expected the section ${name}, found none`);
-    arrays[name] = await section(bytes, entry, dtype, count);
+    arrays[name] = await section(bytes.subarray(16 + length), entry, dtype, count);
   }
   return {header, arrays};
 }
