@@ -42,6 +42,7 @@ class Gpu:
     Attributes:
         name: of the adapter.
         timed: whether it measures the times of passes.
+        half: whether shaders may compute in half precision.
         limits: sizes in bytes that buffers and their bindings may have.
     """
 
@@ -64,9 +65,10 @@ class Gpu:
                 adapter = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
             except RuntimeError as error:
                 raise MissingError(f"wgpu: expected a GPU, found none ({str(error):.200})") from None
-        self.timed = "timestamp-query" in adapter.features
+        self.timed, self.half = ("timestamp-query" in adapter.features, "shader-f16" in adapter.features)
+        wanted = {"timestamp-query": self.timed, "shader-f16": self.half}
         self.device = adapter.request_device_sync(
-            required_features=["timestamp-query"] if self.timed else [],
+            required_features=[name for name, there in wanted.items() if there],
             required_limits={name: adapter.limits[name] for name in LIMITS},
         )
         self.name: str = adapter.summary
@@ -124,15 +126,17 @@ class Gpu:
         timed = timed and self.timed
         encoder = self.device.create_command_encoder()
         queries = self.device.create_query_set(type="timestamp", count=2 * len(passes)) if timed else None
+        compute = None if timed else encoder.begin_compute_pass()
         for index, one in enumerate(passes):
-            extra = {}
             if queries is not None:
                 marks = {"beginning_of_pass_write_index": 2 * index, "end_of_pass_write_index": 2 * index + 1}
-                extra = {"timestamp_writes": {"query_set": queries, **marks}}
-            compute = encoder.begin_compute_pass(**extra)
+                compute = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
             compute.set_pipeline(one.pipeline)
             compute.set_bind_group(0, one.bindings)
             compute.dispatch_workgroups(*one.groups, 1)
+            if timed:
+                compute.end()
+        if not timed:
             compute.end()
         resolved = None
         if queries is not None:

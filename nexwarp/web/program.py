@@ -18,6 +18,7 @@ SCAN_BLOCK = 1024  # elements of a workgroup of scan.wgsl
 SORT_BLOCK = 2048  # pairs of a workgroup of sort.wgsl
 MODES = ("image", "plain", "textured", "ids", "depth", "weights", "normals", "alpha")
 FRAME_BYTES = 12 * 16
+MOST_UNROLLED = 1200  # blocks of an MLP that is unrolled
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,17 @@ class Program:
     Attributes:
         constants: names to WGSL literals.
         features: features an entry of the grid.
+        half: whether the MLP is computed in half precision.
+        unrolled: whether the MLP is unrolled.
     """
 
     constants: dict[str, str]
     features: int
+    half: bool
+    unrolled: bool
 
     @classmethod
-    def of(cls, scene: SceneData, sharing: int) -> "Program":
+    def of(cls, scene: SceneData, sharing: int, half: bool, unrolled: bool) -> "Program":
         """Derive the constants; `sharing` threads share a surfel's tile rows."""
         options, texture = scene.options, scene.texture
         stored = scene.sh.shape[1]
@@ -67,20 +72,62 @@ class Program:
             "CLAMP": options.clamp_texture,
         }
         constants = {name: f"{value}u" for name, value in unsigned.items()}
-        return cls(constants | {name: "true" if value else "false" for name, value in flags.items()}, features)
+        constants |= {name: "true" if value else "false" for name, value in flags.items()}
+        return cls(constants, features, half, unrolled)
+
+    def number(self, name: str) -> int:
+        """Return the value of a constant."""
+        return int(self.constants[name][:-1])
 
     def source(self, name: str) -> str:
         """Return the WGSL text of a shader, with constants and what it includes."""
         if name in ("scan", "sort"):
             return shader(name)
-        parts = [shader("common"), shader(name)]
+        parts, lines = [shader("common"), shader(name)], []
         if name == "shade":
-            parts.insert(1, shader(f"features{self.features}"))
-        lines = [
+            scalar = "f16" if self.half else "f32"
+            lines = [*(["enable f16;"] if self.half else []), f"alias Scalar = {scalar};", f"alias Weight = vec4<{scalar}>;"]
+            mlp = unrolled_mlp(self) if self.unrolled else shader("mlp")
+            parts = [shader("common"), shader(f"features{self.features}"), shader("shade"), mlp]
+        lines += [
             f"const {name}: {'u32' if value.endswith('u') else 'bool'} = {value};"
             for name, value in self.constants.items()
         ]
         return "\n".join([*lines, *parts])
+
+
+def unrolled_mlp(program: Program) -> str:
+    """Return `mlp_color` of mlp.wgsl without loops: activations stay in registers."""
+    inputs, width, hidden = (program.number(name) for name in ("INPUTS", "WIDTH", "HIDDEN"))
+    lines = ["fn mlp_color(x: ptr<function, array<Weight, INPUTS>>, direction: vec3f) -> vec3f {"]
+    lines += [f"    let h0_{i} = (*x)[{i}];" for i in range(inputs)]
+    at = 0
+
+    def product(layer: int) -> str:
+        nonlocal at
+        terms = [f"block_product({at + 4 * i}u, h{layer}_{i})" for i in range(inputs)]
+        at += 4 * inputs
+        return " + ".join(terms)
+
+    for layer in range(hidden):
+        lines += [f"    let h{layer + 1}_{o} = activation({product(layer)});" for o in range(width)]
+        inputs = width
+    blocks, used = program.number("BLOCKS"), program.number("USED_BLOCKS")
+    lines += [f"    let b{block} = basis({block}u, direction) * used({block}u);" for block in range(used)]
+    lines.append("    var color = vec3f(0.0);")
+    for channel in range(3):
+        for block in range(blocks):
+            text = product(hidden)
+            if block < used:
+                lines.append(f"    color[{channel}] += dot({text}, b{block});")
+    return "\n".join([*lines, "    return color;", "}"])
+
+
+def mlp_blocks(program: Program) -> int:
+    """Return the number of 4 x 4 blocks of the MLP."""
+    inputs, width, hidden = (program.number(name) for name in ("INPUTS", "WIDTH", "HIDDEN"))
+    last = 3 * program.number("BLOCKS")
+    return inputs * last if hidden == 0 else width * (inputs + (hidden - 1) * width + last)
 
 
 @cache

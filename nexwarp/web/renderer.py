@@ -1,8 +1,9 @@
 """The WebGPU renderer from Python: the shaders of the browser on any GPU that wgpu drives, without CUDA and Warp."""
 
 import os
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ from nexwarp.web.gpu import Gpu, Pass, grouped
 from nexwarp.web.program import (
     FRAME_BYTES,
     MODES,
+    MOST_UNROLLED,
     SCAN_BLOCK,
     SORT_BLOCK,
     Program,
     frame_values,
     geometry_rows,
     level_rows,
+    mlp_blocks,
     packed_matrices,
     tile_grid,
 )
@@ -58,12 +61,21 @@ class WebRendering:
 class Renderer:
     """Renders a scene with the WGSL shaders of the web page, on a GPU of any maker."""
 
-    def __init__(self, scene: Model | SceneData | str | os.PathLike[str], adapter: Any = None) -> None:
+    def __init__(
+        self,
+        scene: Model | SceneData | str | os.PathLike[str],
+        adapter: Any = None,
+        *,
+        half: bool = False,
+        unrolled: bool | None = None,
+    ) -> None:
         """Upload a scene.
 
         Args:
             scene: a model, a scene file's name, or its content.
             adapter: an adapter of wgpu; None takes the fastest one.
+            half: compute the MLP in half precision where the device has it.
+            unrolled: unroll the MLP; None unrolls it on GPUs, unless it is large.
 
         Raises:
             MissingError: wgpu is not installed, or finds no GPU.
@@ -75,7 +87,12 @@ class Renderer:
             scene = load_scene_file(scene)
         self.scene = SceneData.of(scene) if isinstance(scene, Model) else scene
         self.gpu = Gpu(adapter)
-        self._program = Program.of(self.scene, SHARING)
+        if unrolled is None:
+            unrolled = "(CPU)" not in self.gpu.name
+        self._program = Program.of(self.scene, SHARING, half and self.gpu.half, unrolled)
+        if mlp_blocks(self._program) > MOST_UNROLLED:
+            self._program = replace(self._program, unrolled=False)
+        self._plans: dict[tuple[int, int, int, int], list[Pass]] = {}
         self._capacity = FIRST_ENTRIES
         self._image: tuple[int, int] | None = None
         self._lists = 0
@@ -96,8 +113,11 @@ class Renderer:
             self._buffers[name] = gpu.buffer(name, 4 * count)
         if texture is not None:
             self._buffers["grid"] = gpu.buffer("texture grid", texture.grid)
-            self._buffers["mlp"] = gpu.buffer("texture MLP", packed_matrices(texture.matrices))
+            self._buffers["mlp"] = gpu.buffer("texture MLP", self._packed(texture.matrices))
             self._buffers["levels"] = gpu.buffer("resolutions", level_rows(texture.resolutions), uniform=True)
+
+    def _packed(self, matrices: list[np.ndarray]) -> np.ndarray:
+        return packed_matrices(matrices).astype(np.float16 if self._program.half else np.float32)
 
     def render(
         self,
@@ -146,20 +166,54 @@ class Renderer:
                 least_weight=least_weight,
                 exposures=exposures,
             )
-            self.gpu.write(self._buffers["frame"], values)
-            times = self.gpu.run(self._passes(camera, texel_step), timed)
-            sums = self.gpu.read(self._buffers["start_sums"], np.uint32, int(self._program.constants["TOTAL"][:-1]) + 1)
-            entries = int(sums[-1])
+            times = self._submit(camera, texel_step, values, timed)
+            total = self._program.number("TOTAL")
+            entries = int(self.gpu.read(self._buffers["start_sums"], np.uint32, total + 1)[-1])
             if entries <= self._capacity:
                 return self._rendering(camera, entries, times)
             check_range("entries of the tile lists", entries, 0, MOST_ENTRIES)
             self._capacity = int(entries * SPARE)
+
+    def _submit(self, camera: Camera, texel_step: int, values: bytes, timed: bool = False) -> dict[str, float]:
+        """Submit a frame without waiting for it, unless timed."""
+        key = (camera.width, camera.height, texel_step, self._capacity)
+        if key not in self._plans:
+            self._plans[key] = self._passes(camera, texel_step)
+        self.gpu.write(self._buffers["frame"], values)
+        return self.gpu.run(self._plans[key], timed)
+
+    def seconds_per_frame(self, camera: Camera, frames: int, *, texel_step: int = 1, least_weight: float = 0.0) -> float:
+        """Render a camera again and again without reading the pictures, and return the wall time of a frame.
+
+        Args:
+            camera: the camera.
+            frames: number of frames, >= 1.
+            texel_step: see `render`.
+            least_weight: see `render`.
+        """
+        self.render(camera, texel_step=texel_step, least_weight=least_weight)
+        values = frame_values(
+            self.scene,
+            camera,
+            self._capacity,
+            mode="image",
+            slot=0,
+            texel_step=texel_step,
+            least_weight=least_weight,
+            exposures=self.scene.exposures,
+        )
+        start = time.perf_counter()
+        for _ in range(frames):
+            self._submit(camera, texel_step, values)
+        self.gpu.read(self._buffers["image"], np.float32, 4)
+        return (time.perf_counter() - start) / frames
 
     def _make_image_buffers(self, camera: Camera) -> None:
         """Make the buffers of an image's size, unless they exist."""
         size = (camera.width, camera.height)
         if self._image == size:
             return
+        self._plans.clear()
         pixels, slots = camera.width * camera.height, max(self.scene.options.max_hits, 1)
         columns, rows = tile_grid(camera)
         self._image = None
@@ -174,6 +228,7 @@ class Renderer:
         """Make the tile lists of the capacity, unless they exist."""
         if self._lists == self._capacity:
             return
+        self._plans.clear()
         for name in ("tiles", "surfels", "tiles2", "surfels2"):
             self._buffers[name] = self.gpu.buffer("tile lists", 4 * self._capacity)
         self._lists = self._capacity
@@ -182,7 +237,7 @@ class Renderer:
         """Return the dispatches of a frame."""
         count, (columns, rows) = len(self.scene), tile_grid(camera)
         tiles = columns * rows
-        total = int(self._program.constants["TOTAL"][:-1])
+        total = self._program.number("TOTAL")
         passes = [self._pass("project", "project", "project", PROJECT, grouped(count))]
         passes += self._sort("sort surfels", ("keys", "order"), ("keys2", "order2"), 32, count, ("count", 0))
         passes += [self._pass("lists", "lists", "count", COUNT, grouped(count * SHARING))]

@@ -18,6 +18,7 @@ from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
+from nexwarp.representation.detail_limits import NEVER
 from nexwarp.representation.texture import NeuralTexture, TextureShape
 from nexwarp.web.quantise import (
     CHUNK,
@@ -51,6 +52,7 @@ FORMAT_VERSION = 1
 LARGEST_HEADER = 4 * 2**20
 MOST_CAMERAS = 200
 LARGEST_VALUE = 1e16
+SURFEL_ARRAYS = ("means", "quats", "scales", "opacities", "gammas", "limits", "sh")
 
 
 def encode_scene(
@@ -187,7 +189,7 @@ def _arrays(scene: SceneData, quality: Quality) -> dict[str, np.ndarray]:
     """Return the arrays of the sections by name."""
     arrays: dict[str, np.ndarray] = {}
     if quality == "full":
-        for name in ("means", "quats", "scales", "opacities", "gammas", "limits", "sh"):
+        for name in SURFEL_ARRAYS:
             if (array := getattr(scene, name)) is not None:
                 arrays[name] = array
     else:
@@ -291,8 +293,8 @@ def decode_scene(content: bytes) -> SceneData:
     sections = _sections_of(header, options.detail_limits)
     arrays = _read_arrays(content, header, start, sections)
     data = arrays if header["quality"] == "full" else _dequantised(arrays, options.detail_limits)
-    for name, values in data.items():
-        if not bool(np.all(np.abs(values) <= (1e30 if name == "limits" else LARGEST_VALUE))):
+    for name in SURFEL_ARRAYS:
+        if name in data and not bool(np.all(np.abs(data[name]) <= (NEVER if name == "limits" else LARGEST_VALUE))):
             raise FormatError(f"section {name}: expected finite values of at most {LARGEST_VALUE:g}")
     return SceneData(
         *(data[name] for name in ("means", "quats", "scales", "opacities", "gammas")),

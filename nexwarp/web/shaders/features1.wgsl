@@ -8,6 +8,6 @@ fn fetch(index: u32) -> Features {
     return select(pair.x, pair.y, (index & 1u) == 1u);
 }
 
-fn store_features(x: ptr<function, array<vec4f, INPUTS>>, level: u32, value: Features) {
-    (*x)[level / 4u][level % 4u] = value;
+fn store_features(x: ptr<function, array<Weight, INPUTS>>, level: u32, value: Features) {
+    (*x)[level / 4u][level % 4u] = Scalar(value);
 }

@@ -7,10 +7,10 @@ fn fetch(index: u32) -> Features {
     return unpack2x16float(grid[index]);
 }
 
-fn store_features(x: ptr<function, array<vec4f, INPUTS>>, level: u32, value: Features) {
+fn store_features(x: ptr<function, array<Weight, INPUTS>>, level: u32, value: Features) {
     if (level % 2u == 0u) {
-        (*x)[level / 2u] = vec4f(value, 0.0, 0.0);
+        (*x)[level / 2u] = Weight(vec4f(value, 0.0, 0.0));
     } else {
-        (*x)[level / 2u] = vec4f((*x)[level / 2u].xy, value);
+        (*x)[level / 2u] = Weight(vec4f(vec2f((*x)[level / 2u].xy), value));
     }
 }

@@ -8,6 +8,6 @@ fn fetch(index: u32) -> Features {
     return vec4f(unpack2x16float(row.x), unpack2x16float(row.y));
 }
 
-fn store_features(x: ptr<function, array<vec4f, INPUTS>>, level: u32, value: Features) {
-    (*x)[level] = value;
+fn store_features(x: ptr<function, array<Weight, INPUTS>>, level: u32, value: Features) {
+    (*x)[level] = Weight(value);
 }

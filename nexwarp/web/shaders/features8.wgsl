@@ -11,7 +11,7 @@ fn fetch(index: u32) -> Features {
     );
 }
 
-fn store_features(x: ptr<function, array<vec4f, INPUTS>>, level: u32, value: Features) {
-    (*x)[2u * level] = value[0];
-    (*x)[2u * level + 1u] = value[1];
+fn store_features(x: ptr<function, array<Weight, INPUTS>>, level: u32, value: Features) {
+    (*x)[2u * level] = Weight(value[0]);
+    (*x)[2u * level + 1u] = Weight(value[1]);
 }

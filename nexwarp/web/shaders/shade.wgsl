@@ -2,14 +2,15 @@
 // Hash lookup (nexwarp/kernels/hashgrid.py, paper Eq. 2 and 4), MLP, spherical harmonics of each of its K hits.
 //
 // The MLP's matrices are in blocks of 4 x 4, column by column, a row of blocks after the other. The rows of the last one
-// are by channel, then coefficient, so that a block's dot product with the basis is a part of one channel.
+// are by channel, then coefficient, so that a block's dot product with the basis is a part of one channel. `mlp_color` is
+// in mlp.wgsl, or unrolled by the host. Weights and activations are in half precision where the device has it.
 
 @group(0) @binding(1) var<storage, read> seen: array<vec2f>;
 @group(0) @binding(2) var<storage, read> ids: array<i32>;
 @group(0) @binding(3) var<storage, read> depths: array<f32>;
 @group(0) @binding(4) var<storage, read> weights: array<f32>;
 @group(0) @binding(5) var<storage, read> grid: array<Row>;
-@group(0) @binding(6) var<storage, read> mlp: array<vec4f>;
+@group(0) @binding(6) var<storage, read> mlp: array<Weight>;
 @group(0) @binding(7) var<storage, read_write> texels: array<vec4f>;  // colour; 1 where the hit is textured
 @group(0) @binding(8) var<uniform> resolutions: array<vec4f, 16>;  // cells per world unit of each level
 
@@ -46,64 +47,12 @@ fn lookup(level: u32, position: vec3f, depth: f32) -> Features {
     return front * (g.z * fade) + back * (f.z * fade);
 }
 
-fn block_product(at: u32, x: vec4f) -> vec4f {
-    return mlp[at] * x.x + mlp[at + 1u] * x.y + mlp[at + 2u] * x.z + mlp[at + 3u] * x.w;
+fn block_product(at: u32, x: Weight) -> vec4f {
+    return vec4f(mlp[at] * x.x + mlp[at + 1u] * x.y + mlp[at + 2u] * x.z + mlp[at + 3u] * x.w);
 }
 
-fn texture_color(position: vec3f, depth: f32, direction: vec3f) -> vec3f {
-    var x: array<vec4f, INPUTS>;
-    for (var level = 0u; level < LEVELS; level++) {
-        store_features(&x, level, lookup(level, position, depth));
-    }
-    var at = 0u;
-    var color = vec3f(0.0);
-    if (HIDDEN == 0u) {
-        for (var channel = 0u; channel < 3u; channel++) {
-            for (var block = 0u; block < BLOCKS; block++) {
-                var sum = vec4f(0.0);
-                for (var i = 0u; i < INPUTS; i++) {
-                    sum += block_product(at, x[i]);
-                    at += 4u;
-                }
-                color[channel] += dot(sum, basis(block, direction) * used(block));
-            }
-        }
-        return color;
-    }
-    var h: array<vec4f, WIDTH>;
-    for (var o = 0u; o < WIDTH; o++) {
-        var sum = vec4f(0.0);
-        for (var i = 0u; i < INPUTS; i++) {
-            sum += block_product(at, x[i]);
-            at += 4u;
-        }
-        h[o] = max(sum, vec4f(0.0));
-    }
-    for (var layer = 1u; layer < HIDDEN; layer++) {
-        var next: array<vec4f, WIDTH>;
-        for (var o = 0u; o < WIDTH; o++) {
-            var sum = vec4f(0.0);
-            for (var i = 0u; i < WIDTH; i++) {
-                sum += block_product(at, h[i]);
-                at += 4u;
-            }
-            next[o] = max(sum, vec4f(0.0));
-        }
-        h = next;
-    }
-    for (var channel = 0u; channel < 3u; channel++) {
-        for (var block = 0u; block < BLOCKS; block++) {
-            if (block < USED_BLOCKS) {
-                var sum = vec4f(0.0);
-                for (var i = 0u; i < WIDTH; i++) {
-                    sum += block_product(at + 4u * i, h[i]);
-                }
-                color[channel] += dot(sum, basis(block, direction) * used(block));
-            }
-            at += 4u * WIDTH;
-        }
-    }
-    return color;
+fn activation(sum: vec4f) -> Weight {
+    return Weight(clamp(sum, vec4f(0.0), vec4f(60000.0)));
 }
 
 // 1 for the coefficients of a block that the SH degree of the rendering includes.
@@ -134,7 +83,12 @@ fn shade(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
                 let range = seen[i] * focal;
                 seen_depth = max(min(depth, range.y), range.x);
             }
-            var c = texture_color(frame.position.xyz + ray * depth, seen_depth, direction);
+            let position = frame.position.xyz + ray * depth;
+            var x: array<Weight, INPUTS>;
+            for (var level = 0u; level < LEVELS; level++) {
+                store_features(&x, level, lookup(level, position, seen_depth));
+            }
+            var c = mlp_color(&x, direction);
             if (!RESIDUAL) {
                 c += 0.5;
                 if (CLAMP) {

@@ -1,0 +1,178 @@
+"""The WGSL renderer of the web page, run through wgpu: agreement with `Model.render`, times of its stages, sizes.
+
+    python -m benchmarks.bench_web RUN --size 1920x1080
+
+Needs the extra `wgpu` and a Vulkan or Metal driver. Prints for the run's test views the PSNR against `Model.render` on
+the CPU, of the exact and of the quantised scene file; with --scene, also the PSNR of each against the photos. Then the
+times of the stages at --size, for each way to save work on weak GPUs with its cost in dB, and with CUDA those of
+`Model.render`.
+"""
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+
+import nexwarp as nw
+from benchmarks.timing import git_commit
+from nexwarp.camera import resized
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.model.model import Model
+from nexwarp.web.renderer import Renderer
+from nexwarp.web.scene_data import SceneData
+from nexwarp.web.scene_file import decode_scene, encode_scene
+
+Options = dict[str, float]
+SAVINGS: dict[str, tuple[bool, Options]] = {
+    "exact": (False, {}),
+    "half precision": (True, {}),
+    "texture at half resolution": (True, {"texel_step": 2}),
+    "second hits below 1/64 plain": (True, {"least_weight": 1 / 64}),
+    "both": (True, {"texel_step": 2, "least_weight": 1 / 64}),
+}
+
+
+@dataclass
+class Arguments:
+    """Arguments of the command line."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    size: str = "1920x1080"
+    """Size of the timed frames."""
+    frames: int = 30
+    """Number of timed frames."""
+    views: int = 7
+    """Test views that are compared."""
+    scene: Path | None = None
+    """The scene's folder, for the PSNR against photos."""
+    downscale: int = 1
+    """--downscale of the training."""
+    loops: bool = False
+    """Also time the MLP in loops."""
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """PSNR of two images of values up to 1, without clamping; that of equal images is limited to 200 dB."""
+    return float(-10 * np.log10(max(np.mean((a.astype(np.float64) - b) ** 2), 1e-20)))
+
+
+def shown(image: np.ndarray) -> np.ndarray:
+    """Return an image as it is shown and compared with photos."""
+    return np.rint(image.clip(0, 1) * 255) / 255
+
+
+def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) -> None:
+    """Print the agreement with `Model.render`, and the PSNR against the photos."""
+    views = list(load_cameras(arguments.run)["test"].items())[: arguments.views]
+    photos = {}
+    if arguments.scene is not None:
+        given = nw.load_scene(arguments.scene, downscale=arguments.downscale)
+        photos = {view.name: view.image for view in given.test}
+    with torch.no_grad():
+        references = [model.render(camera) for _, camera in views]
+    for name, scene in scenes.items():
+        renderer = Renderer(scene)
+        rows = []
+        for (view, camera), reference in zip(views, references, strict=True):
+            out, expected = renderer.render(camera), reference.image.numpy()
+            row = [psnr(out.image, expected)]
+            if name == "full":
+                row.append(100 * float(np.mean((out.ids != reference.ids.numpy()).any(-1))))
+            if view in photos:
+                photo = np.asarray(photos[view]) / 255
+                row += [psnr(shown(out.image), photo), psnr(shown(expected), photo)]
+            rows.append(row)
+        columns = list(zip(*rows, strict=True))
+        text = f"{name}: against Model.render {min(columns[0]):.1f} dB at least, {statistics.mean(columns[0]):.1f} mean"
+        if name == "full":
+            text += f"; pixels whose ids differ {max(columns[1]):.4f} % at most"
+        if photos:
+            text += f"; against photos {statistics.mean(columns[-2]):.3f} dB, Model.render {statistics.mean(columns[-1]):.3f}"
+        print(text, flush=True)
+
+
+def times(arguments: Arguments, scene: SceneData, camera: nw.Camera) -> None:
+    """Print the times of the stages for each way to save work."""
+    reference = None
+    cases: list[tuple[str, bool, bool | None, Options]] = [(n, half, None, o) for n, (half, o) in SAVINGS.items()]
+    if arguments.loops:
+        cases.insert(1, ("MLP in loops", False, False, {}))
+    renderers: dict[tuple[bool, bool | None], Renderer] = {}
+    for name, half, unrolled, options in cases:
+        start = time.perf_counter()
+        if (half, unrolled) not in renderers:
+            renderers[half, unrolled] = Renderer(scene, half=half, unrolled=unrolled)
+        renderer = renderers[half, unrolled]
+        out = renderer.render(camera, **options)  # type: ignore[arg-type]
+        first = time.perf_counter() - start
+        reference = out.image if reference is None else reference
+        runs = [renderer.render(camera, timed=True, **options).times for _ in range(arguments.frames)]  # type: ignore[arg-type]
+        stages = {stage: statistics.median(run[stage] for run in runs) for stage in runs[0]}
+        wall = 1e3 * renderer.seconds_per_frame(camera, arguments.frames, **options)  # type: ignore[arg-type]
+        listed = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
+        print(
+            f"{name}: stages {sum(stages.values()):.3f} ms ({listed}); back to back {wall:.3f} ms = {1e3 / wall:.0f} FPS; "
+            f"{psnr(out.image, reference):.1f} dB to exact; {out.entries:,} entries; first frame {first:.2f} s",
+            flush=True,
+        )
+
+
+def cuda_times(arguments: Arguments, model: Model, camera: nw.Camera) -> None:
+    """Print the time of `Model.render` on CUDA."""
+    model = model.to("cuda")
+    camera = camera.to("cuda")
+
+    @torch.no_grad()
+    def frame() -> None:
+        model.render(camera)
+
+    for _ in range(5):
+        frame()
+    print(f"Model.render on {torch.cuda.get_device_name()}: {_back_to_back(frame, arguments.frames):.3f} ms back to back")
+    torch.cuda.synchronize()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(10):
+            frame()
+        torch.cuda.synchronize()
+    kernels = sorted(profile.key_averages(), key=lambda event: -event.device_time_total)
+    total = sum(event.device_time_total for event in kernels) / 1e4
+    print(f"  on the GPU {total:.3f} ms: " + ", ".join(f"{e.key[:34]} {e.device_time_total / 1e4:.3f}" for e in kernels[:12]))
+
+
+def _back_to_back(frame: Callable[[], None], count: int) -> float:
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    for _ in range(count):
+        frame()
+    torch.cuda.synchronize()
+    return 1e3 * (time.perf_counter() - start) / count
+
+
+def main(arguments: Arguments) -> None:
+    """Compare, then measure."""
+    model = nw.load(arguments.run)
+    sets = load_cameras(arguments.run)
+    cameras = {**sets["train"], **sets["test"]}
+    contents = {quality: encode_scene(model, cameras, quality=quality) for quality in ("full", "quantised")}
+    scenes = {quality: decode_scene(content) for quality, content in contents.items()}
+    sizes = ", ".join(f"{quality} {len(content) / 1e6:.2f} MB" for quality, content in contents.items())
+    print(f"{Renderer(scenes['full']).gpu.name}; commit {git_commit()}; {len(model.surfels):,} surfels; {sizes}")
+    compare(arguments, model, scenes)
+    width, height = map(int, arguments.size.split("x"))
+    camera = resized(next(iter(sets["test"].values())), width, height)
+    print(f"{arguments.run.name} at {width}x{height}, median of {arguments.frames}")
+    times(arguments, scenes["quantised"], camera)
+    if torch.cuda.is_available():
+        cuda_times(arguments, model, camera)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Arguments)))
