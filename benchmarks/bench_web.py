@@ -9,7 +9,6 @@ times of the stages at --size, for each way to save work on weak GPUs with its c
 """
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +26,8 @@ from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.model.model import Model
 from nexwarp.web.renderer import Renderer
 from nexwarp.web.scene_data import SceneData
-from nexwarp.web.scene_file import decode_scene, encode_scene
+from nexwarp.web.scene_file import encode_scene
+from nexwarp.web.scene_reader import decode_scene
 
 Options = dict[str, float]
 SAVINGS: dict[str, tuple[bool, Options]] = {
@@ -95,7 +95,8 @@ def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) ->
         if name == "full":
             text += f"; pixels whose ids differ {max(columns[1]):.4f} % at most"
         if photos:
-            text += f"; against photos {statistics.mean(columns[-2]):.3f} dB, Model.render {statistics.mean(columns[-1]):.3f}"
+            ours, theirs = (statistics.mean(column) for column in columns[-2:])
+            text += f"; against photos {ours:.3f} dB, Model.render {theirs:.3f}"
         print(text, flush=True)
 
 
@@ -119,8 +120,8 @@ def times(arguments: Arguments, scene: SceneData, camera: nw.Camera) -> None:
         wall = 1e3 * renderer.seconds_per_frame(camera, arguments.frames, **options)  # type: ignore[arg-type]
         listed = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
         print(
-            f"{name}: stages {sum(stages.values()):.3f} ms ({listed}); back to back {wall:.3f} ms = {1e3 / wall:.0f} FPS; "
-            f"{psnr(out.image, reference):.1f} dB to exact; {out.entries:,} entries; first frame {first:.2f} s",
+            f"{name}: stages {sum(stages.values()):.3f} ms ({listed}); "
+            f"back to back {wall:.3f} ms = {1e3 / wall:.0f} FPS; {psnr(out.image, reference):.1f} dB to exact; {out.entries:,} entries; first frame {first:.2f} s",
             flush=True,
         )
 
@@ -136,7 +137,8 @@ def cuda_times(arguments: Arguments, model: Model, camera: nw.Camera) -> None:
 
     for _ in range(5):
         frame()
-    print(f"Model.render on {torch.cuda.get_device_name()}: {_back_to_back(frame, arguments.frames):.3f} ms back to back")
+    wall = _back_to_back(frame, arguments.frames)
+    print(f"Model.render on {torch.cuda.get_device_name()}: {wall:.3f} ms back to back")
     torch.cuda.synchronize()
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         for _ in range(10):
@@ -144,7 +146,8 @@ def cuda_times(arguments: Arguments, model: Model, camera: nw.Camera) -> None:
         torch.cuda.synchronize()
     kernels = sorted(profile.key_averages(), key=lambda event: -event.device_time_total)
     total = sum(event.device_time_total for event in kernels) / 1e4
-    print(f"  on the GPU {total:.3f} ms: " + ", ".join(f"{e.key[:34]} {e.device_time_total / 1e4:.3f}" for e in kernels[:12]))
+    listed = ", ".join(f"{event.key[:34]} {event.device_time_total / 1e4:.3f}" for event in kernels[:12])
+    print(f"  on the GPU {total:.3f} ms: {listed}")
 
 
 def _back_to_back(frame: Callable[[], None], count: int) -> float:
@@ -175,4 +178,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Arguments)))
+    main(tyro.cli(Arguments))

@@ -17,7 +17,7 @@ from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
 from nexwarp.model.model_file import MODEL_FILE, load
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
-from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
+from nexwarp.run.contents import RENDERS_FOLDER
 from nexwarp.run.export import export_run
 from nexwarp.run.folder import (
     read_metrics,
@@ -95,21 +95,26 @@ class Export:
 
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
+
+    --format web writes a web page that shows the scene in any browser with WebGPU, without an installation.
     """
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,cameras}")] = "ply"
+    format: Annotated[str, option("{ply,cameras,web}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
-    """Output folder."""
+    """Output folder. Of --format web, NAME.html writes one file with everything, which is also the default:
+    RUN/export/scene.html."""
+    quality: Annotated[str, option("{quantised,full}")] = "quantised"
+    """Of --format web: quantised files are a fifth to a half as large."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
     """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
     Gaussians; inf splits none."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        for file in export_run(self.run, self.format, self.out or self.run / EXPORT_FOLDER, self.max_extent):
+        for file in export_run(self.run, self.format, self.out, self.max_extent, self.quality):
             console.print(str(file), soft_wrap=True)
 
 

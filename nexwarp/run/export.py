@@ -3,26 +3,30 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from nexwarp.camera import resized
+from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
-from nexwarp.run.folder import read_run
+from nexwarp.run.contents import CAMERA_PATH_FILE, EXPORT_FOLDER, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE, WEB_FILE
+from nexwarp.run.folder import SceneSource, read_run
 
-FORMATS = ("ply", "cameras")
+FORMATS = ("ply", "cameras", "web")
 
 
-def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
+def export_run(
+    run: Path, kind: str, folder: Path | None = None, max_extent: float = MAX_EXTENT, quality: str = "quantised"
+) -> Sequence[Path]:
     """Export a run to a folder; docs/outputs.md describes the files.
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
-        folder: output folder, created if it does not exist.
+        kind: "ply" (surfels.ply, splats.ply), "cameras" (transforms.json, camera_path.json) or "web" (a web page).
+        folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
+            in .html is one file with everything; None is `export/scene.html`.
         max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        quality: "quantised" or "full", of a web page.
 
     Returns:
         The files that were written.
@@ -35,13 +39,22 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     if kind not in FORMATS:
         raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
+    if kind == "web":
+        from nexwarp.web.export import export_web
+
+        return export_web(
+            load(run),
+            _all_cameras(run),
+            folder or run / EXPORT_FOLDER / WEB_FILE,
+            quality=quality,
+            title=run_title(source),
+        )
+    folder = folder or run / EXPORT_FOLDER
     if kind == "ply":
         model = load(run)
         files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
         save_surfels_ply(files[0], model.surfels)
-        # A training that stopped early leaves a model, but no cameras file.
-        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
-        all_cameras = [camera for members in groups for camera in members.values()]
+        all_cameras = list(_all_cameras(run).values())
         degree = model.options.sh_degree
         save_splats_ply(files[1], model.surfels, degree, cameras=all_cameras, max_extent=max_extent)
         return files
@@ -59,3 +72,15 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
     return files
+
+
+def _all_cameras(run: Path) -> dict[str, Camera]:
+    """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
+    if not (run / CAMERAS_FILE).is_file():
+        return {}
+    return {name: camera for members in load_cameras(run / CAMERAS_FILE).values() for name, camera in members.items()}
+
+
+def run_title(source: SceneSource) -> str:
+    """Return the name of a run's scene, as a title."""
+    return Path(source.path).name or "nexwarp"

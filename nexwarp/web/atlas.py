@@ -23,9 +23,7 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 DTYPES = {"f4": "f32", "u2": "u16", "u1": "u8"}
 
 
-def bake(
-    model: Model, cameras: Mapping[str, Camera], done: Callable[[], object] = lambda: None
-) -> dict[str, bytes]:
+def bake(model: Model, cameras: Mapping[str, Camera], done: Callable[[], object] = lambda: None) -> dict[str, bytes]:
     """Bake a model for the page.
 
     Args:

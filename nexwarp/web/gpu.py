@@ -64,7 +64,7 @@ class Gpu:
             try:
                 adapter = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
             except RuntimeError as error:
-                raise MissingError(f"wgpu: expected a GPU, found none ({str(error):.200})") from None
+                raise MissingError(f"wgpu: expected a GPU, found none ({error!s:.200})") from None
         self.timed, self.half = ("timestamp-query" in adapter.features, "shader-f16" in adapter.features)
         wanted = {"timestamp-query": self.timed, "shader-f16": self.half}
         self.device = adapter.request_device_sync(
@@ -81,8 +81,10 @@ class Gpu:
         Raises:
             OutOfMemoryError: the size is beyond the device's limits.
         """
-        data = None if isinstance(content, int) else memoryview(np.ascontiguousarray(content)).cast("B")
-        size = max(content if isinstance(content, int) else len(data or b""), 16)
+        data = b""
+        if not isinstance(content, int):
+            data = content if isinstance(content, bytes) else np.ascontiguousarray(content).tobytes()
+        size = max(content if isinstance(content, int) else len(data), 16)
         size = -(-size // 16) * 16
         most = min(self.limits.values())
         if size > most:
@@ -92,8 +94,8 @@ class Gpu:
         usage = self._wgpu.BufferUsage
         kind = usage.UNIFORM if uniform else usage.STORAGE | usage.COPY_SRC
         made = self.device.create_buffer(label=name, size=size, usage=kind | usage.COPY_DST)
-        if data is not None and len(data):
-            self.device.queue.write_buffer(made, 0, bytes(data) + bytes(-len(data) % 4))
+        if data:
+            self.device.queue.write_buffer(made, 0, data + bytes(-len(data) % 4))
         return made
 
     def pipeline(self, name: str, source: str, entry: str) -> Any:
@@ -126,7 +128,7 @@ class Gpu:
         timed = timed and self.timed
         encoder = self.device.create_command_encoder()
         queries = self.device.create_query_set(type="timestamp", count=2 * len(passes)) if timed else None
-        compute = None if timed else encoder.begin_compute_pass()
+        compute: Any = None if timed else encoder.begin_compute_pass()
         for index, one in enumerate(passes):
             if queries is not None:
                 marks = {"beginning_of_pass_write_index": 2 * index, "end_of_pass_write_index": 2 * index + 1}

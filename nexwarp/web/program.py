@@ -86,7 +86,11 @@ class Program:
         parts, lines = [shader("common"), shader(name)], []
         if name == "shade":
             scalar = "f16" if self.half else "f32"
-            lines = [*(["enable f16;"] if self.half else []), f"alias Scalar = {scalar};", f"alias Weight = vec4<{scalar}>;"]
+            lines = [
+                *(["enable f16;"] if self.half else []),
+                f"alias Scalar = {scalar};",
+                f"alias Weight = vec4<{scalar}>;",
+            ]
             mlp = unrolled_mlp(self) if self.unrolled else shader("mlp")
             parts = [shader("common"), shader(f"features{self.features}"), shader("shade"), mlp]
         lines += [

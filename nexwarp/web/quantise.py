@@ -49,8 +49,8 @@ def encode_chunks(values: np.ndarray, dtype: type) -> tuple[np.ndarray, np.ndarr
     high = np.maximum.reduceat(values, starts).astype(np.float32)
     steps = ((high.astype(np.float64) - low) / largest).astype(np.float32)
     ranges = np.stack([low, steps], axis=-1)
-    low, steps = (np.repeat(x, CHUNK, axis=0)[: len(values)].astype(np.float64) for x in (low, steps))
-    codes = np.rint((values - low) / np.where(steps > 0, steps, 1.0))
+    first, step = (np.repeat(x, CHUNK, axis=0)[: len(values)].astype(np.float64) for x in (low, steps))
+    codes = np.rint((values - first) / np.where(step > 0, step, 1.0))
     return np.clip(codes, 0, largest).astype(dtype), ranges
 
 
@@ -58,6 +58,13 @@ def decode_chunks(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
     """Return the (N, C) float32 values of codes."""
     whole = np.repeat(ranges, CHUNK, axis=0)[: len(codes)]
     return whole[..., 0] + whole[..., 1] * codes.astype(np.float32)
+
+
+def _half_turns(
+    w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], ...]:
+    """Return a quaternion's products with 1, i, j, k."""
+    return (w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)
 
 
 def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,10 +79,8 @@ def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     w, x, y, z = quats.astype(np.float64).T
     c = np.sqrt(0.5)
     quarter = (c * (w - z), c * (x + y), c * (y - x), c * (z + w))
-    # The surfel's eight rotations: q and q times a quarter turn, each times 1, i, j, k.
-    turned = np.stack(
-        [np.stack(one) for w, x, y, z in ((w, x, y, z), quarter) for one in ((w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))]
-    )
+    # The surfel's eight rotations: q, and q times a quarter turn, each times 1, i, j, k.
+    turned = np.stack([np.stack(one) for start in ((w, x, y, z), quarter) for one in _half_turns(*start)])
     best = np.argmax(np.abs(turned[:, 0]), axis=0)
     swapped = best >= 4
     w, x, y, z = np.take_along_axis(turned, best[None, None], axis=0)[0]

@@ -82,7 +82,7 @@ class Renderer:
             OutOfMemoryError: a buffer is beyond the device's limits.
         """
         if isinstance(scene, (str, os.PathLike)):
-            from nexwarp.web.scene_file import load_scene_file
+            from nexwarp.web.scene_reader import load_scene_file
 
             scene = load_scene_file(scene)
         self.scene = SceneData.of(scene) if isinstance(scene, Model) else scene
@@ -182,7 +182,9 @@ class Renderer:
         self.gpu.write(self._buffers["frame"], values)
         return self.gpu.run(self._plans[key], timed)
 
-    def seconds_per_frame(self, camera: Camera, frames: int, *, texel_step: int = 1, least_weight: float = 0.0) -> float:
+    def seconds_per_frame(
+        self, camera: Camera, frames: int, *, texel_step: int = 1, least_weight: float = 0.0
+    ) -> float:
         """Render a camera again and again without reading the pictures, and return the wall time of a frame.
 
         Args:

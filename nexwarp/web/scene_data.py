@@ -124,7 +124,9 @@ class SceneData:
         if model.exposures is not None and model.options.exposure == "photos":
             exposures = ExposureData.of(model.exposures)
         arrays = [_array(x) for x in (active.means, active.quats, active.scales, active.opacities, active.gammas)]
-        return cls(*arrays, limits, _array(surfels.sh), model.options, texture, exposures)
+        means, quats, scales, opacities, gammas = arrays
+        colors, options = _array(surfels.sh), model.options
+        return cls(means, quats, scales, opacities, gammas, limits, colors, options, texture, exposures)
 
     def __len__(self) -> int:
         return len(self.means)

@@ -1,9 +1,10 @@
 """Sections of a scene file: their names, types and shapes follow from the header; packing and unpacking."""
 
+import itertools
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 
@@ -14,6 +15,10 @@ Quality = Literal["quantised", "full"]
 QUALITIES = get_args(Quality)
 DTYPES = {"u8": np.uint8, "u16": np.uint16, "u32": np.uint32, "f16": np.float16, "f32": np.float32}
 ALIGNMENT = 8
+MAGIC = b"NXWSCENE"
+FORMAT_VERSION = 1
+LARGEST_HEADER = 4 * 2**20
+SURFEL_ARRAYS = ("means", "quats", "scales", "opacities", "gammas", "limits", "sh")
 
 
 @dataclass(frozen=True)
@@ -86,13 +91,26 @@ def expected_sections(
     return sections
 
 
+def sections_of(header: Mapping[str, object], limits: bool) -> list[Section]:
+    """Return the sections that a checked header describes, without the poster."""
+    exposures = cast("Mapping[str, int] | None", header["exposures"])
+    return expected_sections(
+        cast(Quality, header["quality"]),
+        cast(int, header["surfels"]),
+        cast(int, header["sh_coefficients"]),
+        limits,
+        0 if exposures is None else exposures["count"],
+        cast("Mapping[str, object] | None", header["texture"]),
+    )
+
+
 def matrix_shapes(texture: Mapping[str, object]) -> list[tuple[int, int]]:
     """Return the shapes (out, in) of the MLP's matrices."""
     levels, features, width, hidden, degree = (
         int(str(texture[name])) for name in ("levels", "features", "width", "hidden_layers", "sh_degree")
     )
     sizes = [levels * features, *[width] * hidden, 3 * (degree + 1) ** 2]
-    return [(out, into) for into, out in zip(sizes, sizes[1:], strict=False)]
+    return [(out, into) for into, out in itertools.pairwise(sizes)]
 
 
 def pack(content: bytes) -> tuple[str, bytes]:
