@@ -48,9 +48,7 @@ def composited(baked: Baked, camera: nw.Camera) -> torch.Tensor:
     exponents = local.square().clamp_min(TINY).pow(surfels.gammas).sum(-1)
     alphas = (surfels.opacities * torch.exp(-0.5 * exponents)).clamp(max=ALPHA_MAX)
     alphas = alphas.where((alphas >= ALPHA_MIN) & (depths > camera.near), 0.0)
-    plain = ops.plain_colors(
-        (surfels.sh0, surfels.shN), surfels.means, eye, baked.model.options.sh_degree
-    )
+    plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, eye, baked.model.options.sh_degree)
     ids = torch.arange(len(surfels.means)).expand(local.shape[:2])
     places = baked.layout.texels(ids, local)
     colors = (plain + bilinear(baked.atlas.double(), places)).clamp_min(0)

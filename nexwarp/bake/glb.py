@@ -45,7 +45,9 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
         import trimesh
         from trimesh.exchange.gltf import export_glb
     except ImportError:
-        raise SettingError("--format glb: expected trimesh; install the extra with pip install 'nexwarp[glb]'") from None
+        raise SettingError(
+            "--format glb: expected trimesh; install the extra with pip install 'nexwarp[glb]'"
+        ) from None
     from PIL import Image
 
     layout, pixels = _texture(baked, side)

@@ -41,7 +41,9 @@ def save_splats_spz(
     try:
         import gaussforge
     except ImportError:
-        raise SettingError("--format spz: needs the package gaussforge, found none; pip install 'nexwarp[splats]'") from None
+        raise SettingError(
+            "--format spz: needs the package gaussforge, found none; pip install 'nexwarp[splats]'"
+        ) from None
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
         save_splats_ply(ply, surfels, sh_degree, cameras=cameras, max_extent=max_extent)
