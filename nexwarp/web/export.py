@@ -104,9 +104,11 @@ def one_file(content: Mapping[str, bytes]) -> bytes:
         for name, data in content.items()
         if name.endswith(MODULES)
     }
-    if IMPORT_MAP not in page or "</body>" not in page:
-        raise FormatError(f"{INDEX}: expected the import map {IMPORT_MAP} and a body")
-    page = page.replace(IMPORT_MAP, json.dumps({"imports": modules}))
+    first_script = page.find("<script", page.find("<body"))
+    if IMPORT_MAP not in page or first_script < 0:
+        raise FormatError(f"{INDEX}: expected the import map {IMPORT_MAP} and a script in the body")
+    head, body = page[:first_script], page[first_script:]
+    page = head.replace(IMPORT_MAP, json.dumps({"imports": modules}))
 
     def style(match: re.Match[str]) -> str:
         return f"<style>{content[match[1]].decode()}</style>"
@@ -117,7 +119,8 @@ def one_file(content: Mapping[str, bytes]) -> bytes:
         for name, data in content.items()
         if name != INDEX and not name.endswith((MODULES, STYLES))
     )
-    return page.replace("</body>", f"{elements}</body>").encode()
+    # Before the scripts, which look for them.
+    return f"{page}{elements}{body}".encode()
 
 
 @torch.no_grad()

@@ -107,13 +107,17 @@ export class Renderer {
                 onLost?.(new SceneError(`The GPU was lost: ${lost.message || lost.reason}`));
             }
         });
+        // Software adapters cannot show a canvas in every configuration of a browser: their pictures are copied to it.
+        renderer.copied = software;
         if (canvas !== null) {
-            renderer.context = canvas.getContext("webgpu");
+            renderer.context = canvas.getContext(software ? "2d" : "webgpu");
             if (renderer.context === null) {
                 throw new SceneError("This browser gives the canvas no WebGPU context.");
             }
-            renderer.format = navigator.gpu.getPreferredCanvasFormat();
-            renderer.context.configure({ device, format: renderer.format, alphaMode: "opaque" });
+            if (!software) {
+                renderer.format = navigator.gpu.getPreferredCanvasFormat();
+                renderer.context.configure({ device, format: renderer.format, alphaMode: "opaque" });
+            }
         }
         return renderer;
     }
@@ -210,7 +214,7 @@ export class Renderer {
         this.texts = Object.fromEntries(names.map((name, i) => [name, texts[i]]));
         this.constants = constantsOf(this.header);
         await Promise.all(ENTRIES.map(([name, entry]) => this.pipeline(name, entry)));
-        if (this.canvas !== null) {
+        if (this.canvas !== null && !this.copied) {
             const module = this.device.createShaderModule({ label: "blit", code: this.texts.blit });
             this.blit = await this.device.createRenderPipelineAsync({
                 layout: "auto",
@@ -286,6 +290,9 @@ export class Renderer {
             this.device.queue.writeBuffer(this.buffers.frame, 0, frameValues(this.header, this.poses, view, settings));
             const entries = await this.submit(width, height, step);
             if (entries <= this.capacity) {
+                if (this.canvas !== null && this.copied) {
+                    await this.copy(width, height);
+                }
                 return { milliseconds: performance.now() - start, entries };
             }
             if (entries > MOST_ENTRIES) {
@@ -309,7 +316,7 @@ export class Renderer {
             pass.dispatchWorkgroups(...groups);
         }
         pass.end();
-        if (this.canvas !== null) {
+        if (this.canvas !== null && !this.copied) {
             this.show(encoder, width, height);
         }
         encoder.copyBufferToBuffer(this.buffers.start_sums, 4 * number(this.constants, "TOTAL"), this.staging, 0, 4);
@@ -438,6 +445,15 @@ export class Renderer {
         pass.end();
     }
 
+    // Copies the picture to the canvas.
+    async copy(width, height) {
+        const image = new Float32Array(await this.readBuffer("image", 0, 16 * width * height));
+        const pixels = Uint8ClampedArray.from(image, (x) => 255 * x);
+        const picture = new OffscreenCanvas(width, height);
+        picture.getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
+        this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
+    }
+
     // The 2nd and 98th percentile of the depths of surfels before the camera.
     depthRange(viewmat) {
         const count = this.header.surfels;
@@ -528,7 +544,7 @@ export class Renderer {
         }
         this.buffers = {};
         this.plans.clear();
-        this.context?.unconfigure();
+        this.context?.unconfigure?.();
         this.device.destroy();
     }
 }
