@@ -1,4 +1,4 @@
-"""The image of a baked scene as its definition says: all hits of a pixel, each with its own texel, one after another."""
+"""The image of a baked scene as its definition says: all hits of a pixel, one after another, each with its texel."""
 
 import torch
 

@@ -111,7 +111,7 @@ def browser() -> Iterator[Any]:
 class Tab:
     """A page, and what it asked for and complained about."""
 
-    def __init__(self, browser: Any, width: int = 320, height: int = 240, **options: Any) -> None:
+    def __init__(self, browser: Any, width: int = 200, height: int = 150, **options: Any) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": height}, **options)
         self.page = self.context.new_page()
         self.errors: list[str] = []
@@ -158,6 +158,7 @@ def tab(browser) -> Iterator[Tab]:
 def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, cameras):
     baked = atlas.as_stored(bake_model(model, list(cameras.values()), steps=10))
     tab.open(f"{site.url}?renderer=baked")
+    picked = 0
     # Far away too: surfels are blurred beyond their detail limits.
     shift = torch.eye(4)
     shift[2, 3] = 6.0
@@ -175,10 +176,12 @@ def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, came
         with torch.no_grad():
             expected = (baked.render(camera) * model.exposures.factors(camera)).clamp(0, 1)
             psnr = -10 * (image - expected).square().mean().log10()
-            depth = model.render(camera).median_depth[24, 32]
+            out = model.render(camera)
         assert psnr > 42, f"{psnr:.1f} dB"
-        if drawn[1] is not None and float(depth) > 0:
-            assert drawn[1]["depth"] == pytest.approx(float(depth), rel=0.02)
+        if out.alpha[24, 32] > 0.11:
+            assert drawn[1]["depth"] == pytest.approx(float(out.median_depth[24, 32]), rel=1e-3)
+            picked += 1
+    assert picked
     assert not tab.errors
 
 
@@ -188,9 +191,9 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert page.title() == "Two & <three>" and page.inner_text("h1") == "Two & <three>"
     start, image = tab.value(POSE), tab.picture()
     assert image.std() > 0.05, "something is drawn"
-    page.mouse.move(160, 100)
+    page.mouse.move(100, 60)
     page.mouse.down()
-    page.mouse.move(200, 90, steps=3)
+    page.mouse.move(140, 50, steps=3)
     page.mouse.up()
     tab.wait(DRAWN)
     dragged = tab.value(POSE)
@@ -223,8 +226,8 @@ def test_controls_modes_links_and_sizes(tab, site):
     page.get_by_label("Exposure of the photos").click()
     tab.wait(DRAWN)
     assert np.abs(tab.picture() - image).mean() > 0.01, "so does the exposure"
-    page.set_viewport_size({"width": 260, "height": 300})
-    tab.wait("nexwarp.canvas.width === 260 && nexwarp.canvas.height === 300")
+    page.set_viewport_size({"width": 150, "height": 180})
+    tab.wait("nexwarp.canvas.width === 150 && nexwarp.canvas.height === 180")
     tab.wait(DRAWN)
 
     page.get_by_label("Show").select_option("normals")
@@ -235,8 +238,9 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert tab.value(POSE) == pytest.approx(pose, rel=1e-4, abs=1e-4), "a link keeps the camera"
     assert tab.value("nexwarp.mode") == "normals" and page.input_value("#mode") == "normals"
 
-    unnamed = "[...document.querySelectorAll('button, select, input')].filter(x => !x.ariaLabel && !x.labels?.length && !x.innerText)"
-    assert tab.value(f"{unnamed}.length") == 0, "every control has a name"
+    unnamed = "x => !x.ariaLabel && !x.labels?.length && !x.innerText"
+    controls = "[...document.querySelectorAll('button, select, input')]"
+    assert tab.value(f"{controls}.filter({unnamed}).length") == 0, "every control has a name"
     assert not tab.errors
     own = [url for url in tab.requests if not url.startswith((site.url, "data:", "blob:"))]
     assert not own, "no request leaves the page's own origin"
@@ -327,11 +331,12 @@ def test_damaged_files_give_one_line(tab, site):
             " try { await m.readBaked(answer.body); return 'read'; } catch (e) { return `${e.name}: ${e.message}`; } })"
         )
         assert text.startswith("SceneError: ") and expected in text and "\n" not in text, f"{name}: {text}"
-    for files, words in (
+    damaged: list[tuple[dict[str, bytes | None], str]] = [
         ({atlas.BAKED_FILE: good[:50]}, "The baked scene is damaged"),
         ({atlas.ATLAS_FILE: b"no picture"}, "expected a picture"),
         ({atlas.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
-    ):
+    ]
+    for files, words in damaged:
         kept = dict(site.files)
         site.files |= {name: content for name, content in files.items() if content is not None}
         for name, content in files.items():

@@ -1,4 +1,4 @@
-"""Surfels as quantised Gaussians in Niantic's SPZ format: a tenth of the size of the PLY file, by the library GaussForge."""
+"""Surfels as quantised Gaussians in Niantic's SPZ format, a tenth of the size of the PLY file; by GaussForge."""
 
 import os
 import tempfile
