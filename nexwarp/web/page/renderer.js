@@ -10,6 +10,7 @@ import {
     TILE,
     constantsOf,
     frameValues,
+    isUniform,
     number,
     packedMatrices,
     positionOf,
@@ -252,7 +253,8 @@ export class Renderer {
         const texture = this.header.texture;
         const packed = packedMatrices(texture, unpackWeights(this.header, arrays));
         this.upload("grid", unpackGrid(this.header, arrays));
-        this.upload("mlp", this.half ? Uint16Array.from(packed, toHalf) : packed);
+        const uniform = isUniform(this.constants, this.half);
+        this.upload("mlp", this.half ? Uint16Array.from(packed, toHalf) : packed, uniform);
         const levels = new Float32Array(64);
         levels.set(texture.resolutions);
         this.upload("levels", levels, true);
