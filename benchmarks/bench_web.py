@@ -45,7 +45,7 @@ class Case:
 
     name: str
     half: bool = True
-    unrolled: bool = True
+    unrolled: bool = False
     uniform: bool = True
     texel_step: int = 1
     least_weight: float = 0.0
@@ -59,9 +59,11 @@ CASES = (
     Case("both", texel_step=2, least_weight=1 / 64),
 )
 FORMS = (
-    Case("single precision, weights in storage", half=False, uniform=False),
     Case("half precision, weights in storage", uniform=False),
-    Case("half precision, MLP in loops", unrolled=False),
+    Case("single precision, weights in storage", half=False, uniform=False),
+    Case("half precision, unrolled", unrolled=True),
+    Case("single precision, unrolled", half=False, unrolled=True),
+    Case("half precision, unrolled, weights in storage", unrolled=True, uniform=False),
 )
 
 
@@ -77,6 +79,8 @@ class Arguments:
     """Number of timed frames."""
     views: int = 7
     """Test views that are compared."""
+    scale: float = 1.0
+    """Factor on their size."""
     scene: Path | None = None
     """The scene's folder, for the PSNR against photos."""
     downscale: int = 1
@@ -97,7 +101,10 @@ def shown(image: np.ndarray) -> np.ndarray:
 
 def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) -> None:
     """Print the agreement with `Model.render`, and the PSNR against the photos."""
-    views = list(load_cameras(arguments.run)["test"].items())[: arguments.views]
+    views = []
+    for name, camera in list(load_cameras(arguments.run)["test"].items())[: arguments.views]:
+        size = (round(arguments.scale * camera.width), round(arguments.scale * camera.height))
+        views.append((name, resized(camera, *size)))
     photos = {}
     if arguments.scene is not None:
         given = nw.load_scene(arguments.scene, downscale=arguments.downscale)
@@ -199,13 +206,13 @@ def main(arguments: Arguments) -> None:
     scenes = {quality: decode_scene(content) for quality, content in contents.items()}
     sizes = ", ".join(f"{quality} {len(content) / 1e6:.2f} MB" for quality, content in contents.items())
     print(f"{Renderer(scenes['full']).gpu.name}; commit {git_commit()}; {len(model.surfels):,} surfels; {sizes}")
-    compare(arguments, model, scenes)
     width, height = map(int, arguments.size.split("x"))
     camera = resized(next(iter(sets["test"].values())), width, height)
     print(f"{arguments.run.name} at {width}x{height}, median of {arguments.frames}")
     times(arguments, scenes["quantised"], camera)
     if torch.cuda.is_available():
         cuda_times(arguments, camera)
+    compare(arguments, model, scenes)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ class Renderer:
         adapter: Any = None,
         *,
         half: bool = False,
-        unrolled: bool | None = None,
+        unrolled: bool = False,
         uniform: bool = True,
     ) -> None:
         """Upload a scene.
@@ -74,7 +74,7 @@ class Renderer:
             scene: a model, a scene file's name, or its content.
             adapter: an adapter of wgpu; None takes the fastest one.
             half: compute the MLP in half precision where the device has it.
-            unrolled: unroll the MLP, unless it is large; None unrolls it on GPUs.
+            unrolled: unroll the MLP, unless it is large; some drivers take minutes to compile it.
             uniform: keep the MLP's weights in a uniform buffer, if they fit.
 
         Raises:
@@ -87,8 +87,6 @@ class Renderer:
             scene = load_scene_file(scene)
         self.scene = SceneData.of(scene) if isinstance(scene, Model) else scene
         self.gpu = Gpu(adapter)
-        if unrolled is None:
-            unrolled = "(CPU)" not in self.gpu.name
         self._program = Program.of(self.scene, SHARING, half and self.gpu.half, unrolled, uniform)
         self._plans: dict[tuple[int, int, int, int], list[Pass]] = {}
         self._capacity = FIRST_ENTRIES

@@ -76,7 +76,7 @@ async function openDevice() {
 
 export class Renderer {
     // Opens a GPU. Throws SceneError, with a line for people, where there is none.
-    static async create(target = null, { onProgress, onStage, onLost, half = true, unrolled = null } = {}) {
+    static async create(target = null, { onProgress, onStage, onLost, half = true, unrolled = false } = {}) {
         let device = target;
         let adapter = null;
         let canvas = null;
@@ -91,7 +91,7 @@ export class Renderer {
         renderer.canvas = canvas;
         renderer.adapter = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
         renderer.half = half && device.features.has("shader-f16");
-        renderer.unrolled = unrolled ?? !software;
+        renderer.unrolled = unrolled;
         renderer.onProgress = onProgress ?? (() => {});
         renderer.onStage = onStage ?? (() => {});
         renderer.buffers = {};
