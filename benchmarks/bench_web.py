@@ -2,10 +2,10 @@
 
     python -m benchmarks.bench_web RUN --size 1920x1080
 
-Needs the extra `wgpu` and a Vulkan or Metal driver. Prints for the run's test views the PSNR against `Model.render` on
-the CPU, of the exact and of the quantised scene file; with --scene, also the PSNR of each against the photos. Then the
-times of the stages at --size, for each way to save work on weak GPUs with its cost in dB, and with CUDA those of
-`Model.render`.
+Needs the extra `wgpu` and a Vulkan or Metal driver. Prints for the run's test views the PSNR against `Model.render` in
+single precision, of the exact and of the quantised scene file; with --scene, also the PSNR of each against the photos.
+Then the times of the stages at --size, for each way to save work on weak GPUs with its cost in dB, and with CUDA those
+of `Model.render`.
 """
 
 import statistics
@@ -29,14 +29,42 @@ from nexwarp.web.scene_data import SceneData
 from nexwarp.web.scene_file import encode_scene
 from nexwarp.web.scene_reader import decode_scene
 
-Options = dict[str, float]
-SAVINGS: dict[str, tuple[bool, Options]] = {
-    "exact": (False, {}),
-    "half precision": (True, {}),
-    "texture at half resolution": (True, {"texel_step": 2}),
-    "second hits below 1/64 plain": (True, {"least_weight": 1 / 64}),
-    "both": (True, {"texel_step": 2, "least_weight": 1 / 64}),
-}
+
+@dataclass(frozen=True)
+class Case:
+    """A way to render.
+
+    Attributes:
+        name: of the way.
+        half: half precision of the MLP.
+        unrolled: MLP unrolled.
+        uniform: its weights in a uniform buffer.
+        texel_step: pixels between evaluations of the texture.
+        least_weight: smallest weight of a textured second hit.
+    """
+
+    name: str
+    half: bool = True
+    unrolled: bool = False
+    uniform: bool = True
+    texel_step: int = 1
+    least_weight: float = 0.0
+
+
+CASES = (
+    Case("half precision"),
+    Case("single precision", half=False),
+    Case("texture at half resolution", texel_step=2),
+    Case("second hits below 1/64 plain", least_weight=1 / 64),
+    Case("both", texel_step=2, least_weight=1 / 64),
+)
+FORMS = (
+    Case("half precision, weights in storage", uniform=False),
+    Case("single precision, weights in storage", half=False, uniform=False),
+    Case("half precision, unrolled", unrolled=True),
+    Case("single precision, unrolled", half=False, unrolled=True),
+    Case("half precision, unrolled, weights in storage", unrolled=True, uniform=False),
+)
 
 
 @dataclass
@@ -51,12 +79,14 @@ class Arguments:
     """Number of timed frames."""
     views: int = 7
     """Test views that are compared."""
+    scale: float = 1.0
+    """Factor on their size."""
     scene: Path | None = None
     """The scene's folder, for the PSNR against photos."""
     downscale: int = 1
     """--downscale of the training."""
-    loops: bool = False
-    """Also time the MLP in loops."""
+    forms: bool = False
+    """Also time other forms of the MLP."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -71,21 +101,28 @@ def shown(image: np.ndarray) -> np.ndarray:
 
 def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) -> None:
     """Print the agreement with `Model.render`, and the PSNR against the photos."""
-    views = list(load_cameras(arguments.run)["test"].items())[: arguments.views]
+    views = []
+    for name, camera in list(load_cameras(arguments.run)["test"].items())[: arguments.views]:
+        size = (round(arguments.scale * camera.width), round(arguments.scale * camera.height))
+        views.append((name, resized(camera, *size)))
     photos = {}
     if arguments.scene is not None:
         given = nw.load_scene(arguments.scene, downscale=arguments.downscale)
         photos = {view.name: view.image for view in given.test}
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    exact = Model(model.surfels, model.texture, model.exposures, model.detail_limits, model.options).to(device)
+    if exact.texture is not None:
+        exact.texture.half_precision = False
     with torch.no_grad():
-        references = [model.render(camera) for _, camera in views]
+        references = [exact.render(camera) for _, camera in views]
     for name, scene in scenes.items():
         renderer = Renderer(scene)
         rows = []
         for (view, camera), reference in zip(views, references, strict=True):
-            out, expected = renderer.render(camera), reference.image.numpy()
+            out, expected = renderer.render(camera), reference.image.cpu().numpy()
             row = [psnr(out.image, expected)]
             if name == "full":
-                row.append(100 * float(np.mean((out.ids != reference.ids.numpy()).any(-1))))
+                row.append(100 * float(np.mean((out.ids != reference.ids.cpu().numpy()).any(-1))))
             if view in photos:
                 photo = np.asarray(photos[view]) / 255
                 row += [psnr(shown(out.image), photo), psnr(shown(expected), photo)]
@@ -101,34 +138,35 @@ def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) ->
 
 
 def times(arguments: Arguments, scene: SceneData, camera: nw.Camera) -> None:
-    """Print the times of the stages for each way to save work."""
+    """Print the times of the stages for each way to render."""
     reference = None
-    cases: list[tuple[str, bool, bool | None, Options]] = [(n, half, None, o) for n, (half, o) in SAVINGS.items()]
-    if arguments.loops:
-        cases.insert(1, ("MLP in loops", False, False, {}))
-    renderers: dict[tuple[bool, bool | None], Renderer] = {}
-    for name, half, unrolled, options in cases:
+    renderers: dict[tuple[bool, bool, bool], Renderer] = {}
+    for case in (*CASES, *(FORMS if arguments.forms else ())):
         start = time.perf_counter()
-        if (half, unrolled) not in renderers:
-            renderers[half, unrolled] = Renderer(scene, half=half, unrolled=unrolled)
-        renderer = renderers[half, unrolled]
-        out = renderer.render(camera, **options)  # type: ignore[arg-type]
+        form = (case.half, case.unrolled, case.uniform)
+        if form not in renderers:
+            half, unrolled, uniform = form
+            renderers[form] = Renderer(scene, half=half, unrolled=unrolled, uniform=uniform)
+        renderer = renderers[form]
+        out = renderer.render(camera, texel_step=case.texel_step, least_weight=case.least_weight)
         first = time.perf_counter() - start
         reference = out.image if reference is None else reference
-        runs = [renderer.render(camera, timed=True, **options).times for _ in range(arguments.frames)]  # type: ignore[arg-type]
+        wall, runs = renderer.measure(
+            camera, arguments.frames, texel_step=case.texel_step, least_weight=case.least_weight
+        )
         stages = {stage: statistics.median(run[stage] for run in runs) for stage in runs[0]}
-        wall = 1e3 * renderer.seconds_per_frame(camera, arguments.frames, **options)  # type: ignore[arg-type]
         listed = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
         print(
-            f"{name}: stages {sum(stages.values()):.3f} ms ({listed}); "
-            f"back to back {wall:.3f} ms = {1e3 / wall:.0f} FPS; {psnr(out.image, reference):.1f} dB to exact; {out.entries:,} entries; first frame {first:.2f} s",
+            f"{case.name}: stages {sum(stages.values()):.3f} ms ({listed}); "
+            f"back to back {1e3 * wall:.3f} ms = {1 / wall:.0f} FPS; {psnr(out.image, reference):.1f} dB to the first; "
+            f"{out.entries:,} entries; first frame {first:.2f} s",
             flush=True,
         )
 
 
-def cuda_times(arguments: Arguments, model: Model, camera: nw.Camera) -> None:
+def cuda_times(arguments: Arguments, camera: nw.Camera) -> None:
     """Print the time of `Model.render` on CUDA."""
-    model = model.to("cuda")
+    model = nw.load(arguments.run).to("cuda")
     camera = camera.to("cuda")
 
     @torch.no_grad()
@@ -168,13 +206,13 @@ def main(arguments: Arguments) -> None:
     scenes = {quality: decode_scene(content) for quality, content in contents.items()}
     sizes = ", ".join(f"{quality} {len(content) / 1e6:.2f} MB" for quality, content in contents.items())
     print(f"{Renderer(scenes['full']).gpu.name}; commit {git_commit()}; {len(model.surfels):,} surfels; {sizes}")
-    compare(arguments, model, scenes)
     width, height = map(int, arguments.size.split("x"))
     camera = resized(next(iter(sets["test"].values())), width, height)
     print(f"{arguments.run.name} at {width}x{height}, median of {arguments.frames}")
     times(arguments, scenes["quantised"], camera)
     if torch.cuda.is_available():
-        cuda_times(arguments, model, camera)
+        cuda_times(arguments, camera)
+    compare(arguments, model, scenes)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 `page/renderer.js` does the same in the browser; a test compares the constants and buffers of both.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
@@ -19,6 +19,7 @@ SORT_BLOCK = 2048  # pairs of a workgroup of sort.wgsl
 MODES = ("image", "plain", "textured", "ids", "depth", "weights", "normals", "alpha")
 FRAME_BYTES = 12 * 16
 MOST_UNROLLED = 1200  # blocks of an MLP that is unrolled
+MOST_UNIFORM = 2**16  # bytes of a uniform buffer
 
 
 @dataclass(frozen=True)
@@ -30,15 +31,17 @@ class Program:
         features: features an entry of the grid.
         half: whether the MLP is computed in half precision.
         unrolled: whether the MLP is unrolled.
+        uniform: whether its weights are in a uniform buffer.
     """
 
     constants: dict[str, str]
     features: int
     half: bool
     unrolled: bool
+    uniform: bool
 
     @classmethod
-    def of(cls, scene: SceneData, sharing: int, half: bool, unrolled: bool) -> "Program":
+    def of(cls, scene: SceneData, sharing: int, half: bool, unrolled: bool, uniform: bool) -> "Program":
         """Derive the constants; `sharing` threads share a surfel's tile rows."""
         options, texture = scene.options, scene.texture
         stored = scene.sh.shape[1]
@@ -73,7 +76,10 @@ class Program:
         }
         constants = {name: f"{value}u" for name, value in unsigned.items()}
         constants |= {name: "true" if value else "false" for name, value in flags.items()}
-        return cls(constants, features, half, unrolled)
+        program = cls(constants, features, half, unrolled, uniform)
+        blocks = mlp_blocks(program)
+        fits = blocks * (32 if half else 64) <= MOST_UNIFORM
+        return replace(program, unrolled=unrolled and blocks <= MOST_UNROLLED, uniform=uniform and fits)
 
     def number(self, name: str) -> int:
         """Return the value of a constant."""
@@ -86,11 +92,10 @@ class Program:
         parts, lines = [shader("common"), shader(name)], []
         if name == "shade":
             scalar = "f16" if self.half else "f32"
-            lines = [
-                *(["enable f16;"] if self.half else []),
-                f"alias Scalar = {scalar};",
-                f"alias Weight = vec4<{scalar}>;",
-            ]
+            kind, size = ("uniform", f", {mlp_blocks(self)}") if self.uniform else ("storage, read", "")
+            lines = ["enable f16;"] if self.half else []
+            lines += [f"alias Scalar = {scalar};", f"alias Weight = vec4<{scalar}>;"]
+            lines.append(f"@group(0) @binding(6) var<{kind}> mlp: array<mat4x4<{scalar}>{size}>;")
             mlp = unrolled_mlp(self) if self.unrolled else shader("mlp")
             parts = [shader("common"), shader(f"features{self.features}"), shader("shade"), mlp]
         lines += [
@@ -109,8 +114,8 @@ def unrolled_mlp(program: Program) -> str:
 
     def product(layer: int) -> str:
         nonlocal at
-        terms = [f"block_product({at + 4 * i}u, h{layer}_{i})" for i in range(inputs)]
-        at += 4 * inputs
+        terms = [f"block_product({at + i}u, h{layer}_{i})" for i in range(inputs)]
+        at += inputs
         return " + ".join(terms)
 
     for layer in range(hidden):

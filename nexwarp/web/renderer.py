@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,12 @@ from nexwarp.web.gpu import Gpu, Pass, grouped
 from nexwarp.web.program import (
     FRAME_BYTES,
     MODES,
-    MOST_UNROLLED,
     SCAN_BLOCK,
     SORT_BLOCK,
     Program,
     frame_values,
     geometry_rows,
     level_rows,
-    mlp_blocks,
     packed_matrices,
     tile_grid,
 )
@@ -67,7 +65,8 @@ class Renderer:
         adapter: Any = None,
         *,
         half: bool = False,
-        unrolled: bool | None = None,
+        unrolled: bool = False,
+        uniform: bool = True,
     ) -> None:
         """Upload a scene.
 
@@ -75,7 +74,8 @@ class Renderer:
             scene: a model, a scene file's name, or its content.
             adapter: an adapter of wgpu; None takes the fastest one.
             half: compute the MLP in half precision where the device has it.
-            unrolled: unroll the MLP; None unrolls it on GPUs, unless it is large.
+            unrolled: unroll the MLP, unless it is large; some drivers take minutes to compile it.
+            uniform: keep the MLP's weights in a uniform buffer, if they fit.
 
         Raises:
             MissingError: wgpu is not installed, or finds no GPU.
@@ -87,11 +87,7 @@ class Renderer:
             scene = load_scene_file(scene)
         self.scene = SceneData.of(scene) if isinstance(scene, Model) else scene
         self.gpu = Gpu(adapter)
-        if unrolled is None:
-            unrolled = "(CPU)" not in self.gpu.name
-        self._program = Program.of(self.scene, SHARING, half and self.gpu.half, unrolled)
-        if mlp_blocks(self._program) > MOST_UNROLLED:
-            self._program = replace(self._program, unrolled=False)
+        self._program = Program.of(self.scene, SHARING, half and self.gpu.half, unrolled, uniform)
         self._plans: dict[tuple[int, int, int, int], list[Pass]] = {}
         self._capacity = FIRST_ENTRIES
         self._image: tuple[int, int] | None = None
@@ -113,7 +109,9 @@ class Renderer:
             self._buffers[name] = gpu.buffer(name, 4 * count)
         if texture is not None:
             self._buffers["grid"] = gpu.buffer("texture grid", texture.grid)
-            self._buffers["mlp"] = gpu.buffer("texture MLP", self._packed(texture.matrices))
+            self._buffers["mlp"] = gpu.buffer(
+                "texture MLP", self._packed(texture.matrices), uniform=self._program.uniform
+            )
             self._buffers["levels"] = gpu.buffer("resolutions", level_rows(texture.resolutions), uniform=True)
 
     def _packed(self, matrices: list[np.ndarray]) -> np.ndarray:
@@ -182,16 +180,19 @@ class Renderer:
         self.gpu.write(self._buffers["frame"], values)
         return self.gpu.run(self._plans[key], timed)
 
-    def seconds_per_frame(
+    def measure(
         self, camera: Camera, frames: int, *, texel_step: int = 1, least_weight: float = 0.0
-    ) -> float:
-        """Render a camera again and again without reading the pictures, and return the wall time of a frame.
+    ) -> tuple[float, list[dict[str, float]]]:
+        """Render a camera again and again without reading the pictures.
 
         Args:
             camera: the camera.
             frames: number of frames, >= 1.
             texel_step: see `render`.
             least_weight: see `render`.
+
+        Returns:
+            Wall time in seconds of a frame of many in a row; and the milliseconds of the stages of as many more.
         """
         self.render(camera, texel_step=texel_step, least_weight=least_weight)
         values = frame_values(
@@ -208,7 +209,8 @@ class Renderer:
         for _ in range(frames):
             self._submit(camera, texel_step, values)
         self.gpu.read(self._buffers["image"], np.float32, 4)
-        return (time.perf_counter() - start) / frames
+        seconds = (time.perf_counter() - start) / frames
+        return seconds, [self._submit(camera, texel_step, values, timed=True) for _ in range(frames)]
 
     def _make_image_buffers(self, camera: Camera) -> None:
         """Make the buffers of an image's size, unless they exist."""

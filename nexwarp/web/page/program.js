@@ -9,6 +9,7 @@ export const SORT_BLOCK = 2048;
 export const FRAME_BYTES = 12 * 16;
 export const MODES = ["image", "plain", "textured", "ids", "depth", "weights", "normals", "alpha"];
 const MOST_UNROLLED = 1200;
+const MOST_UNIFORM = 2 ** 16;
 const FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12;
 const QUARTERS = (x) => Math.ceil(x / 4);
 
@@ -71,7 +72,10 @@ export function sourceOf(name, constants, texts, features, half, unrolled) {
             lines.push("enable f16;");
         }
         lines.push(`alias Scalar = ${scalar};`, `alias Weight = vec4<${scalar}>;`);
-        const small = mlpBlocks(constants) <= MOST_UNROLLED;
+        const blocks = mlpBlocks(constants);
+        const small = blocks <= MOST_UNROLLED;
+        const [kind, size] = isUniform(constants, half) ? ["uniform", `, ${blocks}`] : ["storage, read", ""];
+        lines.push(`@group(0) @binding(6) var<${kind}> mlp: array<mat4x4<${scalar}>${size}>;`);
         const mlp = unrolled && small ? unrolledMlp(constants) : texts.mlp;
         parts = [texts.common, texts[`features${features}`], texts.shade, mlp];
     }
@@ -91,9 +95,9 @@ function unrolledMlp(constants) {
     const product = (layer) => {
         const terms = [];
         for (let i = 0; i < inputs; i++) {
-            terms.push(`block_product(${at + 4 * i}u, h${layer}_${i})`);
+            terms.push(`block_product(${at + i}u, h${layer}_${i})`);
         }
-        at += 4 * inputs;
+        at += inputs;
         return terms.join(" + ");
     };
     const hidden = number(constants, "HIDDEN");
@@ -117,6 +121,11 @@ function unrolledMlp(constants) {
         }
     }
     return [...lines, "    return color;", "}"].join("\n");
+}
+
+// Whether the weights of the MLP fit into a uniform buffer.
+export function isUniform(constants, half) {
+    return mlpBlocks(constants) * (half ? 32 : 64) <= MOST_UNIFORM;
 }
 
 function mlpBlocks(constants) {

@@ -10,6 +10,7 @@ import {
     TILE,
     constantsOf,
     frameValues,
+    isUniform,
     number,
     packedMatrices,
     positionOf,
@@ -75,7 +76,7 @@ async function openDevice() {
 
 export class Renderer {
     // Opens a GPU. Throws SceneError, with a line for people, where there is none.
-    static async create(target = null, { onProgress, onStage, onLost, half = true, unrolled = null } = {}) {
+    static async create(target = null, { onProgress, onStage, onLost, half = true, unrolled = false } = {}) {
         let device = target;
         let adapter = null;
         let canvas = null;
@@ -90,7 +91,7 @@ export class Renderer {
         renderer.canvas = canvas;
         renderer.adapter = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
         renderer.half = half && device.features.has("shader-f16");
-        renderer.unrolled = unrolled ?? !software;
+        renderer.unrolled = unrolled;
         renderer.onProgress = onProgress ?? (() => {});
         renderer.onStage = onStage ?? (() => {});
         renderer.buffers = {};
@@ -252,7 +253,8 @@ export class Renderer {
         const texture = this.header.texture;
         const packed = packedMatrices(texture, unpackWeights(this.header, arrays));
         this.upload("grid", unpackGrid(this.header, arrays));
-        this.upload("mlp", this.half ? Uint16Array.from(packed, toHalf) : packed);
+        const uniform = isUniform(this.constants, this.half);
+        this.upload("mlp", this.half ? Uint16Array.from(packed, toHalf) : packed, uniform);
         const levels = new Float32Array(64);
         levels.set(texture.resolutions);
         this.upload("levels", levels, true);

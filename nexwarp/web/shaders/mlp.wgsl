@@ -13,7 +13,7 @@ fn mlp_color(x: ptr<function, array<Weight, INPUTS>>, direction: vec3f) -> vec3f
             var sum = vec4f(0.0);
             for (var i = 0u; i < inputs; i++) {
                 sum += block_product(at, h[i]);
-                at += 4u;
+                at += 1u;
             }
             next[o] = activation(sum);
         }
@@ -26,11 +26,11 @@ fn mlp_color(x: ptr<function, array<Weight, INPUTS>>, direction: vec3f) -> vec3f
             if (block < USED_BLOCKS) {
                 var sum = vec4f(0.0);
                 for (var i = 0u; i < inputs; i++) {
-                    sum += block_product(at + 4u * i, h[i]);
+                    sum += block_product(at + i, h[i]);
                 }
                 color[channel] += dot(sum, basis(block, direction) * used(block));
             }
-            at += 4u * inputs;
+            at += inputs;
         }
     }
     return color;

@@ -1,16 +1,16 @@
 // Texturing: a thread is a pixel of the texel grid, which samples every frame.texels.z-th pixel of the image.
 // Hash lookup (nexwarp/kernels/hashgrid.py, paper Eq. 2 and 4), MLP, spherical harmonics of each of its K hits.
 //
-// The MLP's matrices are in blocks of 4 x 4, column by column, a row of blocks after the other. The rows of the last one
-// are by channel, then coefficient, so that a block's dot product with the basis is a part of one channel. `mlp_color` is
-// in mlp.wgsl, or unrolled by the host. Weights and activations are in half precision where the device has it.
+// The MLP's matrices `mlp` are in blocks of 4 x 4, a row of blocks after the other. The rows of the last one are by
+// channel, then coefficient, so that a block's dot product with the basis is a part of one channel. `mlp_color` is in
+// mlp.wgsl, or unrolled by the host. Weights and activations are in half precision where the device has it; weights that
+// fit are in a uniform buffer, which the host declares: GPUs have a cache for those.
 
 @group(0) @binding(1) var<storage, read> seen: array<vec2f>;
 @group(0) @binding(2) var<storage, read> ids: array<i32>;
 @group(0) @binding(3) var<storage, read> depths: array<f32>;
 @group(0) @binding(4) var<storage, read> weights: array<f32>;
 @group(0) @binding(5) var<storage, read> grid: array<Row>;
-@group(0) @binding(6) var<storage, read> mlp: array<Weight>;
 @group(0) @binding(7) var<storage, read_write> texels: array<vec4f>;  // colour; 1 where the hit is textured
 @group(0) @binding(8) var<uniform> resolutions: array<vec4f, 16>;  // cells per world unit of each level
 
@@ -47,8 +47,8 @@ fn lookup(level: u32, position: vec3f, depth: f32) -> Features {
     return front * (g.z * fade) + back * (f.z * fade);
 }
 
-fn block_product(at: u32, x: Weight) -> vec4f {
-    return vec4f(mlp[at] * x.x + mlp[at + 1u] * x.y + mlp[at + 2u] * x.z + mlp[at + 3u] * x.w);
+fn block_product(block: u32, x: Weight) -> vec4f {
+    return vec4f(mlp[block] * x);
 }
 
 fn activation(sum: vec4f) -> Weight {
