@@ -118,7 +118,7 @@ def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.nda
     places = (rects[:, None, :2] + 0.5 + sides * (rects[:, None, 2:] - 1)) / size
     places[..., 1] = 1 - places[..., 1]
     first = 4 * np.arange(len(ids))[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    faces = np.concatenate([first + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 
