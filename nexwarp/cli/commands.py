@@ -93,6 +93,8 @@ class Export:
     --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
     splatting open: the surfels as Gaussians, without the texture.
 
+    --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
+
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
 
@@ -106,7 +108,7 @@ class Export:
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,cameras,web,glb,spz}")] = "ply"
+    format: Annotated[str, option("{ply,compact,cameras,web,glb,spz}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder. Of --format web, NAME.html writes one file with everything, which is also the default:

@@ -11,11 +11,12 @@ from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
-from nexwarp.model.model_file import load
+from nexwarp.model.model_file import load, save_model
 from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
 from nexwarp.run.contents import (
     CAMERA_PATH_FILE,
+    COMPACT_FILE,
     EXPORT_FOLDER,
     GLB_FILE,
     SPLATS_FILE,
@@ -26,7 +27,7 @@ from nexwarp.run.contents import (
 )
 from nexwarp.run.folder import SceneSource, read_run
 
-FORMATS = ("ply", "cameras", "web", "glb", "spz")
+FORMATS = ("ply", "compact", "cameras", "web", "glb", "spz")
 
 
 def export_run(
@@ -41,8 +42,8 @@ def export_run(
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply), "cameras" (transforms.json, camera_path.json), "web" (a web page), "glb"
-            (scene.glb) or "spz" (splats.spz).
+        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors), "cameras" (transforms.json,
+            camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
         folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
             in .html is one file with everything; None is `export/scene.html`.
         max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
@@ -58,7 +59,7 @@ def export_run(
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
-        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+        raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
     if kind == "web":
         from nexwarp.web.export import export_web
@@ -73,6 +74,8 @@ def export_run(
     folder = folder or run / EXPORT_FOLDER
     if kind == "cameras":
         return _export_cameras(run, folder, source)
+    if kind == "compact":
+        return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
     model, cameras = load(run), list(_all_cameras(run).values())
     if kind == "glb":
         if not cameras:
