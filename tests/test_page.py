@@ -337,11 +337,8 @@ def test_damaged_files_give_one_line(tab, site):
         ({atlas.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
     ]
     for files, words in damaged:
-        kept = dict(site.files)
-        site.files |= {name: content for name, content in files.items() if content is not None}
-        for name, content in files.items():
-            if content is None:
-                del site.files[name]
+        kept = site.files
+        site.files = {name: content for name, content in {**kept, **files}.items() if content is not None}
         tab.page.goto(site.url)
         tab.wait("globalThis.nexwarp && nexwarp.state === 'failed'")
         assert words in tab.message and "\n" not in tab.message

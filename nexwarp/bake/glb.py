@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
@@ -122,10 +122,11 @@ def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.nda
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 
-def _unlit(tree: dict[str, Any]) -> None:
+def _unlit(tree: dict[str, list[object]]) -> None:
     """Make the material show its texture as it is, without light and without coarser levels of the texture."""
-    tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+    for material in tree["materials"]:
+        cast("dict[str, object]", material)["extensions"] = {"KHR_materials_unlit": {}}
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
     for texture in tree["textures"]:
-        texture["sampler"] = 0
+        cast("dict[str, object]", texture)["sampler"] = 0
