@@ -159,7 +159,7 @@ def test_wrong_arguments_are_named():
     _, camera, renderer = default()
     with pytest.raises(TypeError, match="camera: expected a nexwarp.Camera, got str"):
         renderer.render("front")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="mode: expected one of image, plain, "):
+    with pytest.raises(ValueError, match=r"mode: expected one of image, plain, "):
         renderer.render(camera, mode="picture")
 
 
