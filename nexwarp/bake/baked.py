@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from nexwarp.bake.layout import Layout
 from nexwarp import ops
+from nexwarp.bake.layout import Layout
 from nexwarp.bake.observe import Observations, hits_of, untextured
 from nexwarp.camera import Camera
 from nexwarp.model.model import Model

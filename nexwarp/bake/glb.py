@@ -18,9 +18,10 @@ from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.types import ALPHA_MAX
 
 # Programs draw where the texture's alpha is at least this, and nothing elsewhere: they need not sort the quads.
-CUTOFF = 0.4
+CUTOFF = 0.3
 # The quads end where alpha falls to this: bilinear sampling needs what lies beyond the cut-off.
 LEAST_ALPHA = 0.5 * CUTOFF
+FEWEST = 8  # texels along an axis: alpha varies over every quad
 
 
 @torch.no_grad()
@@ -44,7 +45,9 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
         import trimesh
         from trimesh.exchange.gltf import export_glb
     except ImportError:
-        raise SettingError("--format glb: expected trimesh; install the extra with pip install 'nexwarp[glb]'") from None
+        raise SettingError(
+            "--format glb: expected trimesh; install the extra with pip install 'nexwarp[glb]'"
+        ) from None
     from PIL import Image
 
     layout, pixels = _texture(baked, side)
@@ -88,7 +91,7 @@ def _texture(baked: Baked, side: int) -> tuple[Layout, np.ndarray]:
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     boxes = torch.cat([-reach, reach], dim=1)
-    layout = lay_out_boxes(boxes, visible, baked.seen.pixels, texel=1.0, side=side)
+    layout = lay_out_boxes(boxes, visible, baked.seen.pixels, texel=1.0, side=side, fewest=FEWEST)
     places, ids, local = layout.centres()
     plain = baked.colors_from_mean_direction()
     colors = plain[ids] + baked.added(ids, local)
@@ -115,7 +118,7 @@ def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.nda
     places = (rects[:, None, :2] + 0.5 + sides * (rects[:, None, 2:] - 1)) / size
     places[..., 1] = 1 - places[..., 1]
     first = 4 * np.arange(len(ids))[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    faces = np.concatenate([first + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 

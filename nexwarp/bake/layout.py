@@ -11,6 +11,7 @@ MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
 BISECTIONS = 24
 LARGEST_TEXEL = 1e6  # pixels
+GROWTH = 1.2
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def lay_out(seen: Observations, *, texel: float, side: int) -> Layout:
 
 
 def lay_out_boxes(
-    boxes: torch.Tensor, textured: torch.Tensor, pixels: torch.Tensor, *, texel: float, side: int
+    boxes: torch.Tensor, textured: torch.Tensor, pixels: torch.Tensor, *, texel: float, side: int, fewest: int = 2
 ) -> Layout:
     """Give each textured surfel a rectangle for its box.
 
@@ -89,24 +90,32 @@ def lay_out_boxes(
         pixels: (N, 2) number of pixels that one scale covers along either axis.
         texel: size of a texel in pixels; it grows until the atlas holds all of them.
         side: largest width and height of the atlas, texels.
+        fewest: smallest number of texels along an axis of a surfel, where the atlas has room for it.
     """
     boxes = boxes.where(textured[:, None], 0.0)
     covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
 
+    room = FILLED * side * side
+    fewest = max(min(fewest, int(math.sqrt(room / max(len(covered), 1)))), 2)
+
     def sizes(step: float) -> torch.Tensor:
-        return ((covered / step).ceil() + 1).clamp(2, MAX_SIDE).int()
+        return ((covered / step).ceil() + 1).clamp(fewest, MAX_SIDE).int()
 
     low, high = texel, texel
-    while _area(sizes(high)) > FILLED * side * side and high < LARGEST_TEXEL:
+    while _area(sizes(high)) > room and high < LARGEST_TEXEL:
         high *= 2
     for _ in range(BISECTIONS if high > low else 0):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if _area(sizes(middle)) > FILLED * side * side else (low, middle)
-    found = sizes(high)
-    width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(_area(found), 1) / FILLED)))))
-    places, height = _pack(found, width)
-    if height > side:
-        raise ValueError(f"side: expected a larger atlas than {side} for {int(textured.sum()):,} surfels")
+        low, high = (middle, high) if _area(sizes(middle)) > room else (low, middle)
+    while True:
+        found = sizes(high)
+        width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(_area(found), 1) / FILLED)))))
+        places, height = _pack(found, width)
+        if height <= side and (not len(found) or int(found[:, 0].max()) <= width):
+            break
+        if high > LARGEST_TEXEL:
+            raise ValueError(f"side: expected a larger atlas than {side} for {len(found):,} surfels")
+        high *= GROWTH  # the shelves leave more gaps than FILLED allows for
     rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
     rects[textured.cpu()] = torch.cat([places, found], dim=1)
     return Layout(rects.to(boxes.device), boxes, width, height)

@@ -51,7 +51,7 @@ def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes
         "atlas": {"file": ATLAS_FILE, "width": baked.layout.width, "height": baked.layout.height, "scale": scale},
         "sh_ranges": ranges,
     }
-    stored = []
+    stored: list[tuple[dict[str, object], bytes]] = []
     for name, array in {**_arrays(shown, baked), "shN": harmonics}.items():
         content = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         encoding, packed = pack(content.tobytes())

@@ -17,7 +17,7 @@ export class BakedRenderer {
     if (!gl) throw new SceneError("This browser has neither WebGPU nor WebGL2; a current Chrome, Edge, Firefox or Safari has.");
     canvas.addEventListener("webglcontextlost", event => {
       event.preventDefault();
-      onLost("the graphics device was lost");
+      onLost(new SceneError("The graphics device was lost."));
     });
     return new BakedRenderer(canvas, gl, onProgress, onStage);
   }
@@ -33,12 +33,12 @@ export class BakedRenderer {
     const {header, arrays} = await readBaked(stream, this.onProgress);
     this.scene = new BakedScene(header, arrays);
     this.header = header;
-    this.onProgress({stage: "header"});
+    this.onStage("header");
     const image = await this.#atlasImage(header.atlas);
     this.#upload(image);
     image.close();
     this.onStage("geometry");
-    this.onProgress({stage: "done"});
+    this.onStage("done");
   }
 
   async #atlasImage({file, width, height}) {

@@ -231,13 +231,13 @@ export class BakedScene {
     return [Math.max(away - radius, 0), away + radius];
   }
 
-  // Where a pixel's transmittance falls to one half.
+  // Where a pixel's transmittance falls to one half, or the last hit; null where next to nothing is hit.
   pick({viewmat: m, K: [fx, fy, cx, cy], near}, x, y) {
     const ray = [(x - cx) / fx, (y - cy) / fy, 1];
     const world = [0, 1, 2].map(i => m[i] * ray[0] + m[4 + i] * ray[1] + m[8 + i] * ray[2]);
     const eye = [0, 1, 2].map(i => -(m[i] * m[3] + m[4 + i] * m[7] + m[8 + i] * m[11]));
     const order = this.sorted(m), g = this.geometry;
-    let transmittance = 1;
+    let transmittance = 1, hit = null;
     for (let k = this.count - 1; k >= 0; --k) {
       const i = order[k], at = 32 * i;
       let facing = 0, distance = 0;
@@ -257,9 +257,10 @@ export class BakedScene {
       const alpha = Math.min(g[at + 11] * Math.exp(-0.5 * exponent), ALPHA_MAX);
       if (alpha < ALPHA_MIN) continue;
       transmittance *= 1 - alpha;
-      if (transmittance <= 0.5) return {depth, position: eye.map((e, j) => e + depth * world[j]), id: i};
+      hit = {depth, position: eye.map((e, j) => e + depth * world[j]), id: i};
+      if (transmittance <= 0.5) break;
     }
-    return null;
+    return transmittance < 0.9 ? hit : null;
   }
 }
 

@@ -23,8 +23,8 @@ export function basisOf(up) {
 }
 
 export class Pose {
-  constructor(basis, {eye, yaw, pitch, roll = 0, fov, distance, offset = [0, 0], aspect = 1}) {
-    Object.assign(this, {basis, eye, yaw, pitch, roll, fov, distance, offset, aspect});
+  constructor(basis, {eye, yaw, pitch, roll = 0, fov, distance, offset = [0, 0], aspect = 1, shape = 1}) {
+    Object.assign(this, {basis, eye, yaw, pitch, roll, fov, distance, offset, aspect, shape});
   }
 
   // The pose of a camera of the scene; `distance` from the eye to the point to orbit around.
@@ -39,7 +39,7 @@ export class Pose {
     const distance = ahead > 1e-6 ? ahead : Math.max(Math.hypot(...add(center, eye, -1)), 1e-3);
     const fov = (2 * Math.atan(height / 2 / fy) * 360) / TAU;
     const offset = [(cx - width / 2) / height, (cy - height / 2) / height];
-    return new Pose(basis, {eye, yaw, pitch, roll, fov, distance, offset, aspect: fx / fy});
+    return new Pose(basis, {eye, yaw, pitch, roll, fov, distance, offset, aspect: fx / fy, shape: width / height});
   }
 
   axes() {
@@ -93,18 +93,25 @@ export class Pose {
   // Between this pose and another one, at t in [0, 1].
   mixed(other, t) {
     const turn = ((other.yaw - this.yaw + 1.5 * TAU) % TAU) - TAU / 2;
-    const names = ["pitch", "roll", "fov", "distance", "aspect"];
+    const names = ["pitch", "roll", "fov", "distance", "aspect", "shape"];
     const numbers = Object.fromEntries(names.map(name => [name, mixed(this[name], other[name], t)]));
     const eye = this.eye.map((x, i) => mixed(x, other.eye[i], t));
     const offset = this.offset.map((x, i) => mixed(x, other.offset[i], t));
     return new Pose(this.basis, {...numbers, eye, offset, yaw: this.yaw + turn * t});
   }
 
+  // Vertical focal length in pixels. A narrow window, such as a phone's, shows more above and below than the scene's
+  // cameras did, and less at the sides.
+  focal(width, height) {
+    const narrow = Math.min(width / height / this.shape, 1);
+    return (height / 2 / Math.tan((this.fov * TAU) / 720)) * Math.max(Math.sqrt(narrow), 0.5);
+  }
+
   // The camera of an image of width x height pixels, as renderers take it.
   camera(width, height, near) {
     const {forward, right, down} = this.axes();
     const viewmat = [right, down, forward].flatMap(axis => [...axis, -dot(axis, this.eye)]);
-    const fy = height / 2 / Math.tan((this.fov * TAU) / 720);
+    const fy = this.focal(width, height);
     const K = [fy * this.aspect, fy, width / 2 + this.offset[0] * height, height / 2 + this.offset[1] * height];
     return {viewmat: [...viewmat, 0, 0, 0, 1], K, width, height, near};
   }

@@ -62,7 +62,7 @@ export class Controls {
 
   // The scene follows the fingers at the target's depth.
   #panned(pose, dx, dy) {
-    const pixel = (2 * Math.tan((pose.fov * Math.PI) / 360)) / Math.max(this.canvas.clientHeight, 1);
+    const pixel = 1 / pose.focal(Math.max(this.canvas.clientWidth, 1), Math.max(this.canvas.clientHeight, 1));
     return pose.moved(-dx * pixel, -dy * pixel, 0);
   }
 

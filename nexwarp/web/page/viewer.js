@@ -12,6 +12,7 @@ const MODES = {
   image: "image", plain: "without texture", textured: "texture alone", ids: "surfels", depth: "depth", weights: "weight of the heaviest",
   normals: "normals", alpha: "opacity",
 };
+const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU: the baked scene is faster there
 const FLIGHT_MILLISECONDS = 700; // from one camera to another
 const LINK_MILLISECONDS = 400; // after the last change, before the address follows
 const LARGEST_RATIO = 2; // canvas pixels to CSS pixels
@@ -63,14 +64,14 @@ class Viewer {
   async #load(wanted) {
     const events = {
       onProgress: progress => this.#progress(progress),
-      onStage: stage => stage === "geometry" && this.#firstPicture(),
+      onStage: stage => this.#stage(stage),
       onLost: reason => this.#lost(reason),
     };
     let failure = null;
     if (wanted !== "baked") {
       try {
         const renderer = await Renderer.create(this.canvas, events);
-        if (wanted !== "webgpu" && renderer.info.adapter?.isFallback) throw new SceneError("WebGPU runs on the CPU here.");
+        if (wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter)) throw new SceneError("WebGPU runs on the CPU here.");
         this.renderer = renderer;
         await renderer.load(SCENE_FILE);
       } catch (error) {
@@ -104,8 +105,14 @@ class Viewer {
     this.canvas = fresh;
   }
 
-  #progress({bytes, total, stage}) {
+  #stage(stage) {
     if (stage === "header") this.#showPoster();
+    if (stage === "geometry") this.#firstPicture();
+    this.dirty = true;
+    this.refined = null;
+  }
+
+  #progress({bytes, total}) {
     if (!bytes || this.state === "failed") return;
     const size = x => (x / 1e6).toFixed(1);
     element("progress").textContent = total ? `Loading ${size(bytes)} of ${size(total)} MB` : `Loading ${size(bytes)} MB`;
@@ -340,10 +347,11 @@ class Viewer {
   }
 
   #lost(reason) {
-    this.#fail(new SceneError(`The picture stopped: ${reason}. Reload the page to go on.`));
+    this.#fail(new SceneError(`The picture stopped. ${reason?.message ?? reason} Reload the page to go on.`));
   }
 
   #fail(error) {
+    if (this.state === "failed") return;
     this.state = "failed";
     element("loading").hidden = true;
     const message = element("message");
