@@ -203,7 +203,7 @@ def _quantised(scene: SceneData) -> dict[str, np.ndarray]:
     gammas, gamma_ranges = encode_chunks(log_of(gammas), np.uint8)
     sh, ranges = [], [mean_ranges, scale_ranges, gamma_ranges]
     for band in range(round(coefficients**0.5)):
-        values = scene.sh[order, band**2 : (band + 1) ** 2].reshape(count, -1).astype(np.float64)
+        values = scene.sh[order, band**2 : (band + 1) ** 2].reshape(count, 3 * (2 * band + 1)).astype(np.float64)
         # One range for all values of a band: those of a chunk are quantised as one column.
         codes, band_ranges = _encode_band(values)
         sh.append(codes)

@@ -166,7 +166,7 @@ def _dequantised(arrays: Mapping[str, np.ndarray], limits: bool) -> dict[str, np
         "scales": np.exp(decode_chunks(arrays["scales"].T, ranges[:, 3:5])),
         "opacities": arrays["opacities"].astype(np.float32) / 255,
         "gammas": np.maximum(np.exp(decode_chunks(arrays["gammas"].T, ranges[:, 5:7])), 1),
-        "sh": decode_chunks(arrays["sh"].T, ranges[:, columns]).reshape(count, -1, 3),
+        "sh": decode_chunks(arrays["sh"].T, ranges[:, columns]).reshape(count, bands**2, 3),
     }
     if limits:
         data["limits"] = decode_limits(arrays["limits"].T, arrays["limits_scale"])

@@ -299,6 +299,7 @@ export class SceneReader {
             const entry = this.entries.shift();
             const size = entry.shape.reduce((product, one) => product * one, SIZES[entry.dtype]);
             let bytes = await this.content(entry, size);
+            expect(["raw", "deflate"].includes(entry.encoding), `section ${entry.name}: expected the encoding raw or deflate`);
             if (entry.encoding === "deflate") {
                 bytes = await inflate(bytes, size, entry.name);
             }
