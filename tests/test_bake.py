@@ -17,9 +17,9 @@ from nexwarp.bake.observe import observe
 from nexwarp.errors import FormatError
 from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.web.atlas import as_stored, decode_harmonics, encode_harmonics
-from tests.baked_support import bilinear, composited, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
+from tests.web.baked_support import bilinear, composited, ring
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

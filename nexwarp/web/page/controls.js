@@ -3,6 +3,7 @@
 const RADIANS_PER_VIEW = 2.4; // of a drag across the smaller side of the view
 const KEY_TURN = 1.6; // radians a second
 const KEY_MOVE = 0.7; // distances to the target a second
+const FIRST_SECONDS = 0.03; // that a key counts for at once
 const TAP_MILLISECONDS = 300, TAP_PIXELS = 12;
 
 const MOVES = {w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0]};
@@ -101,8 +102,9 @@ export class Controls {
     if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest?.("select, input, dialog")) return;
     const onButton = event.target.closest?.("button");
     if (name in MOVES || name in TURNS || name in ZOOMS) {
-      this.keys.add(name);
       this.fast = event.shiftKey;
+      if (!this.keys.has(name)) this.#apply(name, FIRST_SECONDS); // also a tap between two slow frames counts
+      this.keys.add(name);
       event.preventDefault();
     } else if (!event.repeat && !onButton && this.viewer.act(name)) {
       event.preventDefault();
@@ -111,16 +113,18 @@ export class Controls {
 
   // What the keys that are held down do in some seconds.
   advance(seconds) {
+    for (const name of this.keys) this.#apply(name, seconds);
+  }
+
+  #apply(name, seconds) {
     const {viewer} = this, speed = seconds * (this.fast ? 4 : 1);
-    for (const name of this.keys) {
-      if (name in MOVES) viewer.pose = viewer.pose.moved(...MOVES[name].map(x => x * KEY_MOVE * speed));
-      if (name in TURNS) {
-        const [yaw, pitch] = TURNS[name].map(x => x * KEY_TURN * seconds);
-        // Orbiting, the camera itself goes the way that the arrow points.
-        viewer.pose = viewer.flying ? viewer.pose.turned(yaw, pitch, true) : viewer.pose.turned(-yaw, -pitch, false);
-      }
-      if (name in ZOOMS) viewer.pose = viewer.pose.zoomed(ZOOMS[name] ** speed);
+    if (name in MOVES) viewer.pose = viewer.pose.moved(...MOVES[name].map(x => x * KEY_MOVE * speed));
+    if (name in TURNS) {
+      const [yaw, pitch] = TURNS[name].map(x => x * KEY_TURN * seconds);
+      // Orbiting, the camera itself goes the way that the arrow points.
+      viewer.pose = viewer.flying ? viewer.pose.turned(yaw, pitch, true) : viewer.pose.turned(-yaw, -pitch, false);
     }
+    if (name in ZOOMS) viewer.pose = viewer.pose.zoomed(ZOOMS[name] ** speed);
   }
 }
 

@@ -302,8 +302,10 @@ class Viewer {
       this.dirty = false;
       const options = this.pacing.options;
       this.refined = options.resolutionScale === 1 || this.pacing.fixed !== null ? "full" : "coarse";
+      this.drawing = true;
       try {
         await this.#draw(options);
+        this.drawing = false;
       } catch (error) {
         this.#fail(error);
       }

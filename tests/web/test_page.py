@@ -20,16 +20,15 @@ from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.web import atlas
 from nexwarp.web.export import one_file, page_files
-from tests.baked_support import ring
 from tests.scenes import make_surfels, make_texture, random_scene
+from tests.web.baked_support import ring
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
 KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
-DRAWN = (
-    "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full' && !nexwarp.dirty && !nexwarp.flight"
-)
+DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
+FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
 DRAW = """async camera => {
     const renderer = nexwarp.renderer;
     nexwarp.state = "failed"; // stops the page's own frames
@@ -131,7 +130,7 @@ class Tab:
 
     def open(self, url: str) -> None:
         self.page.goto(url)
-        self.wait(DRAWN)
+        self.wait(FINISHED)
 
     def value(self, expression: str) -> Any:
         return self.page.evaluate(expression)
@@ -195,7 +194,7 @@ def test_controls_modes_links_and_sizes(tab, site):
     page.mouse.down()
     page.mouse.move(140, 50, steps=3)
     page.mouse.up()
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     dragged = tab.value(POSE)
     assert np.abs(tab.picture() - image).mean() > 0.01, "dragging turns the scene"
     target = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
@@ -204,7 +203,7 @@ def test_controls_modes_links_and_sizes(tab, site):
     tab.wait(f"nexwarp.pose.distance > {dragged[5]} * 1.2")
     before = tab.value(POSE)
     page.keyboard.press("ArrowLeft", delay=200)
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     assert tab.value(POSE) != before, "arrow keys turn"
     page.keyboard.press("Home")
     tab.wait(f"!nexwarp.flight && Math.abs(nexwarp.pose.eye[0] - {start[0]}) < 1e-6")
@@ -213,28 +212,28 @@ def test_controls_modes_links_and_sizes(tab, site):
     page.keyboard.press("w", delay=200)
     assert tab.value(POSE)[:3] != before[:3] and page.get_attribute("#fly", "aria-pressed") == "true"
     page.get_by_role("button", name="Next camera").click()
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     assert tab.value("nexwarp.cameras[nexwarp.index].name") == "1.png"
     assert "1.png" in page.inner_text("#announce")
 
     page.get_by_role("button", name="Settings").click()
     image = tab.picture()
     page.get_by_label("Show").select_option("depth")
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     assert np.abs(tab.picture() - image).mean() > 0.02, "the mode changes the picture"
     page.get_by_label("Show").select_option("image")
     page.get_by_label("Exposure of the photos").click()
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     assert np.abs(tab.picture() - image).mean() > 0.01, "so does the exposure"
     page.set_viewport_size({"width": 150, "height": 180})
     tab.wait("nexwarp.canvas.width === 150 && nexwarp.canvas.height === 180")
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
 
     page.get_by_label("Show").select_option("normals")
     tab.wait("location.hash.includes('mode=normals')")
     pose = tab.value(POSE)
     page.reload()
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     assert tab.value(POSE) == pytest.approx(pose, rel=1e-4, abs=1e-4), "a link keeps the camera"
     assert tab.value("nexwarp.mode") == "normals" and page.input_value("#mode") == "normals"
 
@@ -269,7 +268,7 @@ def test_touch_on_a_phone(browser, site):
     touch("touchEnd")
     assert tab.value(POSE)[5] == pytest.approx(start[5] / 2, rel=0.02), "two fingers zoom"
     tab.page.tap("#more")
-    tab.wait(DRAWN)
+    tab.wait(FINISHED)
     box = tab.page.locator("#settings").bounding_box()
     assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["y"] > 0, "the settings fit on the screen"
     tools = tab.page.locator("#tools button:visible")
@@ -365,7 +364,7 @@ def test_the_exact_renderer_in_the_page(site):
         assert "exact" in tab.page.inner_text("#status")
         image = tab.picture()
         tab.page.keyboard.press("]")
-        tab.wait(DRAWN)
+        tab.wait(FINISHED)
         assert np.abs(tab.picture() - image).mean() > 0.01
         assert not tab.errors
         # Software draws the baked scene faster: without a wish, the page takes it.
