@@ -76,7 +76,7 @@ class Arguments:
     size: str = "1920x1080"
     """Size of the timed frames."""
     frames: int = 30
-    """Number of timed frames."""
+    """Number of timed frames; 0 only compares."""
     views: int = 7
     """Test views that are compared."""
     scale: float = 1.0
@@ -209,8 +209,9 @@ def main(arguments: Arguments) -> None:
     width, height = map(int, arguments.size.split("x"))
     camera = resized(next(iter(sets["test"].values())), width, height)
     print(f"{arguments.run.name} at {width}x{height}, median of {arguments.frames}")
-    times(arguments, scenes["quantised"], camera)
-    if torch.cuda.is_available():
+    if arguments.frames:
+        times(arguments, scenes["quantised"], camera)
+    if arguments.frames and torch.cuda.is_available():
         cuda_times(arguments, camera)
     compare(arguments, model, scenes)
 

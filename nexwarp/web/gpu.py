@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nexwarp.errors import MissingError, OutOfMemoryError
+
+if TYPE_CHECKING:
+    from wgpu import GPUAdapter, GPUBindGroup, GPUBuffer, GPUComputePipeline
 
 LIMITS = ("max-buffer-size", "max-storage-buffer-binding-size")
 MOST_GROUPS = 65535  # workgroups along one dimension of a dispatch
@@ -24,8 +27,8 @@ class Pass:
     """
 
     stage: str
-    pipeline: Any
-    bindings: Any
+    pipeline: "GPUComputePipeline"
+    bindings: "GPUBindGroup"
     groups: tuple[int, int]
 
 
@@ -46,7 +49,7 @@ class Gpu:
         limits: sizes in bytes that buffers and their bindings may have.
     """
 
-    def __init__(self, adapter: Any = None) -> None:
+    def __init__(self, adapter: "GPUAdapter | None" = None) -> None:
         """Open a device.
 
         Args:
@@ -73,9 +76,9 @@ class Gpu:
         )
         self.name: str = adapter.summary
         self.limits = {name: int(self.device.limits[name]) for name in LIMITS}
-        self._pipelines: dict[tuple[str, str], Any] = {}
+        self._pipelines: dict[tuple[str, str], GPUComputePipeline] = {}
 
-    def buffer(self, name: str, content: int | np.ndarray | bytes, uniform: bool = False) -> Any:
+    def buffer(self, name: str, content: int | np.ndarray | bytes, uniform: bool = False) -> "GPUBuffer":
         """Make a buffer of a size in bytes, or with contents.
 
         Raises:
@@ -98,7 +101,7 @@ class Gpu:
             self.device.queue.write_buffer(made, 0, data + bytes(-len(data) % 4))
         return made
 
-    def pipeline(self, name: str, source: str, entry: str) -> Any:
+    def pipeline(self, name: str, source: str, entry: str) -> "GPUComputePipeline":
         """Compile an entry point of a shader, once."""
         key = (source, entry)
         if key not in self._pipelines:
@@ -107,7 +110,7 @@ class Gpu:
             self._pipelines[key] = self.device.create_compute_pipeline(label=entry, layout="auto", compute=compute)
         return self._pipelines[key]
 
-    def bind(self, pipeline: Any, buffers: Mapping[int, Any]) -> Any:
+    def bind(self, pipeline: "GPUComputePipeline", buffers: Mapping[int, "GPUBuffer"]) -> "GPUBindGroup":
         """Bind buffers to a pipeline's bindings."""
         entries = [
             {"binding": index, "resource": {"buffer": buffer, "offset": 0, "size": buffer.size}}
@@ -128,18 +131,21 @@ class Gpu:
         timed = timed and self.timed
         encoder = self.device.create_command_encoder()
         queries = self.device.create_query_set(type="timestamp", count=2 * len(passes)) if timed else None
-        compute: Any = None if timed else encoder.begin_compute_pass()
-        for index, one in enumerate(passes):
-            if queries is not None:
+        if queries is None:
+            compute = encoder.begin_compute_pass()
+            for one in passes:
+                compute.set_pipeline(one.pipeline)
+                compute.set_bind_group(0, one.bindings)
+                compute.dispatch_workgroups(*one.groups, 1)
+            compute.end()
+        else:
+            for index, one in enumerate(passes):
                 marks = {"beginning_of_pass_write_index": 2 * index, "end_of_pass_write_index": 2 * index + 1}
                 compute = encoder.begin_compute_pass(timestamp_writes={"query_set": queries, **marks})
-            compute.set_pipeline(one.pipeline)
-            compute.set_bind_group(0, one.bindings)
-            compute.dispatch_workgroups(*one.groups, 1)
-            if timed:
+                compute.set_pipeline(one.pipeline)
+                compute.set_bind_group(0, one.bindings)
+                compute.dispatch_workgroups(*one.groups, 1)
                 compute.end()
-        if not timed:
-            compute.end()
         resolved = None
         if queries is not None:
             usage = self._wgpu.BufferUsage
@@ -155,11 +161,11 @@ class Gpu:
             times[one.stage] = times.get(one.stage, 0.0) + max(end - start, 0) / 1e6
         return times
 
-    def read(self, buffer: Any, dtype: type, count: int) -> np.ndarray:
+    def read(self, buffer: "GPUBuffer", dtype: type, count: int) -> np.ndarray:
         """Wait, and return the first elements of a buffer."""
         size = count * np.dtype(dtype).itemsize
         return np.frombuffer(self.device.queue.read_buffer(buffer, 0, size), dtype).copy()
 
-    def write(self, buffer: Any, data: bytes) -> None:
+    def write(self, buffer: "GPUBuffer", data: bytes) -> None:
         """Write to the beginning of a buffer."""
         self.device.queue.write_buffer(buffer, 0, data)

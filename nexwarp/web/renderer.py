@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from nexwarp.web.program import (
     tile_grid,
 )
 from nexwarp.web.scene_data import SceneData
+
+if TYPE_CHECKING:
+    from wgpu import GPUAdapter, GPUBuffer
 
 SHARING = 8  # threads that share a surfel's tile rows
 FIRST_ENTRIES = 2**16
@@ -62,7 +65,7 @@ class Renderer:
     def __init__(
         self,
         scene: Model | SceneData | str | os.PathLike[str],
-        adapter: Any = None,
+        adapter: "GPUAdapter | None" = None,
         *,
         half: bool = False,
         unrolled: bool = False,
@@ -261,11 +264,13 @@ class Renderer:
     def _pass(self, stage: str, name: str, entry: str, names: Mapping[int, str], groups: tuple[int, int]) -> Pass:
         return self._bound(stage, name, entry, {index: self._buffers[one] for index, one in names.items()}, groups)
 
-    def _bound(self, stage: str, name: str, entry: str, buffers: Mapping[int, Any], groups: tuple[int, int]) -> Pass:
+    def _bound(
+        self, stage: str, name: str, entry: str, buffers: Mapping[int, "GPUBuffer"], groups: tuple[int, int]
+    ) -> Pass:
         pipeline = self.gpu.pipeline(name, self._program.source(name), entry)
         return Pass(stage, pipeline, self.gpu.bind(pipeline, buffers), groups)
 
-    def _uniform(self, *values: int) -> Any:
+    def _uniform(self, *values: int) -> "GPUBuffer":
         """A uniform buffer of four words, made once."""
         name = f"uniform {values}"
         if name not in self._buffers:

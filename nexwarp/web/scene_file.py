@@ -101,8 +101,6 @@ def joined_file(magic: bytes, header: dict[str, object], stored: Sequence[tuple[
 
 def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quality, title: str) -> dict[str, object]:
     """Return the header without its sections."""
-    from nexwarp import __version__
-
     options, texture, exposures = scene.options, scene.texture, scene.exposures
     kept = list(cameras.items())[:: -(-len(cameras) // MOST_CAMERAS) or 1]
     views = [camera for _, camera in kept]
@@ -110,7 +108,7 @@ def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quali
     center, up = _surroundings(views, (low + high) / 2)
     return {
         "format_version": FORMAT_VERSION,
-        "generator": f"nexwarp {__version__}",
+        "generator": "nexwarp",
         "title": title,
         "quality": quality,
         "surfels": len(scene),

@@ -115,7 +115,8 @@ def test_the_picture_is_that_of_the_model(page, quality):
 
 def test_constants_and_shaders_are_those_of_python(page):
     opened, _, _ = page
-    for case in ({}, {"features": 4, "residual": False, "hidden_layers": 0, "texture_degree": 1}):
+    cases: list[dict[str, Any]] = [{}, {"features": 4, "residual": False, "hidden_layers": 0, "texture_degree": 1}]
+    for case in cases:
         model, camera = web_model(**case)
         scene = SceneData.of(model)
         header, _ = read_header(encode_scene(model, named_cameras(camera)))

@@ -157,7 +157,7 @@ def test_limits_of_the_device_are_checked_before_anything_is_allocated():
 
 def test_wrong_arguments_are_named():
     _, camera, renderer = default()
-    with pytest.raises(TypeError, match="camera: expected a nexwarp.Camera, got str"):
+    with pytest.raises(TypeError, match=r"camera: expected a nexwarp\.Camera, got str"):
         renderer.render("front")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"mode: expected one of image, plain, "):
         renderer.render(camera, mode="picture")
