@@ -62,7 +62,8 @@ class Train:
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
-    """Settings to start from: nexwarp's defaults, or those of the paper (docs/paper.md)."""
+    """Settings to start from: nexwarp's defaults, those of the paper (docs/paper.md), or `web`, defaults with a smaller
+    texture network for web pages on weak GPUs (docs/web.md)."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
