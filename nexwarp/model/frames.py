@@ -298,6 +298,8 @@ class Parts(NamedTuple):
         return (
             *((x.data_ptr(), x.shape) for x in tensors),
             texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
+            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
             exposures and exposures.lens,
             self.detail_limits is None,
             torch.are_deterministic_algorithms_enabled(),
