@@ -117,8 +117,8 @@ class FrameGraphs:
                     return None
                 self.frames[kind] = frame
             self.frames.move_to_end(kind)
-            rendering = frame.replay(camera, background, exposures)
-            if not ops.held(frame.room):
+            rendering, held = frame.replay(camera, background, exposures)
+            if not held:
                 # This rendering is right, but slow, as the next one by this graph would be.
                 del self.frames[kind]
             return rendering
@@ -194,16 +194,23 @@ class _Frame:
         self.room = self.result.intermediates.tiles.room
         self.latest: weakref.ref[CapturedRendering] | None = None
 
-    def replay(self, camera: Camera, background: Color, exposures: Exposures | None) -> "CapturedRendering":
-        """Render another camera; what the rendering before still holds is copied for it first."""
+    def replay(
+        self, camera: Camera, background: Color, exposures: Exposures | None
+    ) -> "tuple[CapturedRendering, bool]":
+        """Render another camera; what the rendering before still holds is copied for it first.
+
+        Returns:
+            The rendering, and whether the lists of surfels have held all entries, as far as is known.
+        """
         if self.latest is not None and (latest := self.latest()) is not None:
             latest.take_buffers()
         with self.graphs.using():
             self._stage(camera, background, exposures)
             self.graph.replay()
             rendering = CapturedRendering.of(self)
+            held = ops.held(self.room)
         self.latest = weakref.ref(rendering)
-        return rendering
+        return rendering, held
 
     def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
         """Copy what differs from one frame to the next into the tensors that the graph reads."""
