@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.device import keep_freed_memory, pick_device
+from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.training_session import TrainingSession
@@ -132,8 +132,6 @@ class Train:
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
             f"{len(scene.points):,} points"
         )
-        if device.type == "cpu":
-            keep_freed_memory()
         return Trainer(scene, self._with_background(config, scene, resume), device)
 
     def _check(self) -> None:
