@@ -69,18 +69,20 @@ class TargetMaker:
         self.background_tensor = torch.tensor(background, device=views.device)
         self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
 
-    def make(self, index: int, iteration: int, upcoming: list[int]) -> Target:
+    def make(self, index: int, iteration: int, upcoming: list[int], number: int | None = None) -> Target:
         """Make the target of a step.
 
         Args:
             index: of the training view.
             iteration: of the step, from 1.
             upcoming: indices of the views to come, the next one first.
+            number: of the view among all that the training sees, from 1, which decides whether it is a border step;
+                None is that of the iteration.
         """
-        config = self.config
+        config, number = self.config, iteration if number is None else number
         coarse = iteration <= config.coarse * config.iterations
         target = self.from_view(index, 2 if coarse else 1, upcoming)
-        if config.border > 0 and iteration % config.border_every == 0:
+        if config.border > 0 and number % config.border_every == 0:
             # Without points: those of a shifted window would have to be found anew in every border step.
             target = self.shifted(target)
         else:
