@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-import torch.distributed as dist
+from torch.distributed.distributed_c10d import Store
+from torch.distributed.rendezvous import TCPStore  # type: ignore[attr-defined]
 
 from nexwarp.errors import RankError
 
@@ -18,6 +19,9 @@ JOIN_SECONDS = 300.0
 WAIT_VARIABLE = "NEXWARP_JOIN_SECONDS"
 # A viewer may pause a training: it is the death of a rank that ends the others, not a long wait.
 FOREVER = timedelta(days=365)
+
+
+_present = [0]  # ranks that are known to be there
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,11 @@ def is_rank() -> bool:
     return all(os.environ.get(name) for name in VARIABLES) and os.environ["WORLD_SIZE"] != "1"
 
 
+def first_present() -> int:
+    """Return the first rank that is known to be there; it speaks for all before they have met."""
+    return _present[0]
+
+
 def _launch() -> str:
     """Identify torchrun's process, which outlives the ranks that it restarts."""
     import psutil
@@ -62,7 +71,7 @@ def _launch() -> str:
     return f"{run} {socket.gethostname()} {os.getppid()} {psutil.Process(os.getppid()).create_time():.2f}"
 
 
-def open_store(seconds: float, *, host: bool) -> dist.TCPStore:
+def open_store(seconds: float, *, host: bool) -> TCPStore:
     """Connect to the store in which ranks meet.
 
     Args:
@@ -72,12 +81,12 @@ def open_store(seconds: float, *, host: bool) -> dist.TCPStore:
     served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
     wait = timedelta(seconds=seconds)
-    return dist.TCPStore(
+    return TCPStore(
         address, port, None, host and not served, wait, wait_for_workers=False, multi_tenant=host and not served
     )
 
 
-def join_store(place: Place) -> dist.Store:
+def join_store(place: Place) -> Store:
     """Wait for all ranks, and return the store in which they meet.
 
     Raises:
@@ -91,11 +100,13 @@ def join_store(place: Place) -> dist.Store:
         store = open_store(seconds, host=place.rank == 0)
         store.set(keys[place.rank], "")
     except (RuntimeError, ValueError, OSError):
+        _present[:] = [place.rank]
         raise RankError(f"{expected}, but rank {place.rank} cannot reach rank 0 there") from None
     try:
         store.wait(keys, timedelta(seconds=seconds))
     except RuntimeError:
-        missing = [str(rank) for rank, key in enumerate(keys) if not store.check([key])]
+        _present[:] = [rank for rank, key in enumerate(keys) if store.check([key])]
+        missing = [str(rank) for rank in range(place.size) if rank not in _present]
         raise RankError(f"{expected}; missing: {', '.join(missing) or 'none any more'}") from None
     return store
 

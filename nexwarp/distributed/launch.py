@@ -1,7 +1,9 @@
 """Starts the ranks of a training on this machine, with torch's own launcher, which `torchrun` is too."""
 
 import logging
+import os
 import sys
+import uuid
 from collections.abc import Sequence
 
 import torch
@@ -45,18 +47,24 @@ def launch(count: int, command: Sequence[str]) -> int:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    for name in ("torch.distributed.elastic", "torch.distributed.launcher", "torch.distributed.nn"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    # Why ranks end, they tell themselves, in one line.
+    for name in list(logging.root.manager.loggerDict):
+        if name.startswith("torch.distributed"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
         nproc_per_node=count,
         rdzv_backend="c10d",
         rdzv_endpoint="localhost:0",
+        run_id=uuid.uuid4().hex,
         max_restarts=0,
         monitor_interval=MONITOR_SECONDS,
         local_addr="localhost",
     )
+    # Of all cores, each process gets its share, as with torchrun.
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
     try:
         elastic_launch(config, sys.executable)(*command)
     except ChildFailedError as error:

@@ -14,13 +14,13 @@ from collections.abc import Callable
 import torch
 import torch.distributed as dist
 
-from nexwarp.distributed.join import Place, open_store
+from nexwarp.distributed.join import Place, first_present, is_rank, open_store
 from nexwarp.errors import NexwarpError
 
 EXIT_CODE = 3
 PARENT_SECONDS = 1.0
 # For the thread that waits for the other ranks to find which one has died, after a message to it has failed.
-GRACE_SECONDS = 5.0
+GRACE_SECONDS = 3.0
 STORE_SECONDS = 3.0
 # What gloo and NCCL say when the process at the other end is gone.
 LOST = re.compile(r"gloo|nccl|connection (closed|reset|refused)|broken pipe|socket", re.I)
@@ -47,7 +47,7 @@ class Liveness:
         """
         global _current
         self.place, self.group, self.names, self.hint = place, group, names, hint
-        self.leaving = self.speaks = self.failed = False
+        self.leaving = self.speaks = False
         self.partners = list(range(1, place.size)) if place.rank == 0 else [0]
         self.store = open_store(STORE_SECONDS, host=False)
         self.ended = threading.Event()
@@ -75,7 +75,7 @@ class Liveness:
         """
         if isinstance(error, RuntimeError) and not isinstance(error, NexwarpError) and LOST.search(str(error)):
             time.sleep(GRACE_SECONDS)
-        self.leaving = self.failed = True
+        self.leaving = True
         self.speaks = self._claim(default=True)
 
     def _wait_for(self, partner: int) -> None:
@@ -116,15 +116,17 @@ def _started(work: Callable[[int], None], argument: int) -> threading.Thread:
 
 def may_speak() -> bool:
     """Whether this process may print why it ends: always where it is alone, on one rank where it is not."""
-    return _current is None or _current.speaks
+    if _current is not None:
+        return _current.speaks
+    return not is_rank() or os.environ["RANK"] == str(first_present())
 
 
 def end_process(code: int) -> int:
-    """Return an exit code, or end the process with it at once if it is a rank that has failed.
+    """Return an exit code, or end the process with it at once if it is a rank that has not parted from the others.
 
     The threads that wait for other ranks would disturb an ordinary exit.
     """
-    if _current is not None and _current.failed:
+    if _current is not None:
         finish_process(code)
     return code
 

@@ -8,7 +8,7 @@ is JSON or raw bytes; nothing is unpickled.
 import json
 import os
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from types import TracebackType
 
 import torch
@@ -48,29 +48,37 @@ class Ranks:
 
     @classmethod
     def join(
-        cls, device: torch.device, facts: dict[str, str], *, backend: str | None = None, hint: str = ""
+        cls,
+        device: torch.device,
+        facts: dict[str, str],
+        *,
+        fault: str | None = None,
+        backend: str | None = None,
+        hint: str = "",
     ) -> "Ranks":
         """Join the other ranks that the environment variables of torchrun tell of.
 
         Args:
             device: of this rank.
             facts: what must be the same on all ranks, such as the version of the code, by name.
+            fault: why this rank cannot take part; None if it can.
             backend: of the gradients; None is NCCL for GPUs, else gloo.
             hint: added to the message when a rank has died.
 
         Raises:
-            RankError: not all ranks came, or their facts differ; all ranks raise the same.
+            RankError: not all ranks came, one cannot take part, or their facts differ; all ranks raise the same.
         """
         place = Place.of_environment()
         store = join_store(place)
         backend = backend or ("nccl" if device.type == "cuda" else "gloo")
         ranks = cls(place, device, backend)
-        group = dist.PrefixStore("group", store)
-        dist.init_process_group(backend, store=group, rank=place.rank, world_size=place.size, timeout=FOREVER)
+        dist.init_process_group(backend, store=store, rank=place.rank, world_size=place.size, timeout=FOREVER)
         ranks.control = dist.new_group(backend="gloo", timeout=FOREVER)
         watched = dist.new_group(backend="gloo", timeout=FOREVER)
         names = [str(name) for name in ranks.gather(f"process {os.getpid()} on {socket.gethostname()}")]
         ranks.liveness = Liveness(place, watched, names, hint)
+        if (told := next((x for x in ranks.gather(fault) if x is not None), None)) is not None:
+            raise RankError(str(told))
         ranks.check_same(facts)
         return ranks
 
@@ -84,6 +92,12 @@ class Ranks:
             return
         if error is not None:
             self.liveness.fail(error)
+        else:
+            self.close()
+
+    def close(self) -> None:
+        """Part from the other ranks, once all are here; after it, each may end when it likes."""
+        if self.liveness is None:
             return
         self.barrier()
         self.liveness.close()
@@ -184,7 +198,3 @@ class Ranks:
         work.wait()
         self.vote = None
         return int(given)
-
-    def together(self, check: Callable[[], str | None]) -> str | None:
-        """Return what `check` tells on the first rank where it tells something; the same on all ranks."""
-        return next((str(told) for told in self.gather(check()) if told is not None), None)

@@ -151,7 +151,9 @@ class ParallelTrainer(Trainer):
             if theirs["fault"] is not None:
                 raise DivergedError(*theirs["fault"])
             if theirs["sums"] != sums_of_first:
-                raise RankError(f"rank {rank}: its parameters at iteration {self.iteration:,} differ from those of rank 0")
+                raise RankError(
+                    f"rank {rank}: its parameters at iteration {self.iteration:,} differ from those of rank 0"
+                )
 
     def _write(self, run: Path, snapshot: Snapshot) -> None:
         if self.ranks.first:

@@ -297,11 +297,14 @@ class Trainer:
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
         facts, self.checked = self._facts(), self.iteration
-        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
-        check_health(self.loss_log, state | {"densify.errors": self.densifier.errors}, facts)
+        check_health(self.loss_log, self._watched(), facts)
 
     def _facts(self) -> StepFacts:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
+
+    def _watched(self) -> dict[str, torch.Tensor]:
+        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
+        return state | {"densify.errors": self.densifier.errors}
 
     def save(self, run: Path) -> None:
         """Write a checkpoint: everything that shapes the future of the run.
