@@ -53,7 +53,7 @@ class Liveness:
         self.ended = threading.Event()
         self.threads = [_started(self._wait_for, partner) for partner in self.partners]
         if "TORCHELASTIC_RUN_ID" in os.environ:
-            _started(self._watch_parent, os.getppid())
+            self.threads.append(_started(self._watch_parent, os.getppid()))
         _current = self
 
     def close(self) -> None:
@@ -62,9 +62,9 @@ class Liveness:
         self.leaving = True
         for partner in self.partners:
             dist.send(torch.zeros(1), partner, group=self.group)
-        for thread in self.threads:
-            thread.join()
         self.ended.set()
+        for thread in self.threads:  # one that held the group at the interpreter's end would abort it
+            thread.join()
         _current = None
 
     def fail(self, error: BaseException) -> None:

@@ -101,8 +101,8 @@ class Ranks:
             return
         self.barrier()
         self.liveness.close()
+        self.liveness = self.control = None
         dist.destroy_process_group()
-        self.liveness = None
 
     @property
     def first(self) -> bool:
