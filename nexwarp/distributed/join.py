@@ -3,6 +3,7 @@
 import hashlib
 import os
 import socket
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -16,6 +17,7 @@ from nexwarp.errors import RankError
 # Of torchrun, and of whoever starts ranks by other means.
 VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 JOIN_SECONDS = 300.0
+POLL_SECONDS = 0.05
 WAIT_VARIABLE = "NEXWARP_JOIN_SECONDS"
 # A viewer may pause a training: it is the death of a rank that ends the others, not a long wait.
 FOREVER = timedelta(days=365)
@@ -102,12 +104,14 @@ def join_store(place: Place) -> Store:
     except (RuntimeError, ValueError, OSError):
         _present[:] = [place.rank]
         raise RankError(f"{expected}, but rank {place.rank} cannot reach rank 0 there") from None
-    try:
-        store.wait(keys, timedelta(seconds=seconds))
-    except RuntimeError:
+    until = time.monotonic() + seconds
+    while not store.check(keys):
+        time.sleep(POLL_SECONDS)
+        if time.monotonic() < until:
+            continue
         _present[:] = [rank for rank, key in enumerate(keys) if store.check([key])]
         missing = [str(rank) for rank in range(place.size) if rank not in _present]
-        raise RankError(f"{expected}; missing: {', '.join(missing) or 'none any more'}") from None
+        raise RankError(f"{expected}; missing: {', '.join(missing) or 'none any more'}")
     return store
 
 

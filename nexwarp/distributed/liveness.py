@@ -1,7 +1,7 @@
 """How ranks end: the death of one ends all within seconds, and one line in all is printed.
 
-Each rank waits, in a thread, for a farewell from rank 0, and rank 0 for one from each other rank. The system closes the
-connections of a dead process at once, which ends the wait with an error.
+Each rank waits, in a thread, for a farewell from rank 0, and rank 0 for one from each other rank. A rank that fails
+says so in it. The system closes the connections of a dead process at once, which ends the wait with an error.
 """
 
 import os
@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import torch
 import torch.distributed as dist
@@ -18,6 +19,7 @@ from nexwarp.distributed.join import Place, first_present, is_rank, open_store
 from nexwarp.errors import NexwarpError
 
 EXIT_CODE = 3
+ORDERLY, FAILED = 0, 1  # farewells
 PARENT_SECONDS = 1.0
 # For the thread that waits for the other ranks to find which one has died, after a message to it has failed.
 GRACE_SECONDS = 3.0
@@ -61,7 +63,7 @@ class Liveness:
         global _current
         self.leaving = True
         for partner in self.partners:
-            dist.send(torch.zeros(1), partner, group=self.group)
+            dist.send(torch.tensor([ORDERLY]), partner, group=self.group)
         self.ended.set()
         for thread in self.threads:  # one that held the group at the interpreter's end would abort it
             thread.join()
@@ -77,12 +79,21 @@ class Liveness:
             time.sleep(GRACE_SECONDS)
         self.leaving = True
         self.speaks = self._claim(default=True)
+        self._tell_failure()
+
+    def _tell_failure(self) -> None:
+        for partner in self.partners:
+            with suppress(RuntimeError):  # gone itself
+                dist.send(torch.tensor([FAILED]), partner, group=self.group)
 
     def _wait_for(self, partner: int) -> None:
+        farewell = torch.tensor([ORDERLY])
         try:
-            dist.recv(torch.zeros(1), partner, group=self.group)
+            dist.recv(farewell, partner, group=self.group)
         except RuntimeError:
             self._end(f"rank {partner} ({self.names[partner]}) has ended unexpectedly, so all ranks end", partner)
+        if int(farewell) == FAILED:
+            self._end("", partner)
 
     def _watch_parent(self, parent: int) -> None:
         while not self.ended.wait(PARENT_SECONDS):
@@ -90,13 +101,20 @@ class Liveness:
                 self._end("the process that started the ranks has ended, so all ranks end", 0)
 
     def _end(self, why: str, lost: int) -> None:
-        """End this process because another one has ended, unless it is ending anyway."""
+        """End this process because another one has ended, unless it is ending anyway.
+
+        Args:
+            why: to print; "" where another rank prints it.
+            lost: the rank that has ended.
+        """
         if self.leaving:
             return
-        if self._claim(default=self.place.rank == (0 if lost else 1)):
+        if why and self._claim(default=self.place.rank == (0 if lost else 1)):
             shown = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a progress bar hides the cursor
             sys.stdout.write(shown)
             sys.stderr.write(f"nexwarp: error: {why}{self.hint}\n")
+        if self.place.rank == 0:
+            self._tell_failure()
         finish_process(EXIT_CODE)
 
     def _claim(self, *, default: bool) -> bool:
