@@ -8,13 +8,15 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import torch
+from torch import nn
 
+from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.kernels.launch import set_num_threads
@@ -121,7 +123,7 @@ def digest(trainer: Trainer) -> str:
 class Unsent(GradientReducer):
     """Leaves gradients as they are."""
 
-    def finish(self, parameters, sums):  # type: ignore[no-untyped-def]
+    def finish(self, parameters: Sequence[nn.Parameter], sums: torch.Tensor | None) -> torch.Tensor | None:
         return sums
 
 
@@ -140,10 +142,10 @@ def kept_gradients(trainer: Trainer) -> Iterator[list[dict[str, torch.Tensor]]]:
     trainer.optimizer.step = step  # type: ignore[method-assign]
 
 
-def alone_as(rank: int, size: int, scene: object, config: Config) -> ParallelTrainer:
+def alone_as(rank: int, size: int, scene: Scene, config: Config) -> ParallelTrainer:
     """A trainer in one process that takes the views of one of several ranks and sends nothing."""
     ranks = Ranks.alone(CPU)
-    trainer = ParallelTrainer(scene, config, CPU, ranks)  # type: ignore[arg-type]
+    trainer = ParallelTrainer(scene, config, CPU, ranks)
     ranks.rank, ranks.size = rank, size
     trainer.reducer.overlapped, trainer.reducer = False, Unsent(None)
     return trainer

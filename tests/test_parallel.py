@@ -41,10 +41,9 @@ from tests.trainer_support import small
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
-STEPS = 200
 # The command line has no flags for the texture's shape.
 SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
-TRAIN = ["--iterations", "40", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "4"]
+TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "2"]
 
 
 @pytest.fixture(scope="module")
@@ -52,17 +51,19 @@ def scene(tiny_scene: Scene) -> Scene:
     return tiny_scene
 
 
-def long_config(size: int) -> Config:
-    """200 steps, with rounds of density control and a search for floaters."""
-    return small(iterations=STEPS * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
+def long_config(size: int, steps: int) -> Config:
+    """Rounds of density control and a search for floaters."""
+    return small(iterations=steps * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
 
 
 def short_config() -> Config:
     return small(iterations=24)
 
 
-@pytest.mark.parametrize("size", [2, 3])
-def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int) -> None:
+@pytest.mark.parametrize(
+    ("size", "steps"), [(2, 200), (3, 60), pytest.param(3, 200, marks=pytest.mark.slow)], ids=["2", "3", "3 for long"]
+)
+def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: int) -> None:
     """One fork of the ranks for the laws of a whole training: a process costs more than a law."""
 
     def work(ranks: Ranks) -> object:
@@ -71,7 +72,7 @@ def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int) -> None:
             first.step()
         if ranks.first:
             safetensors.torch.save_file(gradients[0], tmp_path / "gradients.safetensors")
-        replica = ParallelTrainer(scene, long_config(size), CPU, ranks)
+        replica = ParallelTrainer(scene, long_config(size, steps), CPU, ranks)
         seen: list[int] = []
         replica.run(lambda step: seen.append(step.iteration))
         # Straight to the end, and resumed in the middle.
@@ -98,19 +99,19 @@ def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int) -> None:
     found = run_ranks(size, work, tmp_path / "ranks")
     first = found[0]
     assert isinstance(first, dict) and all(other == first for other in found)
-    assert first["steps"] == STEPS and first["last"] == STEPS * size and first["surfels"] > 120
+    assert first["steps"] == steps and first["last"] == steps * size and first["surfels"] > 120
     assert first["straight"] == first["resumed"]
     # The gradient is the mean of those of the ranks' views.
     told = safetensors.torch.load_file(tmp_path / "gradients.safetensors")
     alone = []
     for rank in range(size):
-        trainer = alone_as(rank, size, scene, short_config())
-        with kept_gradients(trainer) as gradients:
-            trainer.step()
+        one = alone_as(rank, size, scene, short_config())
+        with kept_gradients(one) as gradients:
+            one.step()
         alone.append(gradients[0])
     for name, value in told.items():
         # Each alone has weighted its loss by 1 / size.
-        assert_close(value, torch.stack([one[name] for one in alone]).sum(0), kind="gradient", name=name)
+        assert_close(value, torch.stack([each[name] for each in alone]).sum(0), kind="gradient", name=name)
     # One process goes on from the checkpoint of several.
     trainer = Trainer(scene, short_config(), CPU)
     trainer.restore(tmp_path / "run")
