@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-from torch.distributed.distributed_c10d import Store
+from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import TCPStore  # type: ignore[attr-defined]
 
 from nexwarp.errors import RankError
@@ -73,8 +73,8 @@ def _launch() -> str:
     return f"{run} {socket.gethostname()} {os.getppid()} {psutil.Process(os.getppid()).create_time():.2f}"
 
 
-def open_store(seconds: float, *, host: bool) -> TCPStore:
-    """Connect to the store in which ranks meet.
+def open_store(seconds: float, *, host: bool) -> Store:
+    """Connect to the store in which ranks meet; ranks that torchrun has restarted find it empty.
 
     Args:
         seconds: to wait for it, and for its answers.
@@ -83,9 +83,9 @@ def open_store(seconds: float, *, host: bool) -> TCPStore:
     served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
     wait = timedelta(seconds=seconds)
-    return TCPStore(
-        address, port, None, host and not served, wait, wait_for_workers=False, multi_tenant=host and not served
-    )
+    host = host and not served
+    store = TCPStore(address, port, None, host, wait, wait_for_workers=False, multi_tenant=host)
+    return PrefixStore(f"nexwarp/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
 
 
 def join_store(place: Place) -> Store:
@@ -96,7 +96,7 @@ def join_store(place: Place) -> Store:
     """
     where = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
     seconds = float(os.environ.get(WAIT_VARIABLE, JOIN_SECONDS))
-    keys = [f"nexwarp/joined/{rank}" for rank in range(place.size)]
+    keys = [f"joined/{rank}" for rank in range(place.size)]
     expected = f"expected {place.size} ranks to join at {where} within {seconds:.0f} s"
     try:
         store = open_store(seconds, host=place.rank == 0)

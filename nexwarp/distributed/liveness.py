@@ -121,7 +121,7 @@ class Liveness:
         """Return True on one rank only; `default` where the store is gone."""
         try:
             mine = str(self.place.rank).encode()
-            return self.store.compare_set("nexwarp/fault", "", mine.decode()) == mine
+            return self.store.compare_set("fault", "", mine.decode()) == mine
         except RuntimeError:
             return default
 
