@@ -41,10 +41,11 @@ from nexwarp.train.trainer import Trainer
 DEMO = "demo"
 LATE = 26_000  # an iteration of 30,000 after density control, with SH of degree 3
 CHUNKS = 5
-# Bytes a second that an all-reduce moves from each rank, one way. NVLink 4: 450 GB/s a GPU and direction (NVIDIA H100
-# data sheet), of which NCCL's all-reduce reaches about 80 %; Ethernet of 100 Gbit/s: 12.5 GB/s a node, 90 % of it.
-NVLINK, ETHERNET = 450e9 * 0.8, 12.5e9 * 0.9
-LATENCY = {"NVLink": 20e-6, "Ethernet": 50e-6}  # seconds of a collective of two buckets beside its bytes, per hop group
+# Bytes a second that leave a GPU over NVLink 4: 450 GB/s in each direction (NVIDIA's data sheet of the H100), of which
+# an all-reduce is assumed to reach 80 %. Of the network's rate, 90 % are assumed.
+NVLINK, NVLINK_SHARE, NETWORK_SHARE = 450e9, 0.8, 0.9
+# Seconds that the two collectives of a step take beside their bytes; assumed.
+NVLINK_LATENCY, NETWORK_LATENCY = 20e-6, 50e-6
 NODE = 8  # GPUs of a node
 
 
@@ -80,6 +81,8 @@ class Scaling:
     """With --simulate: milliseconds of the backward pass after the grid's gradient is complete."""
     table: int = 2**20
     """With --simulate: entries of each of the grid's levels."""
+    gbits: float = 100.0
+    """With --simulate: Gbit/s of a node's network; 3200 is that of a DGX H100, 8 adapters of 400."""
     worker: bool = False
     """Internal: this process is a rank."""
 
@@ -89,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = tyro.cli(Scaling, args=given, description=__doc__)
     wp.config.log_level = wp.LOG_ERROR
     if options.simulate:
-        print(simulate(options.step_ms, options.hidden_ms, options.surfels, options.table))
+        print(simulate(options.step_ms, options.hidden_ms, options.surfels, options.table, options.gbits))
         return 0
     if options.worker:
         work(options)
@@ -239,11 +242,11 @@ def gradient_bytes(surfels: int, table: int, levels: int = 8, features: int = 4)
     return 4 * levels * table * features, 4 * (60 * surfels + 64 * 32 + 64 * 64 + 48 * 64)
 
 
-def simulate(step: float, hidden: float, surfels: int, table: int) -> str:
+def simulate(step: float, hidden: float, surfels: int, table: int, gbits: float) -> str:
     """Return a table of the time of a step on 1 to 64 GPUs.
 
     A ring or tree all-reduce of B bytes over n ranks sends 2 B (n - 1) / n from each. Nodes first reduce inside, then
-    each of their GPUs exchanges its share with those of other nodes, over the node's Ethernet. The grid's bucket is
+    each of their GPUs exchanges its share with those of other nodes, over the node's network. The grid's bucket is
     hidden behind at most `hidden` milliseconds of the backward pass; nothing hides the other.
 
     Args:
@@ -251,15 +254,17 @@ def simulate(step: float, hidden: float, surfels: int, table: int) -> str:
         hidden: milliseconds of the backward pass after the grid's gradient is complete.
         surfels: how many there are.
         table: entries of each of the grid's 8 levels of 4 features.
+        gbits: Gbit/s of a node's network.
     """
+    nvlink, network = NVLINK * NVLINK_SHARE, gbits * 1e9 / 8 * NETWORK_SHARE
     lines = ["GPUs  nodes  communication ms  not hidden ms  step ms  efficiency  speed-up"]
     for count in (1, 2, 4, 8, 16, 32, 64):
         nodes, inside = max(count // NODE, 1), min(count, NODE)
         early, late = (
-            1000 * (2 * size * (inside - 1) / inside / NVLINK + 2 * size * (nodes - 1) / nodes / ETHERNET)
+            1000 * (2 * size * (inside - 1) / inside / nvlink + 2 * size * (nodes - 1) / nodes / network)
             for size in gradient_bytes(surfels, table)
         )
-        fixed = 1000 * ((count > 1) * LATENCY["NVLink"] + (nodes > 1) * LATENCY["Ethernet"])
+        fixed = 1000 * ((count > 1) * NVLINK_LATENCY + (nodes > 1) * NETWORK_LATENCY)
         exposed = max(early - hidden, 0) + late + fixed
         efficiency = step / (step + exposed)
         lines.append(
