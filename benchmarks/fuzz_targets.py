@@ -151,7 +151,7 @@ def _ply(folder: Path) -> list[Files]:
 def _surfels_ply(folder: Path) -> list[Files]:
     save_surfels_ply(folder / "a" / "surfels.ply", some_surfels())
     save_surfels_ply(folder / "b" / "surfels.ply", some_surfels().double())
-    return [_files(folder / "a"), _files(folder / "b")]
+    return [_files(folder / "a"), _files(folder / "b"), _files(folder / "c")]
 
 
 def _nerfstudio(folder: Path) -> list[Files]:
@@ -196,6 +196,7 @@ def _model(folder: Path) -> list[Files]:
     full = some_model()
     save_model(folder / "a", full)
     save_model(folder / "b", Model(full.surfels, full.texture, options=full.options))
+    save_model(folder / "c", full, compact=True)
     _read_model(folder / "a")  # the first reading imports modules and kernels for seconds, which no input must pay for
     return [_files(folder / "a"), _files(folder / "b")]
 
@@ -265,7 +266,7 @@ def _read_log(folder: Path) -> None:
 def _options(folder: Path) -> list[Files]:
     render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": True, "clamp_texture": True}
     render |= {"exposure": "photos", "detail_limits": False}
-    settings = ["border=0.1", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
+    settings = ["coarse=0.1", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
     write_json(folder / "options.json", {"render": render, "settings": settings})
     return [_files(folder)]
 

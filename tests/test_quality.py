@@ -18,7 +18,15 @@ from benchmarks.quality.jobs import TABLES, JobGroup, TrainingJob, group_jobs, t
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import GSPLAT, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
-from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, inner_validation, moved, of_training_views
+from benchmarks.quality.scenes import (
+    ARC_VIEWS,
+    VARIANTS,
+    held_out_arc,
+    inner_validation,
+    moved,
+    of_training_views,
+    with_near,
+)
 from benchmarks.timing import ROOT
 from nexwarp.data import Scene, View
 from nexwarp.data.demo import write_demo
@@ -151,7 +159,7 @@ def test_rows_that_differ_late_share_their_first_iterations() -> None:
 def test_rows_of_finishing_share_their_first_iterations() -> None:
     jobs = list(table_jobs("changes", ("fox",), (0,), 300, 40))
     shared = {tuple(job.row for job in g.jobs): g.iterations for g in group_jobs(jobs, ROWS) if g.iterations}
-    finished = ("no footprints", "no SH smoothing", "no metering")
+    finished = ("no footprints", "no SH smoothing")
     assert shared == {("default", *finished, "floaters left"): 249}
 
 
@@ -222,6 +230,13 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
     assert ("interrupted: the same command does what is missing" in said) == (how == signal.SIGINT)
     assert not (tmp_path / "out.jsonl").exists()
+
+
+def test_near_planes_are_moved_alone(scene: Scene) -> None:
+    other = with_near(scene, near=0.5)
+    for one, two in zip((*scene.train, *scene.test), (*other.train, *other.test), strict=True):
+        assert two.camera.near == 0.5 and torch.equal(one.camera.viewmat, two.camera.viewmat)
+    assert torch.equal(scene.points, other.points)
 
 
 def test_validation_views_are_training_views(scene: Scene) -> None:

@@ -16,6 +16,7 @@ from benchmarks.quality.rows import (
     PEER,
     PEERS,
     REMOVALS,
+    SUSPECTS,
     Row,
 )
 from nexwarp.train.config import Config
@@ -24,7 +25,7 @@ from nexwarp.train.settings import with_settings
 
 SCENES = ("train", "fox", "saharov", "kitchen25")
 DEMO = "demo"  # the built-in scene
-TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames", "demo")
+TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "suspects", "arc", "frames", "demo")
 CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
 
 
@@ -94,6 +95,8 @@ def table_jobs(
         rows = (DEFAULT, NO_TEXTURE, *HITS)
     elif table == "changes":
         rows = (DEFAULT, *CHANGES)
+    elif table == "suspects":
+        rows = (PAPER, *SUSPECTS)
     elif table == "arc":
         rows, variants, scenes = (DEFAULT, PAPER), ("arc",), ("fox",)
     elif table == "frames":
@@ -149,7 +152,6 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         config,
         max_hits=min(config.max_hits, 2),
         densify=dataclasses.replace(config.densify, floaters=False),
-        metering=False,
         footprints=False,
         smooth_sh=0.0,
     )

@@ -93,13 +93,15 @@ class Export:
     --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
     splatting open: the surfels as Gaussians, without the texture.
 
+    --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
+
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
     """
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,cameras}")] = "ply"
+    format: Annotated[str, option("{ply,compact,cameras}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder."""

@@ -44,6 +44,7 @@ class MergedTexture(NeuralTexture):
         self.register_buffer("cells", cells)
         self.sh_degree, self.residual = parts[0].sh_degree, parts[0].residual
         self.down_weighting = parts[0].down_weighting
+        self._half_copy = None  # each part has its own
 
     @property
     def config(self) -> dict[str, list[TextureShape]]:  # type: ignore[override]
@@ -91,13 +92,14 @@ class MergedTexture(NeuralTexture):
         degree: int,
         directions: torch.Tensor | None = None,
         clamp: bool = False,
+        image: tuple[int, int] | None = None,
     ) -> torch.Tensor:
         owners = self.owners(positions.detach())
         total: torch.Tensor | None = None
         for index, part in enumerate(self.textures):
             mine = owners == index
             skipped = torch.where(mine, depths, 0.0)
-            found = part._evaluate(positions, skipped, focal, degree, directions, clamp)
+            found = part._evaluate(positions, skipped, focal, degree, directions, clamp, image)
             found = torch.where(mine[None] if directions is None else mine[:, None], found, 0.0)
             total = found if total is None else total + found
         assert total is not None

@@ -7,12 +7,12 @@ from nexwarp.camera import resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
-from nexwarp.model.model_file import load
+from nexwarp.model.model_file import load, save_model
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
+from nexwarp.run.contents import CAMERA_PATH_FILE, COMPACT_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
 from nexwarp.run.folder import read_run
 
-FORMATS = ("ply", "cameras")
+FORMATS = ("ply", "compact", "cameras")
 
 
 def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
@@ -20,7 +20,8 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
+        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors) or "cameras" (transforms.json,
+            camera_path.json).
         folder: output folder, created if it does not exist.
         max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
 
@@ -33,8 +34,10 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
-        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+        raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
+    if kind == "compact":
+        return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
     if kind == "ply":
         model = load(run)
         files = [folder / SURFELS_FILE, folder / SPLATS_FILE]

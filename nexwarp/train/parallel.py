@@ -17,6 +17,7 @@ from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.errors import DivergedError, RankError, SceneError
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
 from nexwarp.train.graphs import Gradients, StepResult
 from nexwarp.train.schedules import OptimizerMaker
@@ -77,6 +78,7 @@ class ParallelTrainer(Trainer):
         )
         # The same already, unless the ranks' processors round differently.
         ranks.share_tensors(x for _, x in self._named_parameters())
+        self.texture.drop_half_copy()
         self.beside = self.graphs is not None and (ranks.backend != "nccl" if beside is None else beside)
         self.reducer = GradientReducer(self.texture.grid if config.max_hits else None)
         self.reducer.overlapped = not self.beside
@@ -91,12 +93,11 @@ class ParallelTrainer(Trainer):
         # Where views of the last step are fewer than ranks, the others repeat one with weight 0.
         self.share = 1.0 / self.views_a_step if ranks.rank < self.views_a_step else 0.0
         mine = ranks.rank % self.views_a_step
-        number = first + mine + 1
         self.iteration += self.views_a_step
         for offset, generator in enumerate((self.targets.generator, self.targets.noise)):
-            generator.manual_seed(view_seed(self.config.seed, number, offset))
+            generator.manual_seed(view_seed(self.config.seed, first + mine + 1, offset))
         upcoming = self.order[-1 - ranks.rank :: -ranks.size][:2]
-        return self.targets.make(chosen[mine], self.iteration, upcoming, number)
+        return self.targets.make(chosen[mine], self.iteration, upcoming)
 
     def _run_step(self, target: Target) -> StepResult:
         result = super()._run_step(target)
@@ -108,6 +109,8 @@ class ParallelTrainer(Trainer):
                 self._reduce(errors)
             finally:
                 self.optimizer.zero_grad(set_to_none=True)
+            if isinstance(self.optimizer, FusedAdam) and self.optimizer.grid_loss is not None:
+                result = result._replace(losses=result.losses | {"grid": self.optimizer.grid_loss})
         return result
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
@@ -179,7 +182,7 @@ def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
 
     The square-root rule for Adam (Malladi et al. 2022, On the SDEs and scaling rules for adaptive gradient algorithms):
     rates are multiplied by the square root of the number of views, and moments forget as much in a step as in that
-    many steps of one view. An optimizer of one's own keeps its other settings.
+    many steps of one view. Other optimizers keep their other settings.
 
     Args:
         optimizer: as `make_optimizer` makes it.
@@ -188,7 +191,7 @@ def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
     for group in optimizer.param_groups:
         first, last = group["ends"]
         group["ends"] = first * math.sqrt(views), last * math.sqrt(views)
-        if type(optimizer) is torch.optim.Adam:
+        if isinstance(optimizer, torch.optim.Adam):
             group["betas"] = tuple(beta**views for beta in group["betas"])
 
 

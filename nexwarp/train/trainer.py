@@ -20,6 +20,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
@@ -111,7 +112,7 @@ class Trainer:
         self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
-        self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer)
+        self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds = 0, 0.0
         self.order: list[int] = []
@@ -190,6 +191,11 @@ class Trainer:
         self.iteration += 1
         return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
 
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        return make_optimizer(
+            self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer, self.cells_unit
+        )
+
     def _next_view(self) -> int:
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
@@ -202,18 +208,12 @@ class Trainer:
 
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
+        fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
-            losses = step_losses(
-                taken,
-                target,
-                self.surfels,
-                self.texture,
-                self.config,
-                cells_unit=self.cells_unit,
-                own=self.own_losses,
-            )
+            given = (taken, target, self.surfels, self.texture, self.config)
+            losses = step_losses(*given, cells_unit=self.cells_unit, own=self.own_losses, grid_term=fused is None)
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
@@ -224,6 +224,8 @@ class Trainer:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
+        if kept is None and fused is not None and fused.grid_loss is not None:
+            losses["grid"] = fused.grid_loss
         return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room, kept)
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
@@ -242,7 +244,8 @@ class Trainer:
         for _, parameter in self._named_parameters():
             kept = self.optimizer.state.get(parameter, {}).values()
             state += [parameter, *(x for x in kept if isinstance(x, torch.Tensor))]
-        return graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        key = graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        return key, self.texture.half_copy_key()
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
@@ -289,8 +292,9 @@ class Trainer:
         """
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
+        self.texture.drop_half_copy()
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
@@ -374,7 +378,7 @@ class Trainer:
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
-        self.optimizer = make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer)
+        self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:
