@@ -26,6 +26,7 @@ from benchmarks.fuzz_models import (
     some_trainer,
     some_viewmats,
 )
+from benchmarks.fuzz_web import make_scene_files, read_scene_files
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
@@ -402,6 +403,7 @@ TARGETS = {
         FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
         FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
+        FuzzTarget("web_scene", make_scene_files, read_scene_files, (".nxw",)),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

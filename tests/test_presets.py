@@ -58,7 +58,7 @@ def test_default_prunes_at_the_cap_and_filters_points():
 
 
 def test_unknown_preset_is_refused():
-    with pytest.raises(ValueError, match=r"^preset: expected one of default, paper, got 'papr'$"):
+    with pytest.raises(ValueError, match=r"^preset: expected one of default, paper, web, got 'papr'$"):
         preset("papr")
 
 

@@ -3,27 +3,52 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from nexwarp.camera import resized
+import torch
+
+from nexwarp.bake.fit import bake
+from nexwarp.bake.glb import save_glb
+from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import load, save_model
+from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, COMPACT_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
-from nexwarp.run.folder import read_run
+from nexwarp.run.contents import (
+    CAMERA_PATH_FILE,
+    COMPACT_FILE,
+    EXPORT_FOLDER,
+    GLB_FILE,
+    SPLATS_FILE,
+    SPZ_FILE,
+    SURFELS_FILE,
+    TRANSFORMS_FILE,
+    WEB_FILE,
+)
+from nexwarp.run.folder import SceneSource, read_run
 
-FORMATS = ("ply", "compact", "cameras")
+FORMATS = ("ply", "compact", "cameras", "web", "glb", "spz")
 
 
-def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
+def export_run(
+    run: Path,
+    kind: str,
+    folder: Path | None = None,
+    max_extent: float = MAX_EXTENT,
+    quality: str = "quantised",
+    device: torch.device | str = "cpu",
+) -> Sequence[Path]:
     """Export a run to a folder; docs/outputs.md describes the files.
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors) or "cameras" (transforms.json,
-            camera_path.json).
-        folder: output folder, created if it does not exist.
-        max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors), "cameras" (transforms.json,
+            camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
+        folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
+            in .html is one file with everything; None is `export/scene.html`.
+        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        quality: "quantised" or "full", of a web page.
+        device: renders what the texture is baked from, of "web" and "glb".
 
     Returns:
         The files that were written.
@@ -36,18 +61,39 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     if kind not in FORMATS:
         raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
+    if kind == "web":
+        from nexwarp.web.export import export_web
+
+        return export_web(
+            load(run).to(device),
+            _all_cameras(run),
+            folder or run / EXPORT_FOLDER / WEB_FILE,
+            quality=quality,
+            title=run_title(source),
+        )
+    folder = folder or run / EXPORT_FOLDER
+    if kind == "cameras":
+        return _export_cameras(run, folder, source)
     if kind == "compact":
         return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
-    if kind == "ply":
-        model = load(run)
-        files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
-        save_surfels_ply(files[0], model.surfels)
-        # A training that stopped early leaves a model, but no cameras file.
-        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
-        all_cameras = [camera for members in groups for camera in members.values()]
-        degree = model.options.sh_degree
-        save_splats_ply(files[1], model.surfels, degree, cameras=all_cameras, max_extent=max_extent)
-        return files
+    model, cameras = load(run), list(_all_cameras(run).values())
+    if kind == "glb":
+        if not cameras:
+            raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
+        return [folder / GLB_FILE]
+    degree = model.options.sh_degree
+    if kind == "spz":
+        save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        return [folder / SPZ_FILE]
+    files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
+    save_surfels_ply(files[0], model.surfels)
+    save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+    return files
+
+
+def _export_cameras(run: Path, folder: Path, source: SceneSource) -> Sequence[Path]:
+    """Write the cameras of a run for nerfstudio."""
     sets = load_cameras(run / CAMERAS_FILE)
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
@@ -62,3 +108,15 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
     return files
+
+
+def _all_cameras(run: Path) -> dict[str, Camera]:
+    """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
+    if not (run / CAMERAS_FILE).is_file():
+        return {}
+    return {name: camera for members in load_cameras(run / CAMERAS_FILE).values() for name, camera in members.items()}
+
+
+def run_title(source: SceneSource) -> str:
+    """Return the name of a run's scene, as a title."""
+    return Path(source.path).name or "nexwarp"

@@ -75,6 +75,8 @@ def _fits(value: object, kind: object) -> bool:
 
 PRESETS: dict[str, Config] = {
     "default": Config(),
+    # A texture that weak GPUs evaluate in real time: a third of the arithmetic.
+    "web": Config(preset="web", texture=TextureConfig(width=32, hidden_layers=1, sh_degree=1)),
     "paper": Config(
         preset="paper",
         more_hits_from=0,
