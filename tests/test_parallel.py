@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import cast
 
 import pytest
 import safetensors.torch
@@ -123,14 +124,14 @@ def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: i
 def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
     """Whatever the number of ranks, views come in one order, with random numbers of their own."""
     views = len(scene.train)
-    taken: dict[int, list[object]] = {}
+    taken: dict[int, list[int]] = {}
     for size in (2, 3):
         trainers = [alone_as(rank, size, scene, small(iterations=3 * views)) for rank in range(size)]
         for trainer in trainers:
-            trainer.targets.make = lambda index, *_: index  # type: ignore[method-assign,assignment,misc,return-value]
+            trainer.targets.make = lambda index, *_: index  # type: ignore[method-assign]
         while trainers[0].iteration < 3 * views:
             first = trainers[0].iteration
-            chosen: list[object] = [trainer._next_target() for trainer in trainers]
+            chosen = [cast(int, trainer._next_target()) for trainer in trainers]
             for offset in range(trainers[0].views_a_step):
                 taken.setdefault(first + offset, []).append(chosen[offset])
         weights = [trainer.share for trainer in trainers]
