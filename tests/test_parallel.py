@@ -11,6 +11,7 @@ import pytest
 import safetensors.torch
 import torch
 
+from benchmarks import scaling
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.distributed import join, liveness
@@ -19,6 +20,7 @@ from nexwarp.distributed.launch import check_count
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train import presets
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
@@ -37,6 +39,7 @@ from tests.ranks_support import (
     start_ranks,
     wait,
 )
+from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
@@ -151,6 +154,18 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
+
+
+def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    texture = NeuralTexture(levels=8, table_size=2**10, features=4, residual=True)
+    surfels = make_surfels(random_scene(24))
+    numbers = sum(x.numel() for x in (*surfels.parameters(), *texture.mlp.parameters())) + len(surfels)  # error sums
+    assert scaling.gradient_bytes(24, 2**10) == (4 * texture.grid.numel(), 4 * numbers)
+    assert scaling.main(["--simulate", "--step-ms", "10", "--surfels", "400000"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    counts, efficiencies = [int(row[0]) for row in rows], [float(row[5]) for row in rows]
+    assert counts == [1, 2, 4, 8, 16, 32, 64] and efficiencies[0] == 1.0
+    assert efficiencies == sorted(efficiencies, reverse=True) and efficiencies[3] > 2 * efficiencies[4]
 
 
 # Bad input
