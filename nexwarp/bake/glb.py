@@ -45,9 +45,8 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
     """
     check_package()
     import trimesh
-    from trimesh.exchange.gltf import export_glb
-
     from PIL import Image
+    from trimesh.exchange.gltf import export_glb
 
     layout, pixels = _texture(baked, side)
     if not len(layout.textured()):

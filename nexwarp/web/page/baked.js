@@ -13,8 +13,11 @@ const SURFELS_PER_ROW = 128;
 
 export class BakedRenderer {
     static async create(canvas, {onProgress = () => {}, onStage = () => {}, onLost = () => {}} = {}) {
-        const gl = canvas.getContext("webgl2", {alpha: false, antialias: false, depth: false, powerPreference: "high-performance"});
-        if (!gl) throw new SceneError("This browser has neither WebGPU nor WebGL2; a current Chrome, Edge, Firefox or Safari has.");
+        const wanted = {alpha: false, antialias: false, depth: false, powerPreference: "high-performance"};
+        const gl = canvas.getContext("webgl2", wanted);
+        if (!gl) {
+            throw new SceneError("This browser has neither WebGPU nor WebGL2; current Chrome, Edge, Firefox and Safari have.");
+        }
         canvas.addEventListener("webglcontextlost", event => {
             event.preventDefault();
             onLost(new SceneError("The graphics device was lost."));
@@ -59,7 +62,8 @@ export class BakedRenderer {
         const rows = Math.ceil(scene.count / SURFELS_PER_ROW);
         const sides = [image.width, image.height, rows, SURFELS_PER_ROW * Math.max(scene.coefficients - 1, GEOMETRY_TEXELS)];
         if (Math.max(...sides) > largest) {
-            throw new SceneError(`This device draws textures of at most ${largest} pixels a side; the scene needs ${Math.max(...sides)}.`);
+            const needed = Math.max(...sides);
+            throw new SceneError(`This device draws textures of at most ${largest} pixels a side; the scene needs ${needed}.`);
         }
         this.quads = this.#program(QUADS_VERTEX, QUADS_FRAGMENT);
         this.resolve = this.#program(RESOLVE_VERTEX, RESOLVE_FRAGMENT);
@@ -245,8 +249,9 @@ export class BakedRenderer {
         const {gl, scene} = this;
         const names = gl.getExtension("WEBGL_debug_renderer_info");
         const adapter = gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-        const megabytes = scene ? (scene.geometry.byteLength + scene.harmonics.byteLength + 4 * scene.header.atlas.width * scene.header.atlas.height) / 1e6 : 0;
-        return {adapter, f16: this.half, surfels: scene?.count ?? 0, megabytes, maxHits: null, textured: true};
+        const {width, height} = scene?.header.atlas ?? {width: 0, height: 0};
+        const bytes = scene ? scene.geometry.byteLength + scene.harmonics.byteLength + 4 * width * height : 0;
+        return {adapter, f16: this.half, surfels: scene?.count ?? 0, megabytes: bytes / 1e6, maxHits: null, textured: true};
     }
 
     destroy() {

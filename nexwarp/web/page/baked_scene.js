@@ -164,7 +164,8 @@ export class BakedScene {
             out.set([gammas[2 * i], gammas[2 * i + 1], farthest[i], 0], 12);
             out.set(boxes.subarray(4 * i, 4 * i + 4), 16);
             const [left, top, across, along] = rects.subarray(4 * i, 4 * i + 4);
-            if (!across || !along || left + across > width || top + along > height) throw damaged("expected texels inside the atlas");
+            const inside = across && along && left + across <= width && top + along <= height;
+            if (!inside) throw damaged("expected texels inside the atlas");
             out.set([left, top, across - 1, along - 1], 20);
             out.set(sh0.subarray(3 * i, 3 * i + 3), 24);
             out.set([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 28);

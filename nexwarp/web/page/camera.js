@@ -120,7 +120,10 @@ export class Pose {
     toFragment() {
         const short = x => Number(x.toPrecision(5));
         const parts = {
-            eye: this.eye.map(short), look: [this.yaw, this.pitch, this.roll].map(short), d: [short(this.distance)], fov: [short(this.fov)],
+            eye: this.eye.map(short),
+            look: [this.yaw, this.pitch, this.roll].map(short),
+            d: [short(this.distance)],
+            fov: [short(this.fov)],
         };
         return Object.entries(parts).map(([name, values]) => `${name}=${values.join(",")}`).join("&");
     }
@@ -134,6 +137,7 @@ export class Pose {
         const eye = numbers("eye", 3), look = numbers("look", 3), d = numbers("d", 1), fov = numbers("fov", 1);
         if (!eye || !look || !d || !fov || !(d[0] > 0)) return null;
         const [yaw, pitch, roll] = look;
-        return this.with({eye, yaw: yaw % TAU, pitch: clamp(pitch, -TAU / 4, TAU / 4), roll, distance: d[0], fov: clamp(fov[0], ...FOV)});
+        const level = clamp(pitch, -TAU / 4, TAU / 4);
+        return this.with({eye, yaw: yaw % TAU, pitch: level, roll, distance: d[0], fov: clamp(fov[0], ...FOV)});
     }
 }

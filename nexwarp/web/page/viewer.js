@@ -9,8 +9,14 @@ import {SceneError} from "nexwarp/scene.js";
 
 const SCENE_FILE = "scene.nxw";
 const MODES = {
-    image: "image", plain: "without texture", textured: "texture alone", ids: "surfels", depth: "depth", weights: "weight of the heaviest",
-    normals: "normals", alpha: "opacity",
+    image: "image",
+    plain: "without texture",
+    textured: "texture alone",
+    ids: "surfels",
+    depth: "depth",
+    weights: "weight of the heaviest",
+    normals: "normals",
+    alpha: "opacity",
 };
 const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU: the baked scene is faster there
 const FLIGHT_MILLISECONDS = 700; // from one camera to another
@@ -71,8 +77,10 @@ class Viewer {
         if (wanted !== "baked") {
             try {
                 const renderer = await Renderer.create(this.canvas, events);
-                if (wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter)) throw new SceneError("WebGPU runs on the CPU here.");
                 this.renderer = renderer;
+                if (wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter)) {
+                    throw new SceneError("WebGPU runs on the CPU here, and there is no baked scene.");
+                }
                 await renderer.load(SCENE_FILE);
             } catch (error) {
                 if (wanted === "webgpu") throw error;
@@ -358,7 +366,8 @@ class Viewer {
         element("loading").hidden = true;
         const message = element("message");
         message.hidden = false;
-        message.textContent = error instanceof SceneError ? error.message : `The scene cannot be shown: ${error?.message ?? error}`;
+        const known = error instanceof SceneError;
+        message.textContent = known ? error.message : `The scene cannot be shown: ${error?.message ?? error}`;
     }
 }
 
