@@ -75,7 +75,7 @@ def compare(scene: SurfelScene, options: Options, gsplat: Any) -> list[Measureme
     """Time both sides on a scene, and return the times, the work and the ratios."""
     g = with_gamma_1(geometry(scene))
     ours = list(timed(our_call(g), scene, options))
-    found = list(ours)
+    found = [*ours, frame(scene, options)]
     for primitive in PRIMITIVES:
         theirs = list(timed(gsplat_call(g, gsplat, primitive), scene, options))
         found += theirs
@@ -86,6 +86,20 @@ def compare(scene: SurfelScene, options: Options, gsplat: Any) -> list[Measureme
                     ratio(f"ours over gsplat {primitive}, {what}", mine, other, f"gsplat {gsplat.__version__}")
                 )
     return found
+
+
+def frame(scene: SurfelScene, options: Options) -> Measurement:
+    """Time what our users call for a picture of surfels alone: `Model.render`, by a CUDA graph.
+
+    Beside the collection stage it activates the surfels, evaluates their SH and composes.
+    """
+    model = scene.model.bare(max_hits=2)
+
+    @torch.no_grad()
+    def render() -> torch.Tensor:
+        return model.render(scene.camera).image
+
+    return options.time("ours, Model.render without texture", render, **scene.facts)
 
 
 def with_gamma_1(g: Geometry) -> Geometry:

@@ -12,7 +12,7 @@ from nexwarp.camera import Camera
 from nexwarp.checks import check_finite, check_range, check_tensors
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.memory import needed_memory
+from nexwarp.memory import keep_freed_memory, needed_memory
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
@@ -359,7 +359,9 @@ def _check_types(
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {surfels.means.dtype}")
     if surfels.device.type == "cuda":
         torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
-    elif surfels.device.type != "cpu":
+    elif surfels.device.type == "cpu":
+        keep_freed_memory()
+    else:
         raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {surfels.device}")
 
 

@@ -291,6 +291,7 @@ def test_commands_can_be_typed(page, monkeypatch):
     understood = []
     for command in cli.COMMANDS.values():
         monkeypatch.setattr(command, "__call__", lambda self, console: understood.append(self))
+    monkeypatch.setattr(Train, "starts", lambda self: 0)  # --gpus asks for more than a test machine has
     for arguments in commands(page):
         assert cli.main(arguments) == 0, arguments
         command = understood.pop()
@@ -331,6 +332,12 @@ def test_pages_are_in_the_site_s_navigation():
 def test_the_api_page_has_every_public_name():
     page = (DOCS / "api.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
+
+
+def test_every_setting_has_a_row_of_evidence() -> None:
+    rows = re.findall(r"^\| (`.+?`) \|", (DOCS / "evidence.md").read_text(encoding="utf-8"), re.M)
+    named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    assert sorted(named) == sorted(SYMBOLS)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")

@@ -6,6 +6,7 @@ import gc
 import pickle
 import threading
 import weakref
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
@@ -14,7 +15,9 @@ import torch
 
 import nexwarp as nw
 from nexwarp.camera import StagedCamera
+from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import frames
+from nexwarp.model import model as model_module
 from nexwarp.render import Rendering, render
 from nexwarp.representation.exposures import Exposures
 from tests.narrowing import present
@@ -79,11 +82,11 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
     for camera in others:
         staged.copy_(camera)
         present(staged.falloff).copy_(present(exposures.falloff_of(camera)))
-        rendered = [
+        found, expected = (
             render(model.surfels, model.texture, c, exposures=exposures, detail_limits=model.detail_limits)
             for c in (staged, camera)
-        ]
-        assert_same(*rendered, (*BUFFERS, "ids", "colors"))
+        )
+        assert_same(found, expected, (*BUFFERS, "ids", "colors"))
 
 
 def test_a_cpu_has_no_graphs() -> None:
@@ -121,7 +124,7 @@ def test_buffers_are_copied_when_they_are_asked_for() -> None:
         assert_same(found, expected, (*BUFFERS, "ids", *LATER))
     assert torch.equal(copies[1], expected.image)
     with pytest.raises(AttributeError, match="'CapturedRendering' object has no attribute 'depth'"):
-        _ = out.depth  # type: ignore[attr-defined]
+        _ = out.depth
 
 
 @CUDA
@@ -148,7 +151,8 @@ def test_graphs_give_the_bits_of_launches(options: dict[str, Any], place: str) -
                 assert_same(model.render(camera, **options), out, (*BUFFERS, "ids", *LATER))
     assert len(graphs(model).frames) == 1
     background = torch.tensor([0.1, 0.2, 0.9], device="cuda")
-    assert_same(*both(model, cameras(place)[1], **(options | {"background": background})), (*BUFFERS, *LATER))
+    found, same = both(model, cameras(place)[1], **(options | {"background": background}))
+    assert_same(found, same, (*BUFFERS, *LATER))
 
 
 @CUDA
@@ -167,36 +171,38 @@ def test_renderings_outlive_the_next_frames(model: nw.Model) -> None:
 
 @CUDA
 def test_changes_of_the_model_show(model: nw.Model) -> None:
-    camera = cameras("cuda")[1]
-    changes = [
+    camera, exposures = cameras("cuda")[1], present(model.exposures)
+    changes: list[Callable[[], object]] = [
         lambda: model.surfels.means.data.add_(0.05),
-        lambda: model.texture.grid.data.mul_(1.5),
-        lambda: model.exposures.log_gains.add_(0.1),
-        lambda: model.detail_limits.farthest.mul_(0.5),
+        lambda: present(model.texture).grid.data.mul_(1.5),
+        lambda: [x.add_(0.1) for x in (exposures.log_gains, exposures.mean)],
+        lambda: present(model.detail_limits).farthest.mul_(0.5),
         lambda: setattr(model.surfels, "means", torch.nn.Parameter(model.surfels.means + 0.1)),
+        lambda: present(model.texture).half_copy(),
+        lambda: present(model.texture).grid.mul_(1.1),
         lambda: setattr(model.texture, "half_precision", False),
-        lambda: model.exposures.load_state_dict(
-            model.exposures.state_dict() | {"falloff": torch.tensor([-0.5, 0.0, 0.4])}
-        ),
+        lambda: exposures.load_state_dict(exposures.state_dict() | {"falloff": torch.tensor([-0.5, 0.0, 0.4])}),
         lambda: model.load_state_dict(finished("cuda", seed=5).state_dict()),
         lambda: setattr(model, "exposures", None),
     ]
-    for change in changes:
+    for index, change in enumerate(changes):
         before = both(model, camera)[0].image
-        change()
+        with torch.no_grad():
+            change()
         for _ in range(3):
             found, expected = both(model, camera)
             assert_same(found, expected, (*BUFFERS, *LATER))
-        assert not torch.equal(before, found.image)
+        assert index == 5 or not torch.equal(before, found.image)  # a copy changes nothing
         assert isinstance(found, frames.CapturedRendering)
 
 
 @CUDA
 def test_lists_that_are_too_short_are_right_and_then_made_longer() -> None:
+    """Lists have room for 4,096 entries more than were needed first."""
     model = finished("cuda")
     surfels = model.surfels
     surfels.log_scales.data.fill_(-7.0)
-    camera = cameras("cuda")[0]
+    camera = cameras("cuda", 1, width=320, height=240)[0]
     for _ in range(3):
         assert_same(*both(model, camera))
     (frame,) = graphs(model).frames.values()
@@ -205,8 +211,7 @@ def test_lists_that_are_too_short_are_right_and_then_made_longer() -> None:
         assert_same(*both(model, camera))
         torch.cuda.synchronize()
     (longer,) = graphs(model).frames.values()
-    total = int(longer.room.ends[-1])
-    assert longer.room.entries >= total and (total <= frame.room.entries or longer is not frame)
+    assert frame.room.entries < int(longer.room.ends[-1]) <= longer.room.entries
 
 
 @CUDA
@@ -214,13 +219,9 @@ def test_what_cannot_be_captured_is_launched(model: nw.Model) -> None:
     camera = cameras("cuda")[0]
     with torch.no_grad():
         assert isinstance(model.render(camera), frames.CapturedRendering)
-        others = [
-            model.render(camera, depth_jitter=0.5),
-            model.render(camera, background=torch.zeros(3, device="cuda").half().float().requires_grad_().clone()),
-        ]
         with torch.autocast("cuda"):
             assert isinstance(model.render(camera), frames.CapturedRendering)
-    assert not isinstance(others[0], frames.CapturedRendering)
+        assert not isinstance(model.render(camera, depth_jitter=0.5), frames.CapturedRendering)
     out = model.render(camera)
     assert not isinstance(out, frames.CapturedRendering)
     out.image.sum().backward()
@@ -270,6 +271,7 @@ def test_threads_take_turns() -> None:
     model, views = finished("cuda"), cameras("cuda")
     with torch.no_grad(), frames.without_graphs():
         expected = [model.render(camera) for camera in views]
+    torch.cuda.synchronize()  # the threads have streams of their own
     wrong: list[str] = []
 
     def draw(index: int) -> None:
@@ -294,15 +296,15 @@ def test_memory_of_graphs_is_given_back_when_it_is_missing(monkeypatch: pytest.M
     """A frame that does not fit is rendered again without the graphs."""
     held = graphs(model)
     camera = cameras("cuda", 1, width=64, height=32)[0]
-    original, calls = nw.model.model.render, []
+    original, calls = render, []
 
     def scarce(*arguments: Any, **options: Any) -> Rendering:
         calls.append(len(held.frames))
         if held.frames:
-            raise nw.OutOfMemoryError.of("an image", "1 GiB")
+            raise OutOfMemoryError.of("an image", "1 GiB")
         return original(*arguments, **options)
 
-    monkeypatch.setattr(nw.model.model, "render", scarce)
+    monkeypatch.setattr(model_module, "render", scarce)
     with torch.no_grad():
         out = model.render(camera)
     assert calls == [1, 0] and out.image.isfinite().all()

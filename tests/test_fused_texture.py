@@ -1,7 +1,7 @@
-"""The fused texturing kernels agree with the layer-by-layer computation, on a CPU, which emulates a warp, and on CUDA."""
+"""The fused texturing kernels agree with the reference, on a CPU, which emulates a warp, and on CUDA."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -86,17 +86,18 @@ def make_case(
     weights = [1.5 * matrix.detach() for matrix in texture.mlp.parameters()]
     grid = torch.empty_like(texture.grid.detach()).uniform_(-1, 1).half().float()
     leaves = [x.to(device).requires_grad_() for x in (positions, depths, grid, *weights)]
-    given = (directions, texture.resolutions, torch.tensor([60.0]), 1e-4 * torch.randn(count, 3))
-    return Case(fused_texture.Shape(*size), leaves, *(x.to(device) for x in given), clamp)
+    signal = 1e-4 * torch.randn(count, 3)
+    given = [x.to(device) for x in (directions, texture.resolutions, torch.tensor([60.0]), signal)]
+    return Case(fused_texture.Shape(*size), leaves, given[0], given[1], given[2], given[3], clamp)
 
 
 def fused_on_cpu(case: Case) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return colours and gradients as the kernels' CPU branch computes them."""
     positions, depths, grid, *weights = (x.detach() for x in case.leaves)
-    geometry = (positions, depths, case.directions, grid.half(), weights, case.resolutions, case.focal)
-    colors, encoded, packed = fused_texture.forward(*geometry, case.shape, 0.1, case.clamp, True)
-    kept = (encoded, packed, colors if case.clamp else None, case.shape)
-    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, *geometry, *kept, True)
+    points = (positions, depths, case.directions, grid.half())
+    inputs = fused_texture.Inputs(*points, weights, case.resolutions, case.focal, case.shape)
+    colors, kept = fused_texture.forward(inputs, 0.1, case.clamp, True)
+    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True)
     assert grad_points is not None
     return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
 
@@ -136,9 +137,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     calls: list[int] = []
     forward = fused_texture.forward
 
-    def spy(positions: torch.Tensor, *arguments: object) -> object:
-        calls.append(len(positions))
-        return forward(positions, *arguments)  # type: ignore[arg-type]
+    def spy(inputs: fused_texture.Inputs, *options: bool) -> tuple[torch.Tensor, fused_texture.Kept]:
+        calls.append(len(inputs.positions))
+        return forward(inputs, *options)
 
     monkeypatch.setattr(fused_texture, "forward", spy)
     yield calls
@@ -210,7 +211,7 @@ def test_permutations_are_one_to_one() -> None:
     ids=str,
 )
 def test_shapes_that_the_kernels_take(shape: dict[str, int], usual: bool) -> None:
-    sizes = {"levels": 8, "features": 4, "width": 64, "hidden_layers": 2, "sh_degree": 3} | shape
+    sizes: dict[str, Any] = {"levels": 8, "features": 4, "width": 64, "hidden_layers": 2, "sh_degree": 3} | shape
     texture = nw.NeuralTexture(table_size=2**4, **sizes)
     assert fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 1000) == usual
     assert not fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 2**27)

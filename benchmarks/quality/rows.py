@@ -38,6 +38,12 @@ PEERS = (
     Row("gsplat default", None, _BACKGROUND | {"strategy": "default"}),
     Row("gsplat 2DGS", None, _BACKGROUND | {"strategy": "default", "primitive": "2dgs"}),
 )
+# Compact files of 5 and 10 MB (10^6 bytes): 77 bytes a surfel and one a number of the grid; 73 bytes a Gaussian.
+MEGABYTES = (
+    (Row("5 MB", settings={"texture.table_size": 2**16}), 37_000),
+    (Row("10 MB", settings={"texture.table_size": 2**17}), 74_900),
+    *((row, size) for row in PEERS[2:4] for size in (68_400, 136_900)),
+)
 NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
 # The ablations of the paper.
 REMOVALS = (
@@ -81,4 +87,7 @@ DEMO_CONFIG = with_settings(preset("default"), DEMO_SETTINGS)
 _SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
 _AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_CONFIG.rates.mlp[0],) * 2}
 DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
-ROWS = {row.name: row for row in (DEFAULT, PAPER, *PEERS, *REMOVALS, *HITS, *CHANGES, *SUSPECTS, *DEMOS)}
+ROWS = {
+    row.name: row
+    for row in (DEFAULT, PAPER, *PEERS, *REMOVALS, *HITS, *CHANGES, *SUSPECTS, *DEMOS, *(row for row, _ in MEGABYTES))
+}

@@ -12,7 +12,7 @@ from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
-from nexwarp.kernels.fused_scatter import fused_scatter_kernel
+from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
     FORWARD_THREADS,
@@ -109,7 +109,7 @@ def fused_kernel_builds(features: Sequence[int] = (2, 4)) -> Iterator[tuple[wp.K
         kernels = fused_kernels(count)
         yield kernels.forward, FORWARD_THREADS
         yield kernels.backward, BACKWARD_THREADS
-        yield fused_scatter_kernel(count), 256
+        yield fused_scatter_kernel(count), SCATTER_THREADS
 
 
 def walk_kernels(

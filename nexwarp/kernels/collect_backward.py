@@ -63,7 +63,7 @@ def collect_backward_kernel(
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
     load = record_row_function(real)
-    vec, ivec = buffer_types(real, max_hits)
+    vec, ivec, _ = buffer_types(real, max_hits)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
     sum1, sum3, add_record = warp_sum(real), warp_sum(vec3), warp_record_sum(real)

@@ -1,4 +1,4 @@
-"""Texturing in one kernel each way: hash lookup (paper Eq. 2, 4), MLP (paper Eq. 5) and SH by tensor cores.
+"""Texturing on tensor cores: lookup in the hash grid (paper Eq. 2), MLP and SH in one kernel each way.
 
 For L * F = 32 features of F = 2 or 4, two hidden layers of 64, and half-precision tables, matrices and activations,
 summed in float32. A warp takes 16 neighbouring pixels, a tile, and one hit of each at a time: 16 points are the rows
@@ -7,7 +7,8 @@ place of a point in what the kernels hand to each other is unit * 16 + row.
 
 Columns of the first matrix are permuted so that a lane looks up whole levels of its two points and finds its features
 in its own fragments; rows of the last one, so that a lane has all channels of the SH coefficients q, q + 4, q + 8, ...
-of its two points. `logical_feature` and `logical_output` name what stands where. Lower SH degrees have zeros in the last matrix.
+of its two points. `logical_feature` and `logical_output` name what stands where. Lower SH degrees have zeros in the
+last matrix.
 
     fused_forward    writes colours and, for the backward pass, the features as fragments (64 bytes a point)
     fused_backward   repeats the hidden layers from the features. Written: gradients of the features (L, places, F),

@@ -129,10 +129,11 @@ def walk_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNamespac
 
 
 @functools.cache
-def buffer_types(real: type, max_hits: int) -> tuple[type, type]:
-    """Types of the K-buffer's values and ids: registers, of static length (one unused slot for K = 0)."""
+def buffer_types(real: type, max_hits: int) -> tuple[type, type, type]:
+    """Types of the K-buffer's values, ids and colours: registers, of static length (one unused slot for K = 0)."""
     slots = max(max_hits, 1)
     return (
         wp.types.vector(length=slots, dtype=real),
         wp.types.vector(length=slots, dtype=wp.int32),
+        wp.types.matrix(shape=(slots, 3), dtype=real),
     )

@@ -117,8 +117,8 @@ class FrameGraphs:
                     return None
                 self.frames[kind] = frame
             self.frames.move_to_end(kind)
-            rendering = frame.replay(camera, background, exposures)
-            if not ops.held(frame.room):
+            rendering, held = frame.replay(camera, background, exposures)
+            if not held:
                 # This rendering is right, but slow, as the next one by this graph would be.
                 del self.frames[kind]
             return rendering
@@ -151,6 +151,10 @@ class FrameGraphs:
         stream = torch.cuda.current_stream(self.stream.device)
         if self.user is not None and self.user != stream:
             stream.wait_event(self.used)
+            for frame in self.frames.values():
+                # Their memory is for other use only when this stream is done with it, too.
+                for x in frame.staged:
+                    x.record_stream(stream)
         yield
         self.user = stream
         self.used.record(stream)
@@ -168,7 +172,7 @@ class _Frame:
         device = graphs.stream.device
         # Pose (4, 4), intrinsics (3, 3), two focal lengths and the background, so that one copy brings them all.
         self.numbers = torch.zeros(32, device=device)
-        self.background = self.numbers[27:30]
+        self.matrices, self.scalars, self.background = self.numbers[:25], self.numbers[25:30], self.numbers[27:30]
         falloff = None if exposures is None else exposures.falloff_of(camera)
         self.lens: Hashable = None
         self.camera = StagedCamera(
@@ -181,6 +185,7 @@ class _Frame:
             focals=self.numbers[25:27],
             falloff=None if falloff is None else falloff.clone(),
         )
+        self.staged = [x for x in (self.numbers, self.camera.falloff) if x is not None]
         if graphs.pool is None:
             graphs.pool = torch.cuda.graph_pool_handle()
         self.graph = torch.cuda.CUDAGraph()
@@ -189,30 +194,37 @@ class _Frame:
         self.room = self.result.intermediates.tiles.room
         self.latest: weakref.ref[CapturedRendering] | None = None
 
-    def replay(self, camera: Camera, background: Color, exposures: Exposures | None) -> "CapturedRendering":
-        """Render another camera; what the rendering before still holds is copied for it first."""
+    def replay(
+        self, camera: Camera, background: Color, exposures: Exposures | None
+    ) -> "tuple[CapturedRendering, bool]":
+        """Render another camera; what the rendering before still holds is copied for it first.
+
+        Returns:
+            The rendering, and whether the lists of surfels have held all entries, as far as is known.
+        """
         if self.latest is not None and (latest := self.latest()) is not None:
             latest.take_buffers()
         with self.graphs.using():
             self._stage(camera, background, exposures)
             self.graph.replay()
             rendering = CapturedRendering.of(self)
+            held = ops.held(self.room)
         self.latest = weakref.ref(rendering)
-        return rendering
+        return rendering, held
 
     def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
         """Copy what differs from one frame to the next into the tensors that the graph reads."""
-        matrices = [x.detach().to(self.numbers.dtype).flatten() for x in (camera.viewmat, camera.K)]
-        scalars = [camera.focal, camera.pixel_focal]
+        color = [0.0] * 3
         if not isinstance(background, torch.Tensor):
-            scalars += background_numbers(background, self.numbers.dtype)
-        # In double precision first, as numbers are elsewhere; from pageable memory, which is read at once.
-        rest = torch.tensor(scalars, dtype=torch.float64).to(self.numbers.dtype)
+            color = background_numbers(background, self.numbers.dtype)
+        # From pageable memory, which is read before the copy returns.
+        scalars = torch.tensor([camera.focal, camera.pixel_focal, *color])
+        matrices = [camera.viewmat.detach().reshape(-1), camera.K.detach().to(self.numbers.dtype).reshape(-1)]
         if camera.device.type == "cpu":
-            self.numbers[: 25 + len(rest)].copy_(torch.cat([*matrices, rest]), non_blocking=True)
+            self.numbers[:30].copy_(torch.cat([*matrices, scalars]), non_blocking=True)
         else:
-            torch.cat(matrices, out=self.numbers[:25])
-            self.numbers[25 : 25 + len(rest)].copy_(rest, non_blocking=True)
+            torch.cat(matrices, out=self.matrices)
+            self.scalars.copy_(scalars, non_blocking=True)
         if isinstance(background, torch.Tensor):
             self.background.copy_(background.detach().expand(3))
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -283,18 +295,18 @@ class Parts(NamedTuple):
     exposures: Exposures | None
     detail_limits: DetailLimits | None
 
-    @property
     def tensors(self) -> list[torch.Tensor]:
-        """Parameters and buffers of all parts."""
-        modules = [part for part in self if part is not None]
-        return [x for module in modules for x in (*module.parameters(), *module.buffers())]
+        """Return parameters and buffers of all parts."""
+        return [x for part in self if part is not None for x in _tensors_of(part)]
 
-    def state(self) -> Hashable:
+    def state(self, tensors: list[torch.Tensor]) -> Hashable:
         """What the launches of a frame depend on beside its kind; changes of values in place do not count."""
         texture, exposures, products = self.texture, self.exposures, torch.backends.cuda.matmul
         return (
-            *((x.data_ptr(), x.shape) for x in self.tensors),
+            *((x.data_ptr(), x.shape) for x in tensors),
             texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
+            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
             exposures and exposures.lens,
             self.detail_limits is None,
             torch.are_deterministic_algorithms_enabled(),
@@ -321,14 +333,17 @@ def render_by_graph(
         background: of the frame.
     """
     device = parts.surfels.device
-    if not _enabled or device.type != "cuda" or not _can_capture(device, parts, options, camera, background):
+    if not _enabled or device.type != "cuda":
+        return None
+    tensors = parts.tensors()
+    if not _can_capture(device, tensors, options, camera, background):
         return None
     with _graphs_lock:
         graphs = _graphs.get(parts.surfels)
         if graphs is None or graphs.stream.device != device:
             graphs = _graphs[parts.surfels] = FrameGraphs(device)
     kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture)
-    return graphs.render(camera, background, work, kind, parts.state(), parts.exposures)
+    return graphs.render(camera, background, work, kind, parts.state(tensors), parts.exposures)
 
 
 def release_graphs() -> bool:
@@ -338,21 +353,31 @@ def release_graphs() -> bool:
     return any([graphs.clear() for graphs in everything])
 
 
-def _can_capture(device: torch.device, parts: Parts, options: RenderOptions, camera: Camera, background: Color) -> bool:
+def _can_capture(
+    device: torch.device, tensors: list[torch.Tensor], options: RenderOptions, camera: Camera, background: Color
+) -> bool:
     """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
     if camera.width * camera.height * max(options.max_hits, 1) > MOST_POINTS or isinstance(camera, StagedCamera):
         return False
     if camera.viewmat.dtype != torch.float32 or camera.device not in (device, torch.device("cpu")):
         return False
-    tensors = [*parts.tensors, camera.viewmat]
+    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in tensors):
+        return False
+    differentiated = [*tensors, camera.viewmat]
     if isinstance(background, torch.Tensor):
         given = (background.dtype, background.device, *background.shape)
         if given not in ((torch.float32, device), (torch.float32, device, 3)):
             return False
-        tensors.append(background)
-    for x in parts.tensors:
-        if x.device != device or (x.is_floating_point() and x.dtype != torch.float32):
-            return False
-    if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+        differentiated.append(background)
+    if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
         return False
     return not torch.cuda.is_current_stream_capturing()
+
+
+def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
+    """Return parameters and buffers; torch's own iterators take a tenth of a small frame's time."""
+    found = [x for x in (*module._parameters.values(), *module._buffers.values()) if x is not None]
+    for child in module._modules.values():
+        if child is not None:
+            found += _tensors_of(child)
+    return found

@@ -154,9 +154,19 @@ class Model(nn.Module):
         )
 
         def work(camera: Camera, background: Color) -> Rendering:
-            flags = (options.max_hits, background, options.sh_degree, options.low_pass, options.clamp_texture)
-            extras = {"exposures": parts.exposures, "detail_limits": parts.detail_limits}
-            return render(parts.surfels, parts.texture, camera, *flags, *jitter, **extras)
+            return render(
+                parts.surfels,
+                parts.texture,
+                camera,
+                options.max_hits,
+                background,
+                options.sh_degree,
+                options.low_pass,
+                options.clamp_texture,
+                *jitter,
+                exposures=parts.exposures,
+                detail_limits=parts.detail_limits,
+            )
 
         if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:
             rendering = frames.render_by_graph(work, parts, options, camera, background)

@@ -21,8 +21,9 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import BUFFERS, Exposures
+from nexwarp.representation.merged_texture import MergedTexture, make_texture
 from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture, TextureShape
+from nexwarp.representation.texture import NeuralTexture
 
 FORMAT_VERSION = 1
 COMPACT_VERSION = 2  # of compact files, which older readers cannot read
@@ -63,7 +64,7 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     if model.texture is not None:
         for name, x in model.texture.state_dict().items():
-            tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
+            tensors[f"texture.{name}"] = x.clone() if name.endswith(("resolutions", "cells")) else x.half()
     if model.detail_limits is not None:
         tensors |= {stored: getattr(model.detail_limits, name) for name, stored in DETAIL_LIMITS.items()}
     if model.exposures is not None:
@@ -164,15 +165,25 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
     check_bounds(tensors)
     texture = None
     if header.texture is not None:
-        texture = NeuralTexture(**header.texture)  # type: ignore[arg-type]  # the constructor checks the types
+        texture = make_texture(header.texture)
         texture.load_state_dict(_part(tensors, "texture."))
-        texture.half_precision = fits_half(tensors)
+        for prefix, part in _simple_textures(texture):
+            own = {f"texture.{name}": x for name, x in _part(tensors, prefix).items()}
+            check_bounds(own)
+            part.half_precision = fits_half(own)
     return Model(surfels, texture, exposures, limits, header.options, header.meta)
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Return the tensors with a prefix in their names, as float32, by the names without it."""
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
+
+
+def _simple_textures(texture: NeuralTexture) -> list[tuple[str, NeuralTexture]]:
+    """Return a texture, or the parts of a merged one, with the prefixes of their tensors."""
+    if isinstance(texture, MergedTexture):
+        return [(f"texture.parts.{index}.", part) for index, part in enumerate(texture.textures)]
+    return [("texture.", texture)]
 
 
 def _read_header(path: Path, text: str | None) -> _Header:
@@ -195,9 +206,8 @@ def _read_header(path: Path, text: str | None) -> _Header:
         if not isinstance(texture, (dict, type(None))):
             raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
         if texture is not None:
-            texture = {name: value for name, value in texture.items() if name in TextureShape.__annotations__}
             with torch.device("meta"):  # allocates nothing, even if the metadata gives huge sizes
-                state = NeuralTexture(**texture).state_dict()
+                state = make_texture(texture).state_dict()
             shapes = {f"texture.{name}": list(x.shape) for name, x in state.items()}
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise _no_model(path, error) from None

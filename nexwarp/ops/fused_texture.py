@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.fused_scatter import fused_scatter_kernel
+from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_BLOCKS,
     BACKWARD_THREADS,
@@ -33,9 +33,6 @@ from nexwarp.kernels.native.fused_texture import (
 from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
-
-# Runs of levels that different threads of the scatter kernel take.
-SCATTER_RUNS = 1
 
 
 class Shape(NamedTuple):
@@ -62,10 +59,10 @@ class Shape(NamedTuple):
         return -(-self.width // wide) * -(-self.height // high) * self.hits
 
     @property
-    def threads(self) -> int:
-        """Threads of a run of `fused_scatter`."""
+    def blocks(self) -> int:
+        """Warps of `fused_scatter`: blocks of two tiles times hits."""
         wide = 2 * self.shift - 3
-        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits * 32
+        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits
 
 
 def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
@@ -77,13 +74,18 @@ def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bo
     """Whether the fused kernels take a grid (L, T, F) and matrices, of SH degree 0 to 3, for so many points."""
     levels, size, features = grid.shape
     shapes = [tuple(matrix.shape) for matrix in weights]
-    hidden = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
+    hidden: list[tuple[int, ...]] = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
     return (
         takes_shape(levels, features, len(weights[0]), len(weights) - 1)
-        and shapes in ([*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
+        and any(shapes == [*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
         and levels * size * features <= LARGEST_INT
         and points <= LARGEST_INT // 64
     )
+
+
+def supported(device: torch.device) -> bool:
+    """Whether a GPU has the tensor cores' instructions that the fused kernels use."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 def usable(
@@ -91,9 +93,8 @@ def usable(
 ) -> bool:
     """Whether the fused kernels compute these colours; see `nexwarp.ops.texture`."""
     return (
-        positions.is_cuda
+        supported(positions.device)
         and positions.dtype == torch.float32
-        and torch.cuda.get_device_capability(positions.device) >= (8, 0)
         and not (torch.is_grad_enabled() and directions.requires_grad)
         and not torch.are_deterministic_algorithms_enabled()
         and len(positions) > 0
@@ -101,33 +102,57 @@ def usable(
     )
 
 
-def colors(
-    positions: torch.Tensor,
-    depths: torch.Tensor,
-    directions: torch.Tensor,
-    grid: torch.Tensor,
-    table: torch.Tensor,
-    weights: Sequence[torch.Tensor],
-    resolutions: torch.Tensor,
-    focal: torch.Tensor,
-    shape: Shape,
-    offset: float,
-    clamp: bool,
-    *,
-    keep: bool,
-) -> torch.Tensor:
+class Inputs(NamedTuple):
+    """What the kernels read: see `nexwarp.ops.texture`, whose arguments these are.
+
+    Attributes:
+        positions, depths, directions, resolutions, focal: float32, contiguous.
+        table: (L, T, F) the grid in half precision.
+        weights: the matrices, float32.
+        shape: of the image.
+    """
+
+    positions: torch.Tensor
+    depths: torch.Tensor
+    directions: torch.Tensor
+    table: torch.Tensor
+    weights: Sequence[torch.Tensor]
+    resolutions: torch.Tensor
+    focal: torch.Tensor
+    shape: Shape
+
+
+class Kept(NamedTuple):
+    """What the backward pass needs of the forward pass.
+
+    Attributes:
+        encoded: the features as fragments, 64 bytes a point; empty if there will be no backward pass.
+        packed: the matrices in half precision, in the order in which the kernels' lanes load them.
+        colors: (n, 3) the result if it was clamped, else empty.
+    """
+
+    encoded: torch.Tensor
+    packed: torch.Tensor
+    colors: torch.Tensor
+
+
+def colors(inputs: Inputs, grid: torch.Tensor, offset: float, clamp: bool, *, keep: bool) -> torch.Tensor:
     """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
 
-    The arguments are those of `nexwarp.ops.texture`; `table` is the grid in half precision, `shape` the image's,
-    and `keep` says whether there will be a backward pass.
+    Args:
+        inputs: what the kernels read.
+        grid: (L, T, F) float32, of which `inputs.table` is a copy.
+        offset: colour of coefficients of 0.
+        clamp: limit colours to >= 0.
+        keep: whether there will be a backward pass.
     """
-    given = (positions, depths, directions, grid, table, resolutions, focal, shape, offset, clamp, keep)
-    return _Colors.apply(*given, *weights)
+    positions, depths, directions, table, weights, resolutions, focal, shape = inputs
+    fixed = (directions, table, resolutions, focal, shape, offset, clamp, keep)
+    return _Colors.apply(positions, depths, grid, *fixed, *weights)
 
 
 class _Context(Context):
     shape: Shape
-    clamp: bool
 
 
 class _Colors(torch.autograd.Function):
@@ -136,8 +161,8 @@ class _Colors(torch.autograd.Function):
         ctx: _Context,
         positions: torch.Tensor,
         depths: torch.Tensor,
-        directions: torch.Tensor,
         grid: torch.Tensor,
+        directions: torch.Tensor,
         table: torch.Tensor,
         resolutions: torch.Tensor,
         focal: torch.Tensor,
@@ -147,61 +172,46 @@ class _Colors(torch.autograd.Function):
         keep: bool,
         *weights: torch.Tensor,
     ) -> torch.Tensor:
-        result, encoded, packed = forward(
-            positions, depths, directions, table, weights, resolutions, focal, shape, offset, clamp, keep
-        )
-        ctx.shape, ctx.clamp = shape, clamp
+        inputs = Inputs(positions, depths, directions, table, weights, resolutions, focal, shape)
+        result, kept = forward(inputs, offset, clamp, keep)
+        ctx.shape = shape
         if keep:
-            kept = (result if clamp else None, encoded, packed)
             ctx.save_for_backward(positions, depths, directions, table, resolutions, focal, *kept, *weights)
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        positions, depths, directions, table, resolutions, focal, result, encoded, packed, *weights = ctx.saved_tensors
-        need_positions, need_depths, _, need_grid, *_ = ctx.needs_input_grad
-        given = (positions, depths, directions, table, weights, resolutions, focal, encoded, packed, result, ctx.shape)
-        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), *given, need_positions or need_depths)
+        positions, depths, directions, table, resolutions, focal, encoded, packed, result, *weights = ctx.saved_tensors
+        need_positions, need_depths, need_grid, *_ = ctx.needs_input_grad
+        inputs = Inputs(positions, depths, directions, table, weights, resolutions, focal, ctx.shape)
+        kept, need_points = Kept(encoded, packed, result), need_positions or need_depths
+        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), inputs, kept, need_points)
         return (
             grad_points[:, :3] if need_positions and grad_points is not None else None,
             grad_points[:, 3] if need_depths and grad_points is not None else None,
-            None,
             grad_grid if need_grid else None,
-            *(None,) * 7,
+            *(None,) * 8,
             *grad_matrices,
         )
 
 
-def forward(
-    positions: torch.Tensor,
-    depths: torch.Tensor,
-    directions: torch.Tensor,
-    table: torch.Tensor,
-    weights: Sequence[torch.Tensor],
-    resolutions: torch.Tensor,
-    focal: torch.Tensor,
-    shape: Shape,
-    offset: float,
-    clamp: bool,
-    keep: bool,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the colours (n, 3), the features as fragments, none unless `keep`, and the packed matrices.
+def forward(inputs: Inputs, offset: float, clamp: bool, keep: bool) -> tuple[torch.Tensor, Kept]:
+    """Return the colours (n, 3), and what `backward` needs, without the features unless `keep`.
 
     Args:
-        positions, depths, directions, resolutions, focal, offset, clamp: as of `nexwarp.ops.texture`; float32.
-        table: (L, T, F) half precision.
-        weights: float32.
-        shape: of the image.
-        keep: keep the features for `backward`.
+        inputs: what the kernels read.
+        offset: colour of coefficients of 0.
+        clamp: limit colours to >= 0.
+        keep: whether there will be a backward pass.
     """
-    features = table.shape[2]
-    packed = _pack(weights, features)
+    positions, depths, directions, table, weights, resolutions, focal, shape = inputs
+    packed = _pack(weights, table.shape[2])
     encoded = torch.empty(shape.units * 256 if keep else 0, dtype=torch.int32, device=table.device)
-    colors = torch.empty_like(positions)
+    result = torch.empty_like(positions)
     warps = _warps(positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
     _launch(
-        fused_kernels(features).forward,
+        fused_kernels(table.shape[2]).forward,
         positions,
         warps,
         [
@@ -218,90 +228,92 @@ def forward(
             offset,
             int(clamp),
         ],
-        [array(encoded, wp.int32), array(colors, wp.vec3)],
+        [array(encoded, wp.int32), array(result, wp.vec3)],
         FORWARD_THREADS,
     )
-    return colors, encoded, packed
+    return result, Kept(encoded, packed, result if clamp else result.new_empty(0, 3))
 
 
 def backward(
-    grad_colors: torch.Tensor,
-    positions: torch.Tensor,
-    depths: torch.Tensor,
-    directions: torch.Tensor,
-    table: torch.Tensor,
-    weights: Sequence[torch.Tensor],
-    resolutions: torch.Tensor,
-    focal: torch.Tensor,
-    encoded: torch.Tensor,
-    packed: torch.Tensor,
-    colors: torch.Tensor | None,
-    shape: Shape,
-    need_points: bool,
+    grad_colors: torch.Tensor, inputs: Inputs, kept: Kept, need_points: bool
 ) -> tuple[torch.Tensor, torch.Tensor | None, list[torch.Tensor]]:
     """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices.
 
     Args:
         grad_colors: (n, 3).
-        encoded, packed: of `forward`.
-        colors: of `forward` if they were clamped.
+        inputs: of `forward`.
+        kept: of `forward`.
         need_points: whether positions or depths need a gradient.
-
-    The others are those of `forward`.
     """
-    levels, size, features = table.shape
     scale, unscale = _scales(grad_colors)
-    grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=table.device)
-    warps = _warps(positions, shape.units, BACKWARD_BLOCKS * WARPS)
-    sums = positions.new_empty(warps // (WARPS if positions.is_cuda else 1), sum(GRADIENTS))
+    grad_encoded, sums = _mlp_backward(grad_colors, scale, inputs, kept)
+    order = _order(inputs.table.shape[2], len(inputs.weights[-1]), grad_colors.device)
+    flat = grad_colors.new_empty(len(order))
+    given = [array(sums, wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
+    launch(grad_colors, order_gradients, len(order), given, [array(flat, wp.float32)])
+    ends = np.cumsum([0, *(matrix.numel() for matrix in inputs.weights)]).tolist()
+    grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], inputs.weights, strict=False)]
+    return *_scatter(grad_encoded, unscale, inputs, need_points), grad_matrices
+
+
+def _mlp_backward(
+    grad_colors: torch.Tensor, scale: torch.Tensor, inputs: Inputs, kept: Kept
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the gradients of the features (L, places, F), and those of the matrices in permuted order, both scaled."""
+    shape, (levels, _, features) = inputs.shape, inputs.table.shape
+    grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=scale.device)
+    warps = _warps(grad_colors, shape.units, BACKWARD_BLOCKS * WARPS)
+    sums = grad_colors.new_empty(warps // (WARPS if grad_colors.is_cuda else 1), sum(GRADIENTS))
     _launch(
         fused_kernels(features).backward,
-        positions,
+        grad_colors,
         warps,
         [
-            array(encoded, wp.int32),
-            array(directions, wp.vec3),
-            array(packed, wp.int32),
+            array(kept.encoded, wp.int32),
+            array(inputs.directions, wp.vec3),
+            array(kept.packed, wp.int32),
             *shape,
             shape.shift,
             array(scale, wp.float32),
-            array(colors, wp.vec3),
+            array(kept.colors, wp.vec3),
             array(grad_colors, wp.vec3),
         ],
         [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
         BACKWARD_THREADS,
     )
-    order = _order(features, len(weights[-1]), positions.device)
-    flat = positions.new_empty(len(order))
-    given = [array(sums.sum(0), wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
-    launch(positions, order_gradients, len(order), given, [array(flat, wp.float32)])
-    ends = np.cumsum([0, *(matrix.numel() for matrix in weights)]).tolist()
-    grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], weights, strict=False)]
+    return grad_encoded, sums.sum(0)
+
+
+def _scatter(
+    grad_encoded: torch.Tensor, unscale: torch.Tensor, inputs: Inputs, need_points: bool
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
+    table, positions, shape = inputs.table, inputs.positions, inputs.shape
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    grad_points = positions.new_empty(SCATTER_RUNS * need_points, len(positions), 4)
+    count = shape.blocks * (32 if positions.is_cuda else 1)
+    grad_points = positions.new_empty(len(positions) * need_points, 4)
     launch(
         positions,
-        fused_scatter_kernel(features),
-        shape.threads * SCATTER_RUNS,
+        fused_scatter_kernel(table.shape[2]),
+        count,
         [
             array(table.view(-1), wp.float16),
             array(positions, wp.vec3),
-            array(depths, wp.float32),
-            array(resolutions, wp.float32),
-            array(focal, wp.float32),
-            wp.uint32(size - 1),
+            array(inputs.depths, wp.float32),
+            array(inputs.resolutions, wp.float32),
+            array(inputs.focal, wp.float32),
+            wp.uint32(table.shape[1] - 1),
             array(grad_encoded.view(-1), wp.float16),
             shape.units * 16,
             array(unscale, wp.float32),
             *shape,
             shape.shift,
-            -(-levels // SCATTER_RUNS),
         ],
         [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
-        smallest=shape.threads * SCATTER_RUNS,
+        block_dim=SCATTER_THREADS,
+        smallest=count,  # in one thread on a CPU
     )
-    points = grad_points.sum(0) if SCATTER_RUNS > 1 else grad_points[0] if need_points else None
-    return grad_grid, points, grad_matrices
+    return grad_grid, grad_points if need_points else None
 
 
 def _launch(

@@ -80,8 +80,8 @@ def texture(
             height, width = image or (1, len(directions))
             shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
             copy = grid.detach().contiguous().half() if table is None else table
-            given = (positions, depths, directions, grid, copy, weights, resolutions, focal, shape, offset, clamp)
-            return fused_texture.colors(*given, keep=keep)
+            inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
+            return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
     given = (positions, depths, directions, grid, table, resolutions, focal, offset, clamp, half, keep)
     return _Texture.apply(*given, *weights)
 

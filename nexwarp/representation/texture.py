@@ -48,6 +48,8 @@ class NeuralTexture(nn.Module):
     """
 
     resolutions: torch.Tensor
+    # The grid in half precision, and which grid it was: address and version.
+    _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
 
     def __init__(
         self,
@@ -101,7 +103,6 @@ class NeuralTexture(nn.Module):
         self.sh_degree = sh_degree
         self.residual, self.down_weighting = residual, down_weighting
         self.half_precision = True
-        self._half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
         self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
         sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]

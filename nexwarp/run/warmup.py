@@ -19,7 +19,7 @@ from nexwarp.kernels.catalogue import fused_kernel_builds, thread_kernels, walk_
 from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
-from nexwarp.ops.fused_texture import takes_shape
+from nexwarp.ops.fused_texture import supported, takes_shape
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
@@ -67,7 +67,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
     builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
     shape = config.texture
-    if textured and not cpu and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
+    if textured and supported(device) and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
         builds += (Build(*build) for build in fused_kernel_builds((shape.features,)))
     return builds
 

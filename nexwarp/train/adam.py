@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from nexwarp.ops.adam import Regulariser, adam_step
+from nexwarp.ops.adam import Moments, adam_step
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.losses import LossWeights
 
@@ -30,7 +30,7 @@ class FusedAdam(torch.optim.Adam):
         super().__init__(groups, eps=eps, fused=True, capturable=capturable)
         self.grid_loss: torch.Tensor | None = None
         self._texture: NeuralTexture | None = None
-        self._regulariser: Regulariser | None = None
+        self._factors: torch.Tensor | None = None
 
     def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:
         """Take over a texture's grid: keep its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
@@ -39,8 +39,8 @@ class FusedAdam(torch.optim.Adam):
             texture: whose grid is among the parameters.
             factors: (L,) factors; None adds nothing.
         """
-        self._texture = texture
-        self._regulariser = None if factors is None else Regulariser(factors)
+        self._texture, self._factors = texture, factors
+        texture.half_copy()  # before any step is captured
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -52,29 +52,27 @@ class FusedAdam(torch.optim.Adam):
         work = []
         for group in self.param_groups:
             for parameter in group["params"]:
-                regulariser = self._regulariser if parameter is grid else None
-                if parameter.grad is None and regulariser is None:
+                factors = self._factors if parameter is grid else None
+                if parameter.grad is None and factors is None:
                     continue
                 state = self.state[parameter]
                 if not state:
                     state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
                     state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter) for _ in range(2))
                 steps.append(state["step"])
-                work.append((group, parameter, state, regulariser))
+                work.append((group, parameter, state, factors))
         if steps:
             torch._foreach_add_(steps, 1)
         self.grid_loss = None
-        for group, parameter, state, regulariser in work:
+        for group, parameter, state, factors in work:
             loss = adam_step(
                 parameter.detach(),
                 parameter.grad,
-                state["exp_avg"],
-                state["exp_avg_sq"],
-                state["step"],
+                Moments(state["step"], state["exp_avg"], state["exp_avg_sq"]),
                 group["lr"],
                 betas=group["betas"],
                 epsilon=group["eps"],
-                regulariser=regulariser,
+                factors=factors,
                 half=self._texture.half_copy() if self._texture is not None and parameter is grid else None,
             )
             self.grid_loss = self.grid_loss if loss is None else loss

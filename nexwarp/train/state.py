@@ -1,5 +1,6 @@
 """State of a training: everything that shapes its future, gathered and put back bit for bit."""
 
+import dataclasses
 import hashlib
 import math
 import random
@@ -17,6 +18,8 @@ from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
+from nexwarp.train.config import Config
+from nexwarp.train.presets import config_from_dict
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -169,6 +172,25 @@ def restore_random(
     np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
+
+
+def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str) -> None:
+    """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
+
+    Args:
+        snapshot: as it was read.
+        config: settings.
+        views: fingerprint of the training views.
+        scene: digest of the scene.
+    """
+    state = snapshot.state
+    saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
+    if saved != config:
+        raise ValueError("its settings are others")
+    if state["views"] != views:
+        raise ValueError("it has seen other training views than the scene has")
+    if state["scene"] != scene:
+        raise ValueError("the scene's photos, masks or points have changed since")
 
 
 def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:

@@ -1,6 +1,5 @@
 """Training: the loop of paper Sec. 4.3, as a class that the command line and `nexwarp.train` drive."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from functools import cached_property, reduce
@@ -10,6 +9,7 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
@@ -26,14 +26,14 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
-from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
+from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
     Snapshot,
+    check_origin,
     check_snapshot,
     checkpoint_bytes,
     gather_optimizer,
@@ -74,6 +74,8 @@ class Trainer:
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
         rate_factor: multiplies all learning rates; less than 1 after the run has gone back.
+        views_a_step: number of views of the last step: 1, or that of the ranks.
+        ranks: the processes that train together; here one.
     """
 
     def __init__(
@@ -119,7 +121,8 @@ class Trainer:
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise)
-        self.rate_factor = 1.0
+        self.rate_factor, self.views_a_step = 1.0, 1
+        self.ranks = Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
@@ -149,12 +152,12 @@ class Trainer:
             try:
                 start = time.perf_counter()
                 report = self.step()
-                if self.iteration == last and self.device.type == "cuda":
+                if self.iteration >= last and self.device.type == "cuda":
                     torch.cuda.synchronize(self.device)
                 self.seconds += time.perf_counter() - start
                 self.loss_log.note(self.iteration, report.losses)
-                keep = self.iteration % max(total // SNAPSHOTS, 1) == 0
-                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == last:
+                keep = report.passed(max(total // SNAPSHOTS, 1))
+                if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
                     self.check()
                 if keep:
                     self.good = self.snapshot()
@@ -174,18 +177,19 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
-            self.iteration += 1
-            target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+            target = self._next_target()
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
-            if self.graphs is None:
-                result = self._optimize(target)
-            else:
-                result = self.graphs.run(target, self._optimize, self._graph_key())
-            if self.densifier.due(self.iteration):
+            result = self._run_step(target)
+            if self.densifier.due(self.iteration, self.views_a_step):
                 self.densifier.step(self.surfels, self.optimizer, self.generator)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
-            return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            return StepReport(*report, self.views_a_step)
+
+    def _next_target(self) -> Target:
+        self.iteration += 1
+        return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         return make_optimizer(
@@ -196,6 +200,11 @@ class Trainer:
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
+
+    def _run_step(self, target: Target) -> StepResult:
+        if self.graphs is None:
+            return self._optimize(target)
+        return self.graphs.run(target, self._optimize, self._graph_key())
 
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
@@ -209,18 +218,26 @@ class Trainer:
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
-            reduce(torch.add, losses.values()).backward()
-            with updating():
-                self.optimizer.step()
-                if request is not None and request.sums_after_backward is not None:
-                    self.densifier.accumulate(request.sums_after_backward)
+            self._weighted(reduce(torch.add, losses.values())).backward()
+            kept = self._update(None if request is None else request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        if fused is not None and fused.grid_loss is not None:
-            losses["grid"] = fused.grid_loss
-        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room)
+        if kept is None and fused is not None and fused.grid_loss is not None:
+            losses["grid"], fused.grid_loss = fused.grid_loss, None
+        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room, kept)
+
+    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
+        return loss
+
+    def _update(self, errors: torch.Tensor | None) -> Gradients | None:
+        """Update the parameters by their gradients, and the densifier's sums by the errors (N,) of the step's view."""
+        with updating():
+            self.optimizer.step()
+            if errors is not None:
+                self.densifier.accumulate(errors)
+        return None
 
     def _graph_key(self) -> Hashable:
         state = [self.densifier.errors]
@@ -233,7 +250,8 @@ class Trainer:
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
         densify = self.densifier.config
-        due = self.iteration % (FLOATERS_EVERY * densify.every) == 0 or self.iteration == self.config.iterations
+        due = self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
+        due |= self.iteration == self.config.iterations
         return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
@@ -245,7 +263,7 @@ class Trainer:
         # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
         # A generator of its own: a search that finds no floaters changes nothing.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last)
+        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last, ranks=self.ranks)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def model(self) -> Model:
@@ -289,16 +307,8 @@ class Trainer:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        """Return all tensors that must stay finite, by the names that a report gives them."""
-        watched: dict[str, torch.Tensor] = {}
-        moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
-        for name, parameter in self._named_parameters():
-            # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
-                    watched[f"{moments.get(key, key)} of {name}"] = value
-            watched[name] = parameter
-        return watched | {"densify.errors": self.densifier.errors}
+        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
+        return state | {"densify.errors": self.densifier.errors}
 
     def save(self, run: Path) -> None:
         """Write a checkpoint: everything that shapes the future of the run.
@@ -310,7 +320,13 @@ class Trainer:
         self.check()
         if self.good is None or self.good.state["iteration"] != self.iteration:
             self.good = self.snapshot()
-        save_checkpoint(run, *self.good)
+        self._write(run, self.good)
+
+    def _write(self, run: Path, snapshot: Snapshot) -> None:
+        save_checkpoint(run, *snapshot)
+
+    def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
+        return Snapshot(*load_checkpoint(run, warn))
 
     def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
@@ -323,26 +339,15 @@ class Trainer:
             FileNotFoundError: there is none.
             ValueError: they are damaged, or scene, settings or optimizer differ.
         """
-        snapshot = Snapshot(*load_checkpoint(run, warn))
+        snapshot = self._read(run, warn)
         try:
-            self._check_origin(snapshot)
+            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
             told = one_line(found)  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
-
-    def _check_origin(self, snapshot: Snapshot) -> None:
-        """Raise ValueError unless a snapshot comes from a run of this scene with these settings."""
-        state = snapshot.state
-        saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=self.config.cuda_graphs)
-        if saved != self.config:
-            raise ValueError("its settings are others")
-        if state["views"] != self.views.fingerprint():
-            raise ValueError("it has seen other training views than the scene has")
-        if state["scene"] != self._scene_digest:
-            raise ValueError("the scene's photos, masks or points have changed since")
 
     def checkpoint_size(self) -> int:
         """Return how many bytes a checkpoint takes at most; the model takes less."""

@@ -101,11 +101,6 @@ _PIXELS = """
 
 _LOOKUP = """
     const float focal_length = focal.data[0];
-#if defined(__CUDA_ARCH__)
-    auto power_of_e = [](float x) { return __expf(x); };
-#else
-    auto power_of_e = [](float x) { return expf(x); };
-#endif
     auto map_positive = [](int i) { return (unsigned)(i > 0 ? 2 * i - 1 : -2 * i); };
     // Features of a point at one level, as words of two halves.
     auto look_up = [&](int level, const float* at, float depth, unsigned* out) {
@@ -252,7 +247,8 @@ EACH_LANE {
     UNROLL
     for (int i = 0; i < 2; ++i) {
         const unsigned kept = LAYER;
-        OUT[n >> 1][(n & 1) * 2 + i][l] = halves(kept & 0xffffu ? d[2 * i][l] : 0.0f, kept >> 16 ? d[2 * i + 1][l] : 0.0f);
+        const float first = kept & 0xffffu ? d[2 * i][l] : 0.0f, second = kept >> 16 ? d[2 * i + 1][l] : 0.0f;
+        OUT[n >> 1][(n & 1) * 2 + i][l] = halves(first, second);
     }
 }
 """
@@ -390,7 +386,9 @@ PIXELS
                         UNROLL
                         for (int c = 0; c < 3; ++c) {
                             grad[c] = reinterpret_cast<const float*>(grad_colors.data)[3 * point + c] * scaled;
-                            if (colors.shape[0] > 0 && !(reinterpret_cast<const float*>(colors.data)[3 * point + c] > 0.0f)) grad[c] = 0.0f;
+                            if (colors.shape[0] == 0) continue;
+                            const float color = reinterpret_cast<const float*>(colors.data)[3 * point + c];
+                            if (!(color > 0.0f)) grad[c] = 0.0f;
                         }
                     }
                     float value[4 * OUTPUT_PAIRS] = {};

@@ -19,10 +19,26 @@ PRELUDE = """
 #define UNROLL _Pragma("unroll")
     constexpr int LANES = 1;
     const int lane0 = threadIdx.x & 31;
-    auto low_half = [](unsigned x) { float y; asm("{.reg .f16 a, b; mov.b32 {a, b}, %1; cvt.f32.f16 %0, a;}" : "=f"(y) : "r"(x)); return y; };
-    auto high_half = [](unsigned x) { float y; asm("{.reg .f16 a, b; mov.b32 {a, b}, %1; cvt.f32.f16 %0, b;}" : "=f"(y) : "r"(x)); return y; };
-    auto halves = [](float a, float b) { unsigned y; asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(y) : "f"(b), "f"(a)); return y; };
-    auto relu_halves = [](float a, float b) { unsigned y; asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(y) : "f"(b), "f"(a)); return y; };
+    auto low_half = [](unsigned x) {
+        float y;
+        asm("{.reg .f16 a, b; mov.b32 {a, b}, %1; cvt.f32.f16 %0, a;}" : "=f"(y) : "r"(x));
+        return y;
+    };
+    auto high_half = [](unsigned x) {
+        float y;
+        asm("{.reg .f16 a, b; mov.b32 {a, b}, %1; cvt.f32.f16 %0, b;}" : "=f"(y) : "r"(x));
+        return y;
+    };
+    auto halves = [](float a, float b) {
+        unsigned y;
+        asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(y) : "f"(b), "f"(a));
+        return y;
+    };
+    auto relu_halves = [](float a, float b) {
+        unsigned y;
+        asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(y) : "f"(b), "f"(a));
+        return y;
+    };
     auto read_four = [](const unsigned* from, unsigned (*to)[1], int) {
         const uint4 x = *reinterpret_cast<const uint4*>(from);
         to[0][0] = x.x; to[1][0] = x.y; to[2][0] = x.z; to[3][0] = x.w;
@@ -31,7 +47,8 @@ PRELUDE = """
         *reinterpret_cast<uint4*>(to) = make_uint4(from[0][0], from[1][0], from[2][0], from[3][0]);
     };
     auto multiply_add = [](wp::float32 (*d)[1], const unsigned (*a)[1], const unsigned (*b)[1]) {
-        asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 "
+            "{%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
             : "+f"(d[0][0]), "+f"(d[1][0]), "+f"(d[2][0]), "+f"(d[3][0])
             : "r"(a[0][0]), "r"(a[1][0]), "r"(a[2][0]), "r"(a[3][0]), "r"(b[0][0]), "r"(b[1][0]));
     };
@@ -40,6 +57,15 @@ PRELUDE = """
         x[0] += __shfl_xor_sync(0xffffffffu, x[0], 2);
     };
     auto any_lane = [](const int* x) { return __any_sync(0xffffffffu, x[0]); };
+    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+        to[0] = __shfl_xor_sync(0xffffffffu, x[0], bit);
+    };
+    auto vote = [](const int* x) { return __ballot_sync(0xffffffffu, x[0]); };
+    auto equal_lanes = [](const wp::int32 (*x)[1], unsigned* to) {
+        const unsigned long long xy = ((unsigned long long)(unsigned)x[1][0] << 32) | (unsigned)x[0][0];
+        to[0] = __match_any_sync(0xffffffffu, xy) & __match_any_sync(0xffffffffu, x[2][0]);
+    };
+    auto power_of_e = [](float x) { return __expf(x); };
 #else
 #define UNROLL
     constexpr int LANES = 32;
@@ -57,7 +83,9 @@ PRELUDE = """
     auto write_four = [](unsigned* to, unsigned (*from)[32], int l) {
         for (int r = 0; r < 4; ++r) to[r] = from[r][l];
     };
-    auto multiply_add = [&](wp::float32 (*d)[32], const unsigned (*a)[32], const unsigned (*b)[32]) __attribute__((noinline)) {
+    // Not inlined: it would be as often as the text has products, and compile for a minute.
+    auto multiply_add = [&](wp::float32 (*d)[32], const unsigned (*a)[32],
+                            const unsigned (*b)[32]) __attribute__((noinline)) {
         float left[16][16], right[16][8];
         for (int lane = 0; lane < 32; ++lane) {
             const int g = lane >> 2, q = lane & 3;
@@ -88,6 +116,22 @@ PRELUDE = """
         for (int lane = 0; lane < 32; ++lane) any |= x[lane];
         return any;
     };
+    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+        for (int lane = 0; lane < 32; ++lane) to[lane] = x[lane ^ bit];
+    };
+    auto vote = [](const int* x) {
+        unsigned lanes = 0;
+        for (int lane = 0; lane < 32; ++lane) lanes |= (unsigned)(x[lane] != 0) << lane;
+        return lanes;
+    };
+    auto equal_lanes = [](const wp::int32 (*x)[32], unsigned* to) {
+        for (int lane = 0; lane < 32; ++lane) {
+            to[lane] = 0;
+            for (int i = 0; i < 32; ++i)
+                to[lane] |= (unsigned)(x[0][i] == x[0][lane] && x[1][i] == x[1][lane] && x[2][i] == x[2][lane]) << i;
+        }
+    };
+    auto power_of_e = [](float x) { return expf(x); };
 #endif
 #define EACH_LANE for (int l = 0, lane = lane0; l < LANES; ++l, ++lane)
 """
