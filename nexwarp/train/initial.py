@@ -7,6 +7,7 @@ import torch
 
 from nexwarp.data import Scene, initial_points
 from nexwarp.kernels.sh import BAND_0
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import TextureShape
 from nexwarp.train.config import Config
@@ -76,6 +77,13 @@ def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
         ],
         dim=-1,
     )
+
+
+def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCorrections | None:
+    """Return corrections of 0 for the training poses, on a device; None where poses are not refined."""
+    if not config.refine_poses:
+        return None
+    return PoseCorrections([view.camera for view in scene.train], scene.scale).to(device)
 
 
 def texture_shape(scene: Scene, config: Config) -> TextureShape:

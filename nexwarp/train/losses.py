@@ -38,11 +38,13 @@ class LossWeights:
     """Factor of the relative depth error at the points that were triangulated from the photo."""
     border: float = 0.1
     """Factor of the image loss beyond the frame in border steps, against the photo's repeated edge."""
+    poses: float = 0.1
+    """With `refine_poses`: factor of the squared pose correction, which keeps poses near the given ones."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
         check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border", "poses"):
             check_range(name, getattr(self, name), 0.0)
 
 

@@ -8,14 +8,15 @@ from typing import Any
 import torch
 
 from nexwarp.model.options import RenderOptions
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" and "mlp"; `lr`, the
-# learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses are
+# refined, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
@@ -26,6 +27,7 @@ def make_optimizer(
     config: Config,
     scale: float,
     make: OptimizerMaker | None = None,
+    poses: PoseCorrections | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimizer; each of its groups gets the ends of its schedule as `group["ends"]`.
 
@@ -35,6 +37,7 @@ def make_optimizer(
         config: whose learning rates count.
         scale: of the scene, world units, which the means' rates follow.
         make: makes an optimizer of one's own; None makes Adam.
+        poses: pose corrections to train; None trains none.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -44,6 +47,8 @@ def make_optimizer(
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
     if config.max_hits:
         parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+    if poses is not None:
+        parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
@@ -90,6 +95,7 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "shN": (rates.shN,) * 2,
         "grid": rates.grid,
         "mlp": rates.mlp,
+        "poses": rates.poses,
     }
 
 

@@ -14,13 +14,14 @@ from nexwarp.checks import check_finite
 from nexwarp.data import Scene
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
 HEADERS = 2**20  # bytes of a checkpoint beside its parameters, at most
-FLOATS = ("surfels.", "texture.", "adam.", "densify.")  # of tensors that are float32
+FLOATS = ("surfels.", "texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
 
 
 class Snapshot(NamedTuple):
@@ -35,16 +36,42 @@ class Snapshot(NamedTuple):
     state: dict[str, Any]
 
 
-def named_parameters(surfels: Surfels, texture: NeuralTexture) -> Iterator[tuple[str, torch.nn.Parameter]]:
+def named_parameters(
+    surfels: Surfels, texture: NeuralTexture, poses: PoseCorrections | None = None
+) -> Iterator[tuple[str, torch.nn.Parameter]]:
     """Yield all parameters with their names in a checkpoint."""
     yield from ((f"surfels.{name}", x) for name, x in surfels.named_parameters())
     yield from ((f"texture.{name}", x) for name, x in texture.named_parameters())
+    if poses is not None:
+        yield from ((f"poses.{name}", x) for name, x in poses.named_parameters())
 
 
-def learned_tensors(surfels: Surfels, texture: NeuralTexture) -> dict[str, torch.Tensor]:
+def watched_tensors(
+    parameters: Mapping[str, torch.nn.Parameter], optimizer: torch.optim.Optimizer
+) -> dict[str, torch.Tensor]:
+    """Return the tensors that must stay finite, by the names that a report gives them.
+
+    Args:
+        parameters: by their names in a checkpoint.
+        optimizer: whose state counts, too: gradients are freed, but one that is not finite shows there.
+    """
+    watched: dict[str, torch.Tensor] = {}
+    moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
+    for name, parameter in parameters.items():
+        for key, value in optimizer.state.get(parameter, {}).items():
+            if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
+                watched[f"{moments.get(key, key)} of {name}"] = value
+        watched[name] = parameter
+    return watched
+
+
+def learned_tensors(
+    surfels: Surfels, texture: NeuralTexture, poses: PoseCorrections | None = None
+) -> dict[str, torch.Tensor]:
     """Return what is learned by its names in a checkpoint, and the texture's buffers."""
     tensors = {f"surfels.{name}": x for name, x in surfels.state_dict().items()}
-    return tensors | {f"texture.{name}": x for name, x in texture.state_dict().items()}
+    tensors |= {f"texture.{name}": x for name, x in texture.state_dict().items()}
+    return tensors if poses is None else tensors | {f"poses.{name}": x for name, x in poses.state_dict().items()}
 
 
 def part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
@@ -27,7 +28,7 @@ from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
-from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
+from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, texture_shape
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
@@ -43,10 +44,11 @@ from nexwarp.train.state import (
     restore_optimizer,
     restore_random,
     scene_digest,
+    watched_tensors,
 )
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
-from nexwarp.train.target import Target, TargetMaker
-from nexwarp.train.views import TrainingViews, mean_color
+from nexwarp.train.target import Target, TargetMaker, refined
+from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
 CHECK_EVERY = 100
@@ -69,6 +71,7 @@ class Trainer:
         densifier: density control.
         views: the training views on the device.
         exposures: of the training photos; None where they have one exposure.
+        poses: corrections of the training poses; None where they are not refined.
         background: colour behind everything, three numbers.
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
@@ -109,16 +112,16 @@ class Trainer:
         self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
-        self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer)
+        self.poses = initial_poses(scene, config, self.device)
+        self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer, self.poses)
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
-        self.iteration, self.seconds = 0, 0.0
+        self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
         self.order: list[int] = []
         self.exposures: Exposures | None = None if calibration is None else calibration.exposures
         gains = None if calibration is None else calibration.gains
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
-        self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise)
-        self.rate_factor = 1.0
+        self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise, self.poses)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
@@ -194,6 +197,7 @@ class Trainer:
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         try:
+            target = refined(target, self.poses)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             losses = step_losses(
@@ -204,6 +208,7 @@ class Trainer:
                 self.config,
                 cells_unit=self.cells_unit,
                 own=self.own_losses,
+                poses=self.poses,
             )
             request = None
             if self.densifier.active(self.iteration):
@@ -212,6 +217,8 @@ class Trainer:
             reduce(torch.add, losses.values()).backward()
             with updating():
                 self.optimizer.step()
+                if self.poses is not None:
+                    self.poses.keep_gauge()
                 if request is not None and request.sums_after_backward is not None:
                     self.densifier.accumulate(request.sums_after_backward)
         finally:
@@ -241,9 +248,15 @@ class Trainer:
     def _remove_floaters(self, last: bool) -> None:
         # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
         # A generator of its own: a search that finds no floaters changes nothing.
-        generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last)
+        own = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
+        chosen = floaters(self.model(), self.cameras, self._nearest, own, last=last)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of the training views as they are now, on the device."""
+        given = self.views.cameras
+        return given if self.poses is None else self.poses.cameras(given)
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
@@ -274,7 +287,9 @@ class Trainer:
         config = self.config
         settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
-            return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
+            cameras = self.cameras
+            views = with_cameras(self.scene.train, cameras)
+            return finish_model(self.model(), views, cameras, self.exposures, settings, observe)
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
@@ -285,16 +300,8 @@ class Trainer:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        """Return all tensors that must stay finite, by the names that a report gives them."""
-        watched: dict[str, torch.Tensor] = {}
-        moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
-        for name, parameter in self._named_parameters():
-            # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
-                    watched[f"{moments.get(key, key)} of {name}"] = value
-            watched[name] = parameter
-        return watched | {"densify.errors": self.densifier.errors}
+        tensors = watched_tensors(dict(self._named_parameters()), self.optimizer)
+        return tensors | {"densify.errors": self.densifier.errors}
 
     def save(self, run: Path) -> None:
         """Write a checkpoint: everything that shapes the future of the run.
@@ -348,7 +355,7 @@ class Trainer:
         """Return everything that shapes the future of the run, as copies on the CPU."""
         moments, optimizer = gather_optimizer(self.optimizer, dict(self._named_parameters()))
         numbers, generators = gather_random(self.generator, self.noise, self.device)
-        tensors = learned_tensors(self.surfels, self.texture) | moments
+        tensors = learned_tensors(self.surfels, self.texture, self.poses) | moments
         tensors |= {"densify.errors": self.densifier.errors, **numbers}
         state = {
             "iteration": self.iteration,
@@ -369,7 +376,10 @@ class Trainer:
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
-        self.optimizer = make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer)
+        if self.poses is not None:
+            self.poses.load(tensors["poses.corrections"])
+        made = (self.config, self.scene.scale, self.own_optimizer, self.poses)
+        self.optimizer = make_optimizer(self.surfels, self.texture, *made)
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:
@@ -387,4 +397,4 @@ class Trainer:
         return scene_digest(self.scene, self.texture)
 
     def _named_parameters(self) -> Iterator[tuple[str, torch.nn.Parameter]]:
-        return named_parameters(self.surfels, self.texture)
+        return named_parameters(self.surfels, self.texture, self.poses)

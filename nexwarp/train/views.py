@@ -4,6 +4,7 @@ import copy
 import hashlib
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 
@@ -147,6 +148,11 @@ class TrainingViews:
             return pixels
         small = torch.nn.functional.avg_pool2d(pixels.permute(2, 0, 1), factor)
         return small.permute(1, 2, 0).contiguous()
+
+
+def with_cameras(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]:
+    """Return views with other cameras, which may be on any device."""
+    return [replace(view, camera=camera.to("cpu")) for view, camera in zip(views, cameras, strict=True)]
 
 
 def mean_color(views: list[View], calibration: ExposureCalibration | None = None) -> tuple[float, float, float]:
