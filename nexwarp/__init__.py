@@ -9,6 +9,7 @@ os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
@@ -34,6 +35,7 @@ __all__ = [
     "Exposures",
     "Model",
     "NeuralTexture",
+    "RayCamera",
     "RenderOptions",
     "Rendering",
     "Scene",

@@ -54,36 +54,58 @@ def _last_row(like: torch.Tensor) -> torch.Tensor:
     return last
 
 
+def corrected(viewmat: torch.Tensor, twist: torch.Tensor, pivot: torch.Tensor) -> torch.Tensor:
+    """Return a viewmat (4, 4) after a small motion (6,) about a point on its optical axis; differentiable.
+
+    About a point of the scene, a turn and a shift change an image in different ways. About the camera's own centre both
+    move the image sideways, which gradient descent cannot tell apart.
+
+    Args:
+        viewmat: (4, 4) world to camera.
+        twist: (6,) radians, and a shift in world units.
+        pivot: () z-depth of the point, world units.
+    """
+    motion = rigid_motion(twist)
+    ahead = torch.cat([torch.zeros_like(twist[:2]), pivot[None]])
+    shift = motion[:3, 3] + ahead - motion[:3, :3] @ ahead
+    return torch.cat([torch.cat([motion[:3, :3], shift[:, None]], 1), motion[3:]]) @ viewmat
+
+
 class PoseCorrections(nn.Module):
-    """Rigid corrections of V cameras: a camera's viewmat becomes exp(correction) viewmat.
+    """Rigid corrections of V cameras, about points of the scene that they see; see `corrected`.
 
     The photos determine poses up to a similarity of the world: a common rotation, shift and scale of all cameras and
     surfels changes no rendering (the gauge). `keep_gauge` removes from the corrections what is such a common motion, to
     first order, so that the corrected cameras stay where the given ones are, and with them the test cameras.
 
     Attributes:
-        corrections: (V, 6) parameter, twists in the cameras' frames: radians, and shifts in units of `scale`.
+        corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`.
         scale: world units.
 
     Buffers, not saved:
         gauge: (6 V, G) orthonormal directions that change no rendering, G <= 7.
+        pivots: (V,) z-depths of the points about which the corrections turn, world units.
     """
 
     gauge: torch.Tensor
+    pivots: torch.Tensor
 
-    def __init__(self, cameras: Sequence[Camera], scale: float) -> None:
+    def __init__(self, cameras: Sequence[Camera], scale: float, depths: Sequence[float] | None = None) -> None:
         """Start with no correction.
 
         Args:
             cameras: the V given cameras.
             scale: of the scene, world units > 0.
+            depths: V typical z-depths of what the cameras see, world units > 0; None is `scale`.
         """
         super().__init__()
         check_range("scale", scale, 1e-30, 1e30)
         self.scale = scale
         self.corrections = nn.Parameter(torch.zeros(len(cameras), 6))
         viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
-        self.register_buffer("gauge", _gauge_directions(viewmats, scale).float(), persistent=False)
+        pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
+        self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float(), persistent=False)
+        self.register_buffer("pivots", pivots.float(), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
         """Return the corrected viewmat (4, 4) of a view; differentiable.
@@ -92,8 +114,11 @@ class PoseCorrections(nn.Module):
             given: (4, 4) the given viewmat.
             view: index of the camera, a number or a (1,) int64 tensor.
         """
-        twist = self.corrections[view] if isinstance(view, int) else self.corrections.index_select(0, view)[0]
-        return rigid_motion(torch.cat([twist[:3], self.scale * twist[3:]])) @ given
+        if isinstance(view, int):
+            twist, pivot = self.corrections[view], self.pivots[view]
+        else:
+            twist, pivot = self.corrections.index_select(0, view)[0], self.pivots.index_select(0, view)[0]
+        return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), pivot)
 
     def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
         """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
@@ -121,15 +146,18 @@ class PoseCorrections(nn.Module):
         self.corrections.data.copy_(corrections)
 
 
-def _gauge_directions(viewmats: torch.Tensor, scale: float) -> torch.Tensor:
+def _gauge_directions(viewmats: torch.Tensor, pivots: torch.Tensor, scale: float) -> torch.Tensor:
     """Orthonormal basis (6 V, G) of the corrections that a similarity of the world makes, to first order."""
     rotations, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
     centers = -(rotations.mT @ shifts[..., None])[..., 0]
     offsets = centers - centers.mean(0)  # about the cameras' middle: turns and shifts are then of like size
+    forward = torch.tensor([[0.0, 0.0, 1.0]], dtype=viewmats.dtype)
     columns = []
     for axis in torch.eye(3, dtype=viewmats.dtype):
         turned = rotations @ axis
-        moved = -(rotations @ torch.linalg.cross(axis.expand_as(offsets), offsets)[..., None])[..., 0]
+        moved = (rotations @ torch.linalg.cross(axis.expand_as(offsets), offsets)[..., None])[..., 0]
+        # The same motion, written about the pivots instead of the cameras' centres.
+        moved = moved - torch.linalg.cross(pivots[:, None] * forward, turned)
         columns += [torch.cat([turned, moved / scale], -1), torch.cat([torch.zeros_like(turned), turned], -1)]
     outward = -(rotations @ offsets[..., None])[..., 0] / scale
     columns.append(torch.cat([torch.zeros_like(outward), outward], -1))

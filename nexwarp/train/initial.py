@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from nexwarp.data import Scene, initial_points
+from nexwarp.data import Scene, View, initial_points
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
@@ -83,7 +83,16 @@ def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCor
     """Return corrections of 0 for the training poses, on a device; None where poses are not refined."""
     if not config.refine_poses:
         return None
-    return PoseCorrections([view.camera for view in scene.train], scene.scale).to(device)
+    depths = [_typical_depth(view, scene) for view in scene.train]
+    return PoseCorrections([view.camera for view in scene.train], scene.scale, depths).to(device)
+
+
+def _typical_depth(view: View, scene: Scene) -> float:
+    """Return the median z-depth of the points in front of a view's camera, world units; without any, the scale."""
+    points = scene.points if view.points is None or not len(view.points) else view.points
+    depths = view.camera.project(points)[1]
+    depths = depths[depths > view.camera.near]
+    return depths.median().item() if len(depths) else scene.scale
 
 
 def texture_shape(scene: Scene, config: Config) -> TextureShape:

@@ -1,0 +1,191 @@
+"""Pose refinement: the motions, the gauge, that a run can stop and go on, and that disturbed poses come back."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cli import main as cli
+from nexwarp.data import Scene, demo_folder
+from nexwarp.io.pictures import to_uint8
+from nexwarp.representation.poses import PoseCorrections, pose_differences, rigid_motion
+from nexwarp.run.evaluate import evaluate
+from nexwarp.run.fit_poses import fit_poses
+from nexwarp.train import presets
+from nexwarp.train.config import LearningRates
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.schedules import make_optimizer
+from nexwarp.train.settings import with_settings
+from nexwarp.train.trainer import Trainer
+from nexwarp.train.views import with_cameras
+from tests.cli.support import FLAGS, SMALL
+from tests.tolerances import assert_close
+from tests.trainer_support import assert_same_state, small, trained
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+
+RATES = dataclasses.replace(nw.Config().rates, poses=(1e-3, 1e-4))
+
+
+def disturbed(scene: Scene, degrees: float = 0.5, size: float = 0.01) -> Scene:
+    """A scene whose poses are off by an angle about a random axis, and by a share of its size in a random direction."""
+    generator = torch.Generator().manual_seed(7)
+    views = [*scene.train, *scene.test]
+    turns, shifts = torch.nn.functional.normalize(torch.randn(2, len(views), 3, generator=generator), dim=-1)
+    twists = torch.cat([turns * degrees * torch.pi / 180, shifts * size], dim=-1)
+    moved = [
+        *moved_by(scene.train, twists, scene.scale),
+        *moved_by(scene.test, twists[len(scene.train) :], scene.scale),
+    ]
+    return dataclasses.replace(scene, train=moved[: len(scene.train)], test=moved[len(scene.train) :])
+
+
+def moved_by(views: list[nw.View], twists: torch.Tensor, scale: float) -> list[nw.View]:
+    poses = PoseCorrections([view.camera for view in views], scale)
+    poses.load(twists[: len(views)])
+    return with_cameras(views, poses.cameras([view.camera for view in views]))
+
+
+def poses_of(cameras: list[nw.Camera]) -> torch.Tensor:
+    return torch.stack([camera.viewmat for camera in cameras])
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 3.1])
+def test_rigid_motion_is_the_exponential_of_its_twist(angle):
+    twist = torch.randn(2, 6, dtype=torch.float64)
+    twist[:, :3] *= angle / twist[:, :3].norm(dim=-1, keepdim=True)
+    generator = torch.zeros(2, 4, 4, dtype=torch.float64)
+    generator[:, :3, :3] = torch.linalg.cross(twist[:, None, :3].expand(2, 3, 3), torch.eye(3).double()[None]).mT
+    generator[:, :3, 3] = twist[:, 3:]
+    assert_close(rigid_motion(twist), torch.linalg.matrix_exp(generator), kind="value", name="motion")
+    assert torch.autograd.gradcheck(rigid_motion, twist.requires_grad_())
+
+
+def test_a_common_motion_and_scale_of_all_cameras_is_no_correction(tiny_scene):
+    given = [view.camera for view in tiny_scene.train]
+    poses = PoseCorrections(given, tiny_scene.scale)
+    assert poses.gauge.shape == (6 * len(given), 7)
+    small_motion, scaling = 1e-3 * torch.randn(6, dtype=torch.float64), 1.001
+    twists = []
+    for camera in given:
+        viewmat = camera.viewmat.double()
+        moved = viewmat @ rigid_motion(small_motion)  # of the world
+        moved[:3, 3] *= scaling
+        change = moved @ torch.linalg.inv(viewmat)
+        turn = 0.5 * (change[:3, :3] - change[:3, :3].mT)
+        twists.append(torch.stack([turn[2, 1], turn[0, 2], turn[1, 0], *(change[:3, 3] / tiny_scene.scale)]))
+    common = torch.stack(twists).float()
+    own = 1e-3 * torch.randn(len(given), 6)
+    poses.load(own)
+    poses.keep_gauge()
+    own = poses.corrections.detach().clone()
+    poses.load(own + common)
+    poses.keep_gauge()
+    assert (poses.corrections - own).norm() < 0.02 * common.norm()  # what is left is of second order
+    alone = PoseCorrections(given[:1], tiny_scene.scale)
+    alone.load(torch.randn(1, 6))
+    alone.keep_gauge()
+    assert alone.corrections.abs().max() < 1e-5  # a single camera has no pose of its own to refine
+
+
+def test_resuming_a_refinement_changes_nothing(tiny_scene, tmp_path):
+    config = small(refine_poses=True, rates=RATES)
+    straight = trained(tiny_scene, config)
+    assert straight.poses is not None and straight.poses.corrections.abs().max() > 1e-4
+    first, second = Trainer(tiny_scene, config, "cpu"), Trainer(tiny_scene, config, "cpu")
+    for _ in range(7):
+        first.step()
+    first.save(tmp_path)
+    second.restore(tmp_path)
+    assert_same_state(second, first)
+    second.run()
+    assert_same_state(second, straight)
+
+
+def test_border_steps_leave_poses_alone(tiny_scene):
+    trainer = Trainer(tiny_scene, small(refine_poses=True, rates=RATES, border_every=1, coarse=0.0), "cpu")
+    trainer.step()
+    assert trainer.poses is not None and trainer.poses.corrections.abs().max() == 0.0
+
+
+def photographed(scene: Scene, model: nw.Model) -> Scene:
+    """A scene with the model's renderings as its photos."""
+
+    def taken(view: nw.View) -> nw.View:
+        image = to_uint8(model.render(view.camera).image.detach())
+        return dataclasses.replace(view, image=image)
+
+    return dataclasses.replace(scene, train=[*map(taken, scene.train)], test=[*map(taken, scene.test)])
+
+
+@pytest.fixture(scope="module")
+def model(tiny_scene: Scene) -> nw.Model:
+    """Of a short training: its renderings stand for photos, so that the true poses fit them exactly."""
+    return trained(tiny_scene, small(iterations=60, max_surfels=400, exposures=False)).model()
+
+
+def test_disturbed_poses_come_back_in_training(tiny_scene, model):
+    """With surfels that are right, the training poses return to the true ones, up to the gauge."""
+    still = {f.name: 0.0 for f in dataclasses.fields(RATES)} | dict.fromkeys(("means", "grid", "mlp"), (0.0, 0.0))
+    rates = LearningRates(**still | {"poses": (2e-3, 2e-4)})
+    config = small(iterations=200, refine_poses=True, exposures=False, rates=rates, border=0.0, depth_jitter=0.0)
+    config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False), sh_every=1)
+    scene = photographed(tiny_scene, model)
+    # Surfels that stand still hold the gauge at the true one: so no pose is off by what all are off by.
+    given = PoseCorrections([view.camera for view in scene.train], scene.scale)
+    given.load(0.01 * torch.randn(len(scene.train), 6))
+    given.keep_gauge()
+    wrong = dataclasses.replace(scene, train=moved_by(scene.train, given.corrections.detach(), scene.scale))
+    trainer = Trainer(wrong, config, "cpu")
+    trainer.surfels = nw.Surfels({name: x.clone() for name, x in model.surfels.state_dict().items()})
+    trainer.texture.load_state_dict(model.texture.state_dict())
+    trainer.optimizer = make_optimizer(trainer.surfels, trainer.texture, config, tiny_scene.scale, poses=trainer.poses)
+    trainer.densifier.errors = torch.zeros(len(trainer.surfels))
+    true = poses_of([view.camera for view in tiny_scene.train])
+    before = pose_differences(poses_of(trainer.cameras), true)[0].mean()
+    trainer.run()
+    after = pose_differences(poses_of(trainer.cameras), true)[0].mean()
+    assert before > 0.4 and after < 0.3 * before, (before, after)
+
+
+def test_fitted_test_poses_come_back_and_the_model_stays(tiny_scene, model):
+    before = {name: x.clone() for name, x in model.state_dict().items()}
+    scene = photographed(tiny_scene, model)
+    wrong = disturbed(scene).test
+    fitted, facts = fit_poses(model, wrong, steps=40)
+    true = poses_of([view.camera for view in tiny_scene.test])
+    angles = [pose_differences(poses_of([v.camera for v in views]), true)[0].mean() for views in (wrong, fitted)]
+    assert angles[1] < 0.5 * angles[0]
+    assert evaluate(model, fitted)["psnr"] > evaluate(model, wrong)["psnr"] + 6
+    assert 0.3 < facts["mean_rotation_degrees"] < 0.7 and facts["steps"] == 40
+    assert all(torch.equal(x, before[name]) for name, x in model.state_dict().items())
+    assert all(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_the_command_line_refines_and_says_so(tiny_folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+    run = tmp_path / "run"
+    assert cli.main(["train", str(tiny_folder), "--run", str(run), *FLAGS, "--refine-poses"]) == 0
+    cameras = json.loads((run / "cameras.json").read_text())
+    entries = cameras["train"].values()
+    assert all("given_viewmat" in entry and entry["given_viewmat"] != entry["viewmat"] for entry in entries)
+    assert not any("given_viewmat" in entry for entry in cameras["test"].values())
+    assert "test_poses" not in json.loads((run / "metrics.json").read_text())
+    assert cli.main(["eval", str(run), "--refine-poses", "--device", "cpu"]) == 0
+    assert json.loads((run / "metrics.json").read_text())["test_poses"]["steps"] > 0
+    assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
+    assert "test_poses" not in json.loads((run / "metrics.json").read_text())
+
+
+@pytest.mark.slow
+def test_a_disturbed_demo_comes_back():
+    """Poses off by 0.5 degrees and 1 % of the scene's size: within 0.3 dB of the undisturbed run."""
+    scene = nw.load_scene(demo_folder())
+    wrong, config = disturbed(scene), with_settings(preset("default"), DEMO_SETTINGS)
+    plain = nw.train(scene, config, device="cpu")
+    refined = nw.train(wrong, dataclasses.replace(config, refine_poses=True), device="cpu")
+    expected = evaluate(plain, fit_poses(plain, scene.test)[0])["psnr"]
+    assert evaluate(refined, fit_poses(refined, wrong.test)[0])["psnr"] > expected - 0.3
