@@ -4,7 +4,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import tyro
 from rich.console import Console
@@ -23,6 +23,7 @@ from nexwarp.run.folder import (
     read_metrics,
     read_run,
 )
+from nexwarp.run.optics import Kind, Optics
 from nexwarp.run.render_job import RenderOrder
 from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.train.presets import preset
@@ -55,6 +56,18 @@ class Render:
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
+    camera: Annotated[str, option("{pinhole,panorama,fisheye,orthographic}")] = "pinhole"
+    """Projection. A panorama is equirectangular; pictures other than pinhole ones go to RUN/renders/CAMERA."""
+    fov: Annotated[float, option("DEGREES")] = 180.0
+    """Angle that the smaller side of a fisheye image shows."""
+    aperture: Annotated[float, option("DIAMETER")] = 0.0
+    """Diameter of the lens in world units, for depth of field; 0 is a pinhole."""
+    focus: Annotated[float | None, option("DEPTH", "median depth of each picture")] = None
+    """Depth of the plane in focus in world units, with --aperture."""
+    shutter: Annotated[float, option("SHARE")] = 0.0
+    """Share of a frame's time in which the shutter is open, for motion blur along a path; 0 to 1."""
+    samples: Annotated[int | None, option("N", "16")] = None
+    """Renderings that are averaged for each picture, with --aperture or --shutter."""
     exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
@@ -75,6 +88,7 @@ class Render:
             size=self.size,
             scale=self.scale,
             exposure=self.exposure,
+            optics=Optics(cast(Kind, self.camera), self.fov, self.aperture, self.focus, self.shutter, self.samples),
         )
         device = pick_device(self.device)
         model = load(self.run).to(device)

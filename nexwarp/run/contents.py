@@ -28,6 +28,7 @@ TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
 RENDERS_FOLDER = "renders"
 TRAIN, TEST, COMPARE = "train", "test", "compare"
 FILE_PATH = "path_{}"  # folder of the frames of a path from a file
+PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures of other cameras than pinholes
 
 OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
 
@@ -39,7 +40,8 @@ PATTERN = re.compile(
             *map(re.escape, ROOT_FILES),
             re.escape(CAMERA_PATH).replace(r"\{\}", r"[1-9]\d*"),
             *(re.escape(f"{EXPORT_FOLDER}/{name}") for name in EXPORTS),
-            rf"{RENDERS_FOLDER}/(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
+            rf"{RENDERS_FOLDER}/(?:(?:{'|'.join(PROJECTIONS)})/)?"
+            rf"(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
         ]
     )
 )
@@ -158,7 +160,7 @@ def _view_pictures(run: Path) -> set[str]:
     pictures = {Path(picture_name(view)) for view in views if Path(view).name}
     return {
         f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
-        for group in (TRAIN, TEST, COMPARE)
+        for group in (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
         for picture in pictures
         for suffix in (".png", ".exr")
     }

@@ -41,7 +41,7 @@ class LearningRates:
     """First and last learning rate of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """First and last learning rate of the MLP."""
-    poses: tuple[float, float] = (1e-4, 1e-6)
+    poses: tuple[float, float] = (2e-4, 2e-6)
     """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
 
     def __post_init__(self) -> None:
