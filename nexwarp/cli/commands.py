@@ -107,23 +107,35 @@ class Export:
     --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
     splatting open: the surfels as Gaussians, without the texture.
 
+    --format mesh writes mesh.ply: a triangle mesh with colours, from the depths of the training views.
+
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
     """
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,cameras}")] = "ply"
+    format: Annotated[str, option("{ply,mesh,cameras}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
     """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
     Gaussians; inf splits none."""
+    voxel: Annotated[float | None, option("LENGTH", "1.5 pixels of the photos at their median depth")] = None
+    """Resolution of the mesh in world units."""
+    far: Annotated[float | None, option("DEPTH", "3 scene scales")] = None
+    """The mesh leaves out what is farther from each camera than this, in world units."""
+    device: Device_ = None
+    """Device to render on for the mesh."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        for file in export_run(self.run, self.format, self.out or self.run / EXPORT_FOLDER, self.max_extent):
+        device, folder = pick_device(self.device), self.out or self.run / EXPORT_FOLDER
+        sizes = {"voxel": self.voxel, "far": self.far}
+        with display.stages(console) as observe:
+            files = export_run(self.run, self.format, folder, self.max_extent, **sizes, device=device, observe=observe)
+        for file in files:
             console.print(str(file), soft_wrap=True)
 
 

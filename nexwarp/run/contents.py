@@ -22,7 +22,7 @@ CAMERA_PATH = "camera_path_{}.json"
 TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
 EXPORT_FOLDER = "export"
-SURFELS_FILE, SPLATS_FILE = "surfels.ply", "splats.ply"
+SURFELS_FILE, SPLATS_FILE, MESH_FILE = "surfels.ply", "splats.ply", "mesh.ply"
 TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
 
 RENDERS_FOLDER = "renders"
@@ -33,7 +33,7 @@ PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures
 OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
 
 ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE)
-EXPORTS = (SURFELS_FILE, SPLATS_FILE, TRANSFORMS_FILE, CAMERA_PATH_FILE)
+EXPORTS = (SURFELS_FILE, SPLATS_FILE, MESH_FILE, TRANSFORMS_FILE, CAMERA_PATH_FILE)
 PATTERN = re.compile(
     "|".join(
         [

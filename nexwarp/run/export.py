@@ -3,26 +3,42 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from nexwarp.camera import resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
+from nexwarp.run.contents import CAMERA_PATH_FILE, MESH_FILE, SPLATS_FILE, SURFELS_FILE, TRAIN, TRANSFORMS_FILE
 from nexwarp.run.folder import read_run
+from nexwarp.run.mesh import Progress, extract_mesh, save_mesh
 
-FORMATS = ("ply", "cameras")
+FORMATS = ("ply", "mesh", "cameras")
 
 
-def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
+def export_run(
+    run: Path,
+    kind: str,
+    folder: Path,
+    max_extent: float = MAX_EXTENT,
+    *,
+    voxel: float | None = None,
+    far: float | None = None,
+    device: torch.device | str = "cpu",
+    observe: Progress = lambda *_: None,
+) -> Sequence[Path]:
     """Export a run to a folder; docs/outputs.md describes the files.
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
+        kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply) or "cameras" (transforms.json, camera_path.json).
         folder: output folder, created if it does not exist.
         max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        voxel, far: of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        device: where to render for the mesh.
+        observe: progress of the mesh.
 
     Returns:
         The files that were written.
@@ -33,8 +49,17 @@ def export_run(run: Path, kind: str, folder: Path, max_extent: float = MAX_EXTEN
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
-        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+        raise SettingError(f"--format: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {kind!r}")
+    if kind != "mesh" and (voxel is not None or far is not None):
+        raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {kind}")
     source, _, _ = read_run(run)
+    if kind == "mesh":
+        trained = load_cameras(run / CAMERAS_FILE).get(TRAIN, {})
+        if not trained:
+            raise RunError(f"{run / CAMERAS_FILE}: expected training cameras, found none")
+        model = load(run).to(device)
+        save_mesh(folder / MESH_FILE, extract_mesh(model, [*trained.values()], voxel=voxel, far=far, observe=observe))
+        return [folder / MESH_FILE]
     if kind == "ply":
         model = load(run)
         files = [folder / SURFELS_FILE, folder / SPLATS_FILE]

@@ -19,7 +19,7 @@ from nexwarp.model.model import Model
 from nexwarp.representation.poses import corrected, pose_differences
 
 STEPS = 80  # of each view; the first half sees the photo at half its size
-RATE = 2e-3  # Adam's first learning rate: radians, and shifts in scene scales
+RATE = 5e-3  # Adam's first learning rate: radians, and shifts in scene scales
 LAST_RATE = 0.02  # the last rate, relative to the first
 
 
