@@ -36,7 +36,8 @@ def export_run(
         kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply) or "cameras" (transforms.json, camera_path.json).
         folder: output folder, created if it does not exist.
         max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
-        voxel, far: of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        far: farthest depth of the mesh, likewise.
         device: where to render for the mesh.
         observe: progress of the mesh.
 
