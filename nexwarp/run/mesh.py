@@ -131,11 +131,12 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
         cells = _all_corners(sure)
         if cells.any() and volume[sure].min() < 0 < volume[sure].max():
             volume = np.where(sure, volume, 1.0)
-            vertices, triangles, normals, _ = marching_cubes(volume, 0.0, gradient_direction="ascent")
+            vertices, triangles, normals, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
             at = np.minimum(vertices[triangles].mean(1).astype(int), side - 1)
             triangles = triangles[cells[at[:, 0], at[:, 1], at[:, 2]]]
             shades = np.stack([map_coordinates(c, vertices.T, order=1, mode="nearest") for c in colors(b)], -1)
-            parts.append((vertices + corners[b] * side, normals, shades, triangles + total))
+            # The normals are those of a volume that falls outwards.
+            parts.append((vertices + corners[b] * side, -normals, shades, triangles + total))
             total += len(vertices)
         if b % 256 == 255 or b + 1 == count:
             observe("marching cubes", b + 1, count)
