@@ -94,9 +94,11 @@ def test_what_cannot_be_a_mesh_is_named(monkeypatch):
     scene = scenes.random_scene(20)
     model = nw.Model(scenes.make_surfels(scene), None, options=nw.RenderOptions(max_hits=0))
     camera = scenes.make_camera(scene)
-    for options in ({"voxel": 0.0}, {"voxel": float("nan")}, {"far": -1.0}):
-        with pytest.raises(SettingError, match=f"--{next(iter(options))}: expected a length above 0"):
-            extract_mesh(model, [camera], **options)
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(SettingError, match="--voxel: expected a length above 0"):
+            extract_mesh(model, [camera], voxel=wrong)
+        with pytest.raises(SettingError, match="--far: expected a length above 0"):
+            extract_mesh(model, [camera], far=wrong)
     with pytest.raises(SettingError, match="--voxel: expected a side whose blocks"):
         monkeypatch.setattr("nexwarp.run.mesh.MOST_BLOCKS", 3)
         extract_mesh(model, [camera], voxel=0.01)

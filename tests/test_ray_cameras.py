@@ -161,7 +161,7 @@ def test_an_orthographic_view_is_a_pinhole_far_away():
     ("make", "match"),
     [
         (lambda v: nw.RayCamera.panorama(v, 2), "width: expected"),
-        (lambda v: nw.RayCamera.panorama(v, 8.0), "width: expected an int"),
+        (lambda v: nw.RayCamera.panorama(v, True), "width: expected an int"),
         (lambda v: nw.RayCamera.panorama(2 * v, 8), "viewmat: expected"),
         (lambda v: nw.RayCamera.fisheye(v, torch.eye(3), (0, 0), 8, 8), "distortion: expected k1"),
         (lambda v: nw.RayCamera.fisheye(v, torch.eye(3), (0, 0, 0, math.nan), 8, 8), "distortion: expected"),

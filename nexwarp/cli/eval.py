@@ -114,6 +114,6 @@ def evaluate_run(
     entries |= cast(dict[str, Json], results)
     entries.pop("test_poses", None)  # of an earlier evaluation
     if fitted is not None:
-        entries["test_poses"] = fitted
+        entries["test_poses"] = {**fitted}
     write_json(run / METRICS_FILE, entries)
     return entries

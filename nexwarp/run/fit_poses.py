@@ -14,7 +14,6 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.checks import check_range
 from nexwarp.data import View
-from nexwarp.io.json_files import Json
 from nexwarp.model.model import Model
 from nexwarp.representation.poses import corrected, pose_differences
 
@@ -29,7 +28,7 @@ def fit_poses(
     *,
     steps: int = STEPS,
     progress: Callable[[str], None] | None = None,
-) -> tuple[list[View], dict[str, Json]]:
+) -> tuple[list[View], dict[str, float]]:
     """Return views with the poses at which the model's renderings fit their photos best, and what was done.
 
     Args:
@@ -52,7 +51,7 @@ def fit_poses(
                 progress(view.name)
     poses = [torch.stack([view.camera.viewmat for view in group]) for group in (views, fitted)]
     angles, shifts = pose_differences(*poses)
-    facts: dict[str, Json] = {
+    facts: dict[str, float] = {
         "steps": steps,
         "mean_rotation_degrees": angles.mean().item(),
         "mean_shift_scene_scales": shifts.mean().item() / unit,
