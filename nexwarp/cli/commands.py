@@ -14,11 +14,12 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.errors import SettingError
 from nexwarp.model.model_file import MODEL_FILE, load
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
 from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
-from nexwarp.run.export import export_run
+from nexwarp.run.export import export_mesh, export_run
 from nexwarp.run.folder import (
     read_metrics,
     read_run,
@@ -109,32 +110,49 @@ class Export:
 
     --format mesh writes mesh.ply: a triangle mesh with colours, from the depths of the training views.
 
+    --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
+
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
+
+    --format web writes a web page that shows the scene in any browser, without an installation: as it is with WebGPU,
+    with its texture baked into an image elsewhere.
+
+    --format glb writes scene.glb for Blender, three.js and others (extra `glb`): the surfels as textured quads.
+
+    --format spz writes splats.spz, the Gaussians of splats.ply at a tenth of the size (extra `splats`).
     """
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,mesh,cameras}")] = "ply"
+    format: Annotated[str, option("{ply,mesh,compact,cameras,web,glb,spz}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
-    """Output folder."""
+    """Output folder. Of --format web, NAME.html writes one file with everything, which is also the default:
+    RUN/export/scene.html."""
+    quality: Annotated[str, option("{quantised,full}")] = "quantised"
+    """Of --format web: quantised files are a fifth to a half as large."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
-    Gaussians; inf splits none."""
+    """In splats.ply and splats.spz, surfels larger than this fraction of their distance to the nearest camera become
+    several Gaussians; inf splits none."""
     voxel: Annotated[float | None, option("LENGTH", "1.5 pixels of the photos at their median depth")] = None
     """Resolution of the mesh in world units."""
     far: Annotated[float | None, option("DEPTH", "3 scene scales")] = None
     """The mesh leaves out what is farther from each camera than this, in world units."""
     device: Device_ = None
-    """Device to render on for the mesh."""
+    """Device to render on for the mesh, and to bake the texture on, for web and glb."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
         device, folder = pick_device(self.device), self.out or self.run / EXPORT_FOLDER
-        sizes = {"voxel": self.voxel, "far": self.far}
-        with display.stages(console) as observe:
-            files = export_run(self.run, self.format, folder, self.max_extent, **sizes, device=device, observe=observe)
+        if self.format == "mesh":
+            with display.stages(console) as observe:
+                files = export_mesh(self.run, folder, device, voxel=self.voxel, far=self.far, observe=observe)
+        elif self.voxel is not None or self.far is not None:
+            raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
+        else:
+            with console.status("exporting"):
+                files = export_run(self.run, self.format, self.out, self.max_extent, self.quality, device)
         for file in files:
             console.print(str(file), soft_wrap=True)
 

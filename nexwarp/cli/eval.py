@@ -13,6 +13,7 @@ from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Run_, option
 from nexwarp.data import Scene
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
@@ -84,6 +85,7 @@ def evaluate_run(
     metrics: Sequence[str] = ("psnr", "ssim"),
     facts: dict[str, Json] | None = None,
     refine_poses: bool = False,
+    ranks: Ranks | None = None,
 ) -> dict[str, Json]:
     """Evaluate a model on its test views and write metrics.json.
 
@@ -96,6 +98,7 @@ def evaluate_run(
         metrics: see `evaluate`.
         facts: the file's entries beside the metrics; None keeps those of an existing file.
         refine_poses: fit the test poses first, see `fit_poses`; the file then has an entry `test_poses`.
+        ranks: see `evaluate`; this is rank 0.
 
     Returns:
         The entries of metrics.json.
@@ -107,8 +110,9 @@ def evaluate_run(
         with display.counting(console, "fitting test poses", len(scene.test)) as done:
             views, fitted = fit_poses(model, scene.test, progress=done)
     with display.counting(console, "evaluating", len(scene.test)) as done:
+        renders = run / RENDERS_FOLDER
         results = evaluate(
-            model, views, renders=run / RENDERS_FOLDER, mask_mode=mask_mode, metrics=metrics, progress=done
+            model, views, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
         )
     entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
     entries |= cast(dict[str, Json], results)

@@ -16,9 +16,12 @@ from nexwarp.cli.eval import Eval
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
+from nexwarp.distributed.launch import launch
+from nexwarp.distributed.liveness import end_process, may_speak
 from nexwarp.errors import NexwarpError
 from nexwarp.memory import needed_memory
 
+PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
     "eval": Eval,
@@ -89,33 +92,42 @@ def main(arguments: list[str] | None = None) -> int:
     command = _parse([argument for argument in given if argument != "--debug"])
     console = Console()
     try:
+        if isinstance(command, Train) and (count := command.starts()):
+            return launch(count, [*PROGRAM, *given])
         with stopped_by_signals():
             command(console)
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signal.SIGINT)
         hint = "; continue with --resume" if isinstance(command, Train) else ""
         _complain(f"{'interrupted' if number == signal.SIGINT else 'terminated'}{hint}", None)
-        return 128 + number
+        return end_process(128 + number)
     except Exception as error:
-        trace = error if debug else None
-        if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
-            _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
-            return 2
-        if isinstance(error, (NexwarpError, ValueError, OSError)):
-            _complain(f"error: {error}", trace)
-            return 2
-        if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
-            hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
-            _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
-            return 3
-        hint = "" if debug else "; --debug shows the traceback"
-        _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
-        return 3
+        return end_process(_tell(error, command, debug))
     return 0
 
 
+def _tell(error: Exception, command: Callable[[Console], None], debug: bool) -> int:
+    """Print one line about an error; return the exit code."""
+    trace = error if debug else None
+    if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
+        _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
+        return 2
+    if isinstance(error, (NexwarpError, ValueError, OSError)):
+        _complain(f"error: {error}", trace)
+        return 2
+    if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
+        hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
+        _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
+        return 3
+    hint = "" if debug else "; --debug shows the traceback"
+    _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
+    return 3
+
+
 def _complain(text: str, trace: Exception | None) -> None:
-    """Print one line on stderr, below the traceback of an error if one is given."""
+    """Print one line on stderr, below the traceback of an error if one is given; of several ranks, one does."""
+    if not may_speak():
+        return
     if trace is not None:
         traceback.print_exception(trace)
     line = " ".join(f"nexwarp: {text}".split())

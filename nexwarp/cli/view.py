@@ -11,7 +11,9 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Host_, Port_, Run_
 from nexwarp.model.model_file import load
+from nexwarp.run.export import run_title
 from nexwarp.run.folder import keep_camera_path, read_run
+from nexwarp.web.export import web_page
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -36,14 +38,17 @@ class ViewCommand:
 
         source, _, _ = read_run(self.run)
         model = load(self.run).to(pick_device(self.device))
+        cameras = load_cameras(self.run / CAMERAS_FILE)
+        named = {name: camera for views in cameras.values() for name, camera in views.items()}
         with Viewer(
             lambda: model,
-            load_cameras(self.run / CAMERAS_FILE),
+            cameras,
             near=near if isinstance(near := model.meta.get("near"), float) else 0.01,
             title=source.name,
             host=self.host,
             port=self.port,
             save_path=partial(keep_camera_path, self.run),
+            make_page=partial(web_page, model, named, run_title(source)),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

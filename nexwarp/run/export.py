@@ -5,41 +5,53 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import resized
+from nexwarp.bake.fit import bake
+from nexwarp.bake.glb import save_glb
+from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
-from nexwarp.model.model_file import load
+from nexwarp.model.model_file import load, save_model
+from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, MESH_FILE, SPLATS_FILE, SURFELS_FILE, TRAIN, TRANSFORMS_FILE
-from nexwarp.run.folder import read_run
+from nexwarp.run.contents import (
+    CAMERA_PATH_FILE,
+    COMPACT_FILE,
+    EXPORT_FOLDER,
+    GLB_FILE,
+    MESH_FILE,
+    SPLATS_FILE,
+    SPZ_FILE,
+    SURFELS_FILE,
+    TRAIN,
+    TRANSFORMS_FILE,
+    WEB_FILE,
+)
+from nexwarp.run.folder import SceneSource, read_run
 from nexwarp.run.mesh import Progress, extract_mesh, save_mesh
 
-FORMATS = ("ply", "mesh", "cameras")
+FORMATS = ("ply", "mesh", "compact", "cameras", "web", "glb", "spz")
 
 
 def export_run(
     run: Path,
     kind: str,
-    folder: Path,
+    folder: Path | None = None,
     max_extent: float = MAX_EXTENT,
-    *,
-    voxel: float | None = None,
-    far: float | None = None,
+    quality: str = "quantised",
     device: torch.device | str = "cpu",
-    observe: Progress = lambda *_: None,
 ) -> Sequence[Path]:
     """Export a run to a folder; docs/outputs.md describes the files.
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply) or "cameras" (transforms.json, camera_path.json).
-        folder: output folder, created if it does not exist.
-        max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
-        voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
-        far: farthest depth of the mesh, likewise.
-        device: where to render for the mesh.
-        observe: progress of the mesh.
+        kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply), "compact" (compact.safetensors), "cameras"
+            (transforms.json, camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
+        folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
+            in .html is one file with everything; None is `export/scene.html`.
+        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        quality: "quantised" or "full", of a web page.
+        device: renders what the texture is baked from, of "web" and "glb".
 
     Returns:
         The files that were written.
@@ -50,27 +62,74 @@ def export_run(
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
-        raise SettingError(f"--format: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {kind!r}")
-    if kind != "mesh" and (voxel is not None or far is not None):
-        raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {kind}")
+        raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
     source, _, _ = read_run(run)
+    if kind == "web":
+        from nexwarp.web.export import export_web
+
+        return export_web(
+            load(run).to(device),
+            _all_cameras(run),
+            folder or run / EXPORT_FOLDER / WEB_FILE,
+            quality=quality,
+            title=run_title(source),
+        )
+    folder = folder or run / EXPORT_FOLDER
     if kind == "mesh":
-        trained = load_cameras(run / CAMERAS_FILE).get(TRAIN, {})
-        if not trained:
-            raise RunError(f"{run / CAMERAS_FILE}: expected training cameras, found none")
-        model = load(run).to(device)
-        save_mesh(folder / MESH_FILE, extract_mesh(model, [*trained.values()], voxel=voxel, far=far, observe=observe))
-        return [folder / MESH_FILE]
-    if kind == "ply":
-        model = load(run)
-        files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
-        save_surfels_ply(files[0], model.surfels)
-        # A training that stopped early leaves a model, but no cameras file.
-        groups = load_cameras(run / CAMERAS_FILE).values() if (run / CAMERAS_FILE).is_file() else ()
-        all_cameras = [camera for members in groups for camera in members.values()]
-        degree = model.options.sh_degree
-        save_splats_ply(files[1], model.surfels, degree, cameras=all_cameras, max_extent=max_extent)
-        return files
+        return export_mesh(run, folder, device)
+    if kind == "cameras":
+        return _export_cameras(run, folder, source)
+    if kind == "compact":
+        return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
+    model, cameras = load(run), list(_all_cameras(run).values())
+    if kind == "glb":
+        if not cameras:
+            raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
+        return [folder / GLB_FILE]
+    degree = model.options.sh_degree
+    if kind == "spz":
+        save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        return [folder / SPZ_FILE]
+    files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
+    save_surfels_ply(files[0], model.surfels)
+    save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+    return files
+
+
+def export_mesh(
+    run: Path,
+    folder: Path,
+    device: torch.device | str = "cpu",
+    *,
+    voxel: float | None = None,
+    far: float | None = None,
+    observe: Progress = lambda *_: None,
+) -> Sequence[Path]:
+    """Write the mesh of a run, mesh.ply.
+
+    Args:
+        run: run folder.
+        folder: output folder, created if it does not exist.
+        device: where to render.
+        voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        far: farthest depth of the mesh, likewise.
+        observe: progress, likewise.
+
+    Raises:
+        ValueError, OSError: the message names the option or file.
+    """
+    read_run(run)
+    trained = load_cameras(run / CAMERAS_FILE).get(TRAIN, {})
+    if not trained:
+        raise RunError(f"{run / CAMERAS_FILE}: expected training cameras, found none")
+    mesh = extract_mesh(load(run).to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
+    save_mesh(folder / MESH_FILE, mesh)
+    return [folder / MESH_FILE]
+
+
+def _export_cameras(run: Path, folder: Path, source: SceneSource) -> Sequence[Path]:
+    """Write the cameras of a run for nerfstudio."""
     sets = load_cameras(run / CAMERAS_FILE)
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
@@ -85,3 +144,15 @@ def export_run(
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
     return files
+
+
+def _all_cameras(run: Path) -> dict[str, Camera]:
+    """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
+    if not (run / CAMERAS_FILE).is_file():
+        return {}
+    return {name: camera for members in load_cameras(run / CAMERAS_FILE).values() for name, camera in members.items()}
+
+
+def run_title(source: SceneSource) -> str:
+    """Return the name of a run's scene, as a title."""
+    return Path(source.path).name or "nexwarp"

@@ -1,5 +1,6 @@
 """State of a training: everything that shapes its future, gathered and put back bit for bit."""
 
+import dataclasses
 import hashlib
 import math
 import random
@@ -17,6 +18,9 @@ from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam
+from nexwarp.train.config import Config
+from nexwarp.train.presets import config_from_dict
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -44,25 +48,6 @@ def named_parameters(
     yield from ((f"texture.{name}", x) for name, x in texture.named_parameters())
     if poses is not None:
         yield from ((f"poses.{name}", x) for name, x in poses.named_parameters())
-
-
-def watched_tensors(
-    parameters: Mapping[str, torch.nn.Parameter], optimizer: torch.optim.Optimizer
-) -> dict[str, torch.Tensor]:
-    """Return the tensors that must stay finite, by the names that a report gives them.
-
-    Args:
-        parameters: by their names in a checkpoint.
-        optimizer: whose state counts, too: gradients are freed, but one that is not finite shows there.
-    """
-    watched: dict[str, torch.Tensor] = {}
-    moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
-    for name, parameter in parameters.items():
-        for key, value in optimizer.state.get(parameter, {}).items():
-            if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
-                watched[f"{moments.get(key, key)} of {name}"] = value
-        watched[name] = parameter
-    return watched
 
 
 def learned_tensors(
@@ -110,7 +95,7 @@ def gather_optimizer(
         {key: x for key, x in group.items() if key not in ("params", "lr", "ends") and _is_plain(x)}
         for group in optimizer.param_groups
     ]
-    return tensors, {"kind": type(optimizer).__name__, "values": plain, "groups": groups}
+    return tensors, {"kind": _kind(optimizer), "values": plain, "groups": groups}
 
 
 def restore_optimizer(
@@ -124,9 +109,9 @@ def restore_optimizer(
     Raises:
         ValueError: it was another kind of optimizer, or Adam's moments have other shapes than their parameters.
     """
-    kind = "Adam" if record is None else record["kind"]
-    if kind != type(optimizer).__name__ or (record is None) != _is_adam(optimizer):
-        raise ValueError(f"its optimizer is {kind}, expected {type(optimizer).__name__}")
+    kind, expected = "Adam" if record is None else record["kind"], _kind(optimizer)
+    if kind != expected or (record is None) != _is_adam(optimizer):
+        raise ValueError(f"its optimizer is {kind}, expected {expected}")
     for name, parameter in parameters.items():
         prefix = f"{_prefix(optimizer)}{name}."
         entries = part(tensors, prefix) if record is not None else known_part(tensors, prefix, ADAM_STATE)
@@ -147,7 +132,12 @@ def restore_optimizer(
 
 
 def _is_adam(optimizer: torch.optim.Optimizer) -> bool:
-    return type(optimizer) is torch.optim.Adam
+    return type(optimizer) in (torch.optim.Adam, FusedAdam)
+
+
+def _kind(optimizer: torch.optim.Optimizer) -> str:
+    """Name of an optimizer in a checkpoint; the two Adams have the same state."""
+    return torch.optim.Adam.__name__ if _is_adam(optimizer) else type(optimizer).__name__
 
 
 def _prefix(optimizer: torch.optim.Optimizer) -> str:
@@ -190,6 +180,25 @@ def restore_random(
     np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
+
+
+def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str) -> None:
+    """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
+
+    Args:
+        snapshot: as it was read.
+        config: settings.
+        views: fingerprint of the training views.
+        scene: digest of the scene.
+    """
+    state = snapshot.state
+    saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
+    if saved != config:
+        raise ValueError("its settings are others")
+    if state["views"] != views:
+        raise ValueError("it has seen other training views than the scene has")
+    if state["scene"] != scene:
+        raise ValueError("the scene's photos, masks or points have changed since")
 
 
 def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:

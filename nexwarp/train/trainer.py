@@ -1,6 +1,5 @@
 """Training: the loop of paper Sec. 4.3, as a class that the command line and `nexwarp.train` drive."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from functools import cached_property, reduce
@@ -8,32 +7,32 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
-from nexwarp.io.json_files import Json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
-from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
-from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, texture_shape
-from nexwarp.train.presets import config_from_dict
+from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
+from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
     Snapshot,
+    check_origin,
     check_snapshot,
     checkpoint_bytes,
     gather_optimizer,
@@ -44,7 +43,6 @@ from nexwarp.train.state import (
     restore_optimizer,
     restore_random,
     scene_digest,
-    watched_tensors,
 )
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker, refined
@@ -76,6 +74,8 @@ class Trainer:
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
         rate_factor: multiplies all learning rates; less than 1 after the run has gone back.
+        views_a_step: number of views of the last step: 1, or that of the ranks.
+        ranks: the processes that train together; here one.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Trainer:
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
         self.poses = initial_poses(scene, config, self.device)
-        self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer, self.poses)
+        self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
         self.order: list[int] = []
@@ -122,6 +122,7 @@ class Trainer:
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise, self.poses)
+        self.views_a_step, self.ranks = 1, Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
@@ -151,12 +152,12 @@ class Trainer:
             try:
                 start = time.perf_counter()
                 report = self.step()
-                if self.iteration == last and self.device.type == "cuda":
+                if self.iteration >= last and self.device.type == "cuda":
                     torch.cuda.synchronize(self.device)
                 self.seconds += time.perf_counter() - start
                 self.loss_log.note(self.iteration, report.losses)
-                keep = self.iteration % max(total // SNAPSHOTS, 1) == 0
-                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == last:
+                keep = report.passed(max(total // SNAPSHOTS, 1))
+                if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
                     self.check()
                 if keep:
                     self.good = self.snapshot()
@@ -176,68 +177,84 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
-            self.iteration += 1
-            target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+            target = self._next_target()
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
-            if self.graphs is None:
-                result = self._optimize(target)
-            else:
-                result = self.graphs.run(target, self._optimize, self._graph_key())
-            if self.densifier.due(self.iteration):
+            result = self._run_step(target)
+            if self.densifier.due(self.iteration, self.views_a_step):
                 self.densifier.step(self.surfels, self.optimizer, self.generator)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
-            return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            return StepReport(*report, self.views_a_step)
+
+    def _next_target(self) -> Target:
+        self.iteration += 1
+        return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
+        return make_optimizer(self.surfels, self.texture, *made)
 
     def _next_view(self) -> int:
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
+    def _run_step(self, target: Target) -> StepResult:
+        if self.graphs is None:
+            return self._optimize(target)
+        return self.graphs.run(target, self._optimize, self._graph_key())
+
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
+        fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             target = refined(target, self.poses)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
-            losses = step_losses(
-                taken,
-                target,
-                self.surfels,
-                self.texture,
-                self.config,
-                cells_unit=self.cells_unit,
-                own=self.own_losses,
-                poses=self.poses,
-            )
+            given = (taken, target, self.surfels, self.texture, self.config)
+            own, poses, grid = self.own_losses, self.poses, fused is None
+            losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
-            reduce(torch.add, losses.values()).backward()
-            with updating():
-                self.optimizer.step()
-                if self.poses is not None:
-                    self.poses.keep_gauge()
-                if request is not None and request.sums_after_backward is not None:
-                    self.densifier.accumulate(request.sums_after_backward)
+            self._weighted(reduce(torch.add, losses.values())).backward()
+            kept = self._update(None if request is None else request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room)
+        if kept is None and fused is not None and fused.grid_loss is not None:
+            losses["grid"], fused.grid_loss = fused.grid_loss, None
+        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room, kept)
+
+    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
+        return loss
+
+    def _update(self, errors: torch.Tensor | None) -> Gradients | None:
+        """Update the parameters by their gradients, and the densifier's sums by the errors (N,) of the step's view."""
+        with updating():
+            self.optimizer.step()
+            if self.poses is not None:
+                self.poses.keep_gauge()
+            if errors is not None:
+                self.densifier.accumulate(errors)
+        return None
 
     def _graph_key(self) -> Hashable:
         state = [self.densifier.errors]
         for _, parameter in self._named_parameters():
             kept = self.optimizer.state.get(parameter, {}).values()
             state += [parameter, *(x for x in kept if isinstance(x, torch.Tensor))]
-        return graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        key = graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        return key, self.texture.half_copy_key()
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
         densify = self.densifier.config
-        due = self.iteration % (FLOATERS_EVERY * densify.every) == 0 or self.iteration == self.config.iterations
+        due = self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
+        due |= self.iteration == self.config.iterations
         return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
@@ -248,31 +265,19 @@ class Trainer:
     def _remove_floaters(self, last: bool) -> None:
         # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
         # A generator of its own: a search that finds no floaters changes nothing.
-        own = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), self.cameras, self._nearest, own, last=last)
+        cameras = self.views.refined_cameras(self.poses)
+        generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
+        chosen = floaters(self.model(), cameras, self._nearest, generator, last=last, ranks=self.ranks)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """Cameras of the training views as they are now, on the device."""
-        given = self.views.cameras
-        return given if self.poses is None else self.poses.cameras(given)
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
-        return Model(self.surfels, self.texture, options=self.render_options(), meta=self._meta())
+        meta = model_facts(self.scene, self.config, self.iteration)
+        return Model(self.surfels, self.texture, options=self.render_options(), meta=meta)
 
     def render_options(self) -> RenderOptions:
         """Return how the scene is rendered at this point of the run."""
         return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
-
-    def _meta(self) -> dict[str, Json]:
-        return {
-            "near": self.scene.train[0].camera.near,
-            "scene_scale": self.scene.scale,
-            "preset": self.config.preset,
-            "iteration": self.iteration,
-        }
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model, with surfels of its own: smooth SH, detail limits and exposures, as configured.
@@ -284,10 +289,11 @@ class Trainer:
         """
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
+        self.texture.drop_half_copy()
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
-            cameras = self.cameras
+            cameras = self.views.refined_cameras(self.poses)
             views = with_cameras(self.scene.train, cameras)
             return finish_model(self.model(), views, cameras, self.exposures, settings, observe)
 
@@ -300,8 +306,8 @@ class Trainer:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        tensors = watched_tensors(dict(self._named_parameters()), self.optimizer)
-        return tensors | {"densify.errors": self.densifier.errors}
+        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
+        return state | {"densify.errors": self.densifier.errors}
 
     def save(self, run: Path) -> None:
         """Write a checkpoint: everything that shapes the future of the run.
@@ -313,7 +319,13 @@ class Trainer:
         self.check()
         if self.good is None or self.good.state["iteration"] != self.iteration:
             self.good = self.snapshot()
-        save_checkpoint(run, *self.good)
+        self._write(run, self.good)
+
+    def _write(self, run: Path, snapshot: Snapshot) -> None:
+        save_checkpoint(run, *snapshot)
+
+    def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
+        return Snapshot(*load_checkpoint(run, warn))
 
     def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
@@ -326,26 +338,15 @@ class Trainer:
             FileNotFoundError: there is none.
             ValueError: they are damaged, or scene, settings or optimizer differ.
         """
-        snapshot = Snapshot(*load_checkpoint(run, warn))
+        snapshot = self._read(run, warn)
         try:
-            self._check_origin(snapshot)
+            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
             told = one_line(found)  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
-
-    def _check_origin(self, snapshot: Snapshot) -> None:
-        """Raise ValueError unless a snapshot comes from a run of this scene with these settings."""
-        state = snapshot.state
-        saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=self.config.cuda_graphs)
-        if saved != self.config:
-            raise ValueError("its settings are others")
-        if state["views"] != self.views.fingerprint():
-            raise ValueError("it has seen other training views than the scene has")
-        if state["scene"] != self._scene_digest:
-            raise ValueError("the scene's photos, masks or points have changed since")
 
     def checkpoint_size(self) -> int:
         """Return how many bytes a checkpoint takes at most; the model takes less."""
@@ -378,8 +379,7 @@ class Trainer:
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
         if self.poses is not None:
             self.poses.load(tensors["poses.corrections"])
-        made = (self.config, self.scene.scale, self.own_optimizer, self.poses)
-        self.optimizer = make_optimizer(self.surfels, self.texture, *made)
+        self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:

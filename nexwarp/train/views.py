@@ -11,6 +11,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.data import View
 from nexwarp.representation.exposures import DECIMALS, Exposures
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.train.exposure_calibration import ExposureCalibration
 
 # Photos stay on the GPU when they take less than this share of its free memory.
@@ -62,6 +63,10 @@ class TrainingViews:
 
     def __len__(self) -> int:
         return len(self.photos)
+
+    def refined_cameras(self, poses: PoseCorrections | None) -> list[Camera]:
+        """Return the cameras on the device, with the poses as they are corrected; None corrects none."""
+        return self.cameras if poses is None else poses.cameras(self.cameras)
 
     def fingerprint(self) -> str:
         """Return a digest of the views' names and cameras."""
