@@ -73,17 +73,16 @@ class Viewer {
             onStage: stage => this.#stage(stage),
             onLost: reason => this.#lost(reason),
         };
-        let failure = null;
+        let failure = null, software = false;
         if (wanted !== "baked") {
             try {
                 const renderer = await Renderer.create(this.canvas, events);
                 this.renderer = renderer;
-                if (wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter)) {
-                    throw new SceneError("WebGPU runs on the CPU here, and there is no baked scene.");
-                }
+                software = wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter);
+                if (software) throw new SceneError("WebGPU runs on the CPU here.");
                 await renderer.load(SCENE_FILE);
             } catch (error) {
-                if (wanted === "webgpu") throw error;
+                if (wanted === "webgpu" || this.running) throw error;
                 failure = error;
             }
         }
@@ -96,7 +95,11 @@ class Viewer {
                 this.renderer = renderer;
                 await renderer.load(BAKED_FILE);
             } catch (error) {
-                throw failure && error.missing ? failure : error;
+                if (!failure || !error.missing) throw error;
+                if (!software) throw failure;
+                this.#freshCanvas();
+                await this.#load("webgpu");
+                return;
             }
         }
         this.#firstPicture();
