@@ -13,6 +13,7 @@ if "RANK" in os.environ:
 
 from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
@@ -38,6 +39,7 @@ __all__ = [
     "Exposures",
     "Model",
     "NeuralTexture",
+    "RayCamera",
     "RenderOptions",
     "Rendering",
     "Scene",

@@ -186,7 +186,7 @@ def render(
     """
     _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
     try:
-        background = _background(background, surfels.means)
+        background = color_tensor(background, surfels.means)
         _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
         values = (0, surfels.means.dtype) if texture is None else texture.stored_per_point(sh_degree)
         ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
@@ -296,7 +296,7 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
     return Activated(shape.means, shape.quats, *blurred)
 
 
-def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
+def color_tensor(background: Color, like: torch.Tensor) -> torch.Tensor:
     """Return the background as a (3,) tensor; a tensor keeps its graph."""
     if isinstance(background, torch.Tensor):
         if background.device.type == "cpu":

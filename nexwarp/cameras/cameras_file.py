@@ -18,8 +18,17 @@ CAMERAS_VERSION = 1  # of the file; one without `format_version` has version 1
 SETS = ("train", "test")
 
 
-def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> None:
+def save_cameras(
+    path: Path,
+    cameras: Mapping[str, Mapping[str, Camera]],
+    given: Mapping[str, Mapping[str, Camera]] | None = None,
+) -> None:
     """Write cameras as JSON: set ("train", "test") -> name -> camera.
+
+    Args:
+        path: file to write.
+        cameras: the cameras.
+        given: the same cameras before their poses were refined; those that differ are written, too.
 
     Raises:
         OSError: `path` cannot be written.
@@ -32,12 +41,20 @@ def save_cameras(path: Path, cameras: Mapping[str, Mapping[str, Camera]]) -> Non
                 "width": camera.width,
                 "height": camera.height,
                 "near": camera.near,
+                **_given(camera, None if given is None else given[group][name]),
             }
             for name, camera in members.items()
         }
         for group, members in cameras.items()
     }
     write_json(path, data)
+
+
+def _given(camera: Camera, given: Camera | None) -> dict[str, list[list[float]]]:
+    """Return the entry of the given pose of a camera whose pose was refined; nothing for any other camera."""
+    if given is None or torch.equal(given.viewmat.cpu(), camera.viewmat.cpu()):
+        return {}
+    return {"given_viewmat": given.viewmat.tolist()}
 
 
 def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:

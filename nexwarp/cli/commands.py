@@ -4,7 +4,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import tyro
 from rich.console import Console
@@ -14,15 +14,17 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.errors import SettingError
 from nexwarp.model.model_file import MODEL_FILE, load
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
-from nexwarp.run.contents import RENDERS_FOLDER
-from nexwarp.run.export import export_run
+from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
+from nexwarp.run.export import export_mesh, export_run
 from nexwarp.run.folder import (
     read_metrics,
     read_run,
 )
+from nexwarp.run.optics import Kind, Optics
 from nexwarp.run.render_job import RenderOrder
 from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.train.presets import preset
@@ -55,6 +57,18 @@ class Render:
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
+    camera: Annotated[str, option("{pinhole,panorama,fisheye,orthographic}")] = "pinhole"
+    """Projection. A panorama is equirectangular; pictures other than pinhole ones go to RUN/renders/CAMERA."""
+    fov: Annotated[float, option("DEGREES")] = 180.0
+    """Angle that the smaller side of a fisheye image shows."""
+    aperture: Annotated[float, option("DIAMETER")] = 0.0
+    """Diameter of the lens in world units, for depth of field; 0 is a pinhole."""
+    focus: Annotated[float | None, option("DEPTH", "median depth of each picture")] = None
+    """Depth of the plane in focus in world units, with --aperture."""
+    shutter: Annotated[float, option("SHARE")] = 0.0
+    """Share of a frame's time in which the shutter is open, for motion blur along a path; 0 to 1."""
+    samples: Annotated[int | None, option("N", "16")] = None
+    """Renderings that are averaged for each picture, with --aperture or --shutter."""
     exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
@@ -75,6 +89,7 @@ class Render:
             size=self.size,
             scale=self.scale,
             exposure=self.exposure,
+            optics=Optics(cast(Kind, self.camera), self.fov, self.aperture, self.focus, self.shutter, self.samples),
         )
         device = pick_device(self.device)
         model = load(self.run).to(device)
@@ -93,6 +108,8 @@ class Export:
     --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
     splatting open: the surfels as Gaussians, without the texture.
 
+    --format mesh writes mesh.ply: a triangle mesh with colours, from the depths of the training views.
+
     --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
 
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
@@ -108,7 +125,7 @@ class Export:
 
     run: Run_
     """Run folder."""
-    format: Annotated[str, option("{ply,compact,cameras,web,glb,spz}")] = "ply"
+    format: Annotated[str, option("{ply,mesh,compact,cameras,web,glb,spz}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder. Of --format web, NAME.html writes one file with everything, which is also the default:
@@ -118,14 +135,24 @@ class Export:
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
     """In splats.ply and splats.spz, surfels larger than this fraction of their distance to the nearest camera become
     several Gaussians; inf splits none."""
+    voxel: Annotated[float | None, option("LENGTH", "1.5 pixels of the photos at their median depth")] = None
+    """Resolution of the mesh in world units."""
+    far: Annotated[float | None, option("DEPTH", "3 scene scales")] = None
+    """The mesh leaves out what is farther from each camera than this, in world units."""
     device: Device_ = None
-    """Device to bake the texture on, for web and glb."""
+    """Device to render on for the mesh, and to bake the texture on, for web and glb."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        device = pick_device(self.device)
-        with console.status("exporting"):
-            files = export_run(self.run, self.format, self.out, self.max_extent, self.quality, device)
+        device, folder = pick_device(self.device), self.out or self.run / EXPORT_FOLDER
+        if self.format == "mesh":
+            with display.stages(console) as observe:
+                files = export_mesh(self.run, folder, device, voxel=self.voxel, far=self.far, observe=observe)
+        elif self.voxel is not None or self.far is not None:
+            raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
+        else:
+            with console.status("exporting"):
+                files = export_run(self.run, self.format, self.out, self.max_extent, self.quality, device)
         for file in files:
             console.print(str(file), soft_wrap=True)
 

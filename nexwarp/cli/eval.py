@@ -20,6 +20,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.run.contents import METRICS_FILE, RENDERS_FOLDER
 from nexwarp.run.evaluate import evaluate
+from nexwarp.run.fit_poses import fit_poses
 from nexwarp.run.folder import read_metrics, read_run
 from nexwarp.run.lock import locked_run
 
@@ -34,6 +35,8 @@ class Eval:
     """Folder of the scene, if it has moved."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
     """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
+    refine_poses: bool = False
+    """Fit each test pose to its photo before it is judged, the model fixed; metrics.json says so."""
     device: Device_ = None
     """Device to render on."""
 
@@ -48,9 +51,18 @@ class Eval:
                 source = dataclasses.replace(source, path=self.scene)
             with display.loading(console) as progress:
                 scene = source.load(progress)
-            results = evaluate_run(model, scene, self.run, console, mask_mode=config.mask_mode, metrics=self.metrics)
+            results = evaluate_run(
+                model,
+                scene,
+                self.run,
+                console,
+                mask_mode=config.mask_mode,
+                metrics=self.metrics,
+                refine_poses=self.refine_poses,
+            )
         rows = figures(results, self.metrics)
-        console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views"))
+        fitted = ", poses fitted to their photos" if self.refine_poses else ""
+        console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views{fitted}"))
 
 
 def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
@@ -72,6 +84,7 @@ def evaluate_run(
     mask_mode: str,
     metrics: Sequence[str] = ("psnr", "ssim"),
     facts: dict[str, Json] | None = None,
+    refine_poses: bool = False,
     ranks: Ranks | None = None,
 ) -> dict[str, Json]:
     """Evaluate a model on its test views and write metrics.json.
@@ -84,6 +97,7 @@ def evaluate_run(
         mask_mode: see `evaluate`.
         metrics: see `evaluate`.
         facts: the file's entries beside the metrics; None keeps those of an existing file.
+        refine_poses: fit the test poses first, see `fit_poses`; the file then has an entry `test_poses`.
         ranks: see `evaluate`; this is rank 0.
 
     Returns:
@@ -91,12 +105,19 @@ def evaluate_run(
     """
     if not scene.test:
         raise SceneError(f"{scene.path}: expected test views, found none")
+    views, fitted = scene.test, None
+    if refine_poses:
+        with display.counting(console, "fitting test poses", len(scene.test)) as done:
+            views, fitted = fit_poses(model, scene.test, progress=done)
     with display.counting(console, "evaluating", len(scene.test)) as done:
         renders = run / RENDERS_FOLDER
         results = evaluate(
-            model, scene.test, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
+            model, views, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
         )
     entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
     entries |= cast(dict[str, Json], results)
+    entries.pop("test_poses", None)  # of an earlier evaluation
+    if fitted is not None:
+        entries["test_poses"] = {**fitted}
     write_json(run / METRICS_FILE, entries)
     return entries

@@ -64,6 +64,8 @@ class Train:
     """Format of the scene, for a folder that holds several."""
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
+    refine_poses: bool = False
+    """Learn a small correction of each training pose, for poses that are not exact (docs/poses.md)."""
     preset: Preset_ = "default"
     """Settings to start from: nexwarp's defaults, those of the paper (docs/paper.md), or `web`, defaults with a smaller
     texture network for web pages on weak GPUs (docs/web.md)."""
@@ -243,6 +245,7 @@ class Train:
             "seed": self.seed,
             "mask_mode": self.mask_mode,
             "deterministic": self.deterministic or None,
+            "refine_poses": self.refine_poses or None,
         }
         given: dict[str, Json] = {name: value for name, value in flags.items() if value is not None}
         check_max_hits(self.max_hits)

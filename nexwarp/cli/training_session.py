@@ -184,8 +184,10 @@ class TrainingSession:
         file = save_model(run, finished)
         if self.ranks.size > 1:
             self.ranks.share_bytes(file.read_bytes())
-        sets = {TRAIN: scene.train, TEST: scene.test}
-        save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
+        given = {name: {v.name: v.camera for v in views} for name, views in ((TRAIN, scene.train), (TEST, scene.test))}
+        cameras = trainer.views.refined_cameras(trainer.poses)
+        refined = {TRAIN: dict(zip(given[TRAIN], cameras, strict=True))}
+        save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given=given)
         model = load(run).to(device)
         rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
         facts: dict[str, Json] = {

@@ -10,11 +10,13 @@ from torch import nn
 from typing_extensions import Unpack
 
 from nexwarp.camera import Camera
+from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
 from nexwarp.model import frames
 from nexwarp.model.options import RenderChanges, RenderOptions
-from nexwarp.render import Color, Rendering, render
+from nexwarp.model.render_rays import RayRendering, render_rays
+from nexwarp.render import Color, Rendering, color_tensor, render
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Surfels
@@ -94,6 +96,11 @@ class Model(nn.Module):
 
     @overload
     def render(
+        self, camera: RayCamera, *, background: Color | None = ..., **changes: Unpack[RenderChanges]
+    ) -> RayRendering: ...
+
+    @overload
+    def render(
         self,
         camera: Sequence[Camera],
         *,
@@ -105,17 +112,18 @@ class Model(nn.Module):
 
     def render(
         self,
-        camera: Camera | Sequence[Camera],
+        camera: Camera | RayCamera | Sequence[Camera],
         *,
         background: Color | None = None,
         depth_jitter: float | torch.Tensor = 0.0,
         generator: torch.Generator | None = None,
         **changes: Unpack[RenderChanges],
-    ) -> Rendering | list[Rendering]:
+    ) -> Rendering | RayRendering | list[Rendering]:
         """Render the scene as `nexwarp render` does, with exposures and detail limits. Differentiable.
 
         Args:
-            camera: one camera, or several, which may differ in size. Cameras are moved to the model's device.
+            camera: one camera, or several, which may differ in size. Cameras are moved to the model's device. What a
+                `RayCamera` renders is not differentiable.
             background: see `nexwarp.render`; None takes that of the options.
             depth_jitter: see `nexwarp.render`; for training.
             generator: random generator of the jitter.
@@ -133,9 +141,11 @@ class Model(nn.Module):
                 self.render(item, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
                 for item in camera
             ]
+        options = self.options.changed(**changes) if changes else self.options
+        if isinstance(camera, RayCamera):
+            return self._render_rays(camera, options, background)
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
-        options = self.options.changed(**changes) if changes else self.options
         return self._render(camera, options.background if background is None else background, options, jitter)
 
     def _render(
@@ -180,6 +190,17 @@ class Model(nn.Module):
                 raise
         # Outside of the handler: the error's traceback would keep alive what has been allocated.
         return work(camera, background)
+
+    def _render_rays(self, camera: RayCamera, options: RenderOptions, background: Color | None) -> RayRendering:
+        return render_rays(
+            self.surfels,
+            self.texture if options.max_hits else None,
+            camera.to(self.device),
+            options,
+            color_tensor(options.background if background is None else background, self.surfels.means),
+            self.exposures if options.exposure == "photos" else None,
+            self.detail_limits if options.detail_limits else None,
+        )
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.

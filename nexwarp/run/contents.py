@@ -22,7 +22,7 @@ CAMERA_PATH = "camera_path_{}.json"
 TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
 EXPORT_FOLDER = "export"
-SURFELS_FILE, SPLATS_FILE = "surfels.ply", "splats.ply"
+SURFELS_FILE, SPLATS_FILE, MESH_FILE = "surfels.ply", "splats.ply", "mesh.ply"
 COMPACT_FILE = "compact.safetensors"
 TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
 WEB_FILE, GLB_FILE, SPZ_FILE = "scene.html", "scene.glb", "splats.spz"
@@ -30,6 +30,7 @@ WEB_FILE, GLB_FILE, SPZ_FILE = "scene.html", "scene.glb", "splats.spz"
 RENDERS_FOLDER = "renders"
 TRAIN, TEST, COMPARE = "train", "test", "compare"
 FILE_PATH = "path_{}"  # folder of the frames of a path from a file
+PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures of other cameras than pinholes
 
 OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
 
@@ -37,6 +38,7 @@ ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIV
 EXPORTS = (
     SURFELS_FILE,
     SPLATS_FILE,
+    MESH_FILE,
     COMPACT_FILE,
     TRANSFORMS_FILE,
     CAMERA_PATH_FILE,
@@ -50,7 +52,8 @@ PATTERN = re.compile(
             *map(re.escape, ROOT_FILES),
             re.escape(CAMERA_PATH).replace(r"\{\}", r"[1-9]\d*"),
             *(re.escape(f"{EXPORT_FOLDER}/{name}") for name in EXPORTS),
-            rf"{RENDERS_FOLDER}/(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
+            rf"{RENDERS_FOLDER}/(?:(?:{'|'.join(PROJECTIONS)})/)?"
+            rf"(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
         ]
     )
 )
@@ -169,7 +172,7 @@ def _view_pictures(run: Path) -> set[str]:
     pictures = {Path(picture_name(view)) for view in views if Path(view).name}
     return {
         f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
-        for group in (TRAIN, TEST, COMPARE)
+        for group in (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
         for picture in pictures
         for suffix in (".png", ".exr")
     }

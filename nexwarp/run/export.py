@@ -19,15 +19,18 @@ from nexwarp.run.contents import (
     COMPACT_FILE,
     EXPORT_FOLDER,
     GLB_FILE,
+    MESH_FILE,
     SPLATS_FILE,
     SPZ_FILE,
     SURFELS_FILE,
+    TRAIN,
     TRANSFORMS_FILE,
     WEB_FILE,
 )
 from nexwarp.run.folder import SceneSource, read_run
+from nexwarp.run.mesh import Progress, extract_mesh, save_mesh
 
-FORMATS = ("ply", "compact", "cameras", "web", "glb", "spz")
+FORMATS = ("ply", "mesh", "compact", "cameras", "web", "glb", "spz")
 
 
 def export_run(
@@ -42,8 +45,8 @@ def export_run(
 
     Args:
         run: run folder.
-        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors), "cameras" (transforms.json,
-            camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
+        kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply), "compact" (compact.safetensors), "cameras"
+            (transforms.json, camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
         folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
             in .html is one file with everything; None is `export/scene.html`.
         max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
@@ -64,14 +67,11 @@ def export_run(
     if kind == "web":
         from nexwarp.web.export import export_web
 
-        return export_web(
-            load(run).to(device),
-            _all_cameras(run),
-            folder or run / EXPORT_FOLDER / WEB_FILE,
-            quality=quality,
-            title=run_title(source),
-        )
+        model, out = load(run).to(device), folder or run / EXPORT_FOLDER / WEB_FILE
+        return export_web(model, _all_cameras(run), out, quality=quality, title=run_title(source))
     folder = folder or run / EXPORT_FOLDER
+    if kind == "mesh":
+        return export_mesh(run, folder, device)
     if kind == "cameras":
         return _export_cameras(run, folder, source)
     if kind == "compact":
@@ -87,6 +87,37 @@ def export_run(
     save_surfels_ply(files[0], model.surfels)
     save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
     return files
+
+
+def export_mesh(
+    run: Path,
+    folder: Path,
+    device: torch.device | str = "cpu",
+    *,
+    voxel: float | None = None,
+    far: float | None = None,
+    observe: Progress = lambda *_: None,
+) -> Sequence[Path]:
+    """Write the mesh of a run, mesh.ply.
+
+    Args:
+        run: run folder.
+        folder: output folder, created if it does not exist.
+        device: where to render.
+        voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        far: farthest depth of the mesh, likewise.
+        observe: progress, likewise.
+
+    Raises:
+        ValueError, OSError: the message names the option or file.
+    """
+    read_run(run)
+    trained = load_cameras(run / CAMERAS_FILE).get(TRAIN, {})
+    if not trained:
+        raise RunError(f"{run / CAMERAS_FILE}: expected training cameras, found none")
+    mesh = extract_mesh(load(run).to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
+    save_mesh(folder / MESH_FILE, mesh)
+    return [folder / MESH_FILE]
 
 
 def _export_glb(run: Path, folder: Path, device: torch.device | str) -> Sequence[Path]:

@@ -24,6 +24,7 @@ MIN_LINES = 100
 
 # Names in `nexwarp.train.config.LearningRates` of the optimizer's parameters.
 RATES = {
+    "corrections": "poses",
     "means": "means",
     "raw_quats": "quats",
     "log_scales": "scales",
@@ -166,7 +167,8 @@ class TrainingLog:
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
     """Return the learning rates of the trainer's last step by the names of `nexwarp.train.config.LearningRates`."""
-    modules = (trainer.surfels, trainer.texture)
+    poses = () if trainer.poses is None else (trainer.poses,)
+    modules = (trainer.surfels, trainer.texture, *poses)
     names = {id(parameter): name for module in modules for name, parameter in module.named_parameters()}
     rates = {}
     for group in trainer.optimizer.param_groups:

@@ -22,6 +22,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.run.contents import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, frame_name, picture_name
 from nexwarp.run.folder import read_run
+from nexwarp.run.optics import PLAIN, Optics
 
 FRAMES, FPS = 120, 30.0
 
@@ -39,12 +40,14 @@ class PictureJob:
         camera: the camera.
         is_frame: whether the image is a frame of the camera path.
         buffers: whether to write its buffers, too.
+        following: camera of the path's next frame; None where there is none.
     """
 
     file: Path
     camera: Camera
     is_frame: bool
     buffers: bool
+    following: Camera | None = None
 
 
 @dataclass(frozen=True)
@@ -56,12 +59,14 @@ class RenderJob:
         video: video file to write; None writes none.
         fps: frames per second.
         exposure: see `RenderOptions`; None is that of the model.
+        optics: what the pictures are taken with.
     """
 
     pictures: list[PictureJob]
     video: Path | None
     fps: float
     exposure: Exposure | None = None
+    optics: Optics = PLAIN
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -93,7 +98,7 @@ class RenderJob:
                     save_buffers(picture.file.with_suffix(".exr"), buffers)
                     image = buffers.image
                 else:
-                    image = model.render(camera, **changes).image
+                    image = self.optics.image(model, camera, picture.following, **changes)
                 pixels = to_uint8(image).cpu()
                 save_png(picture.file, pixels)
                 if append is not None and picture.is_frame:
@@ -117,6 +122,7 @@ class RenderOrder:
         size: "WIDTHxHEIGHT" in pixels; None keeps the size of the cameras.
         scale: factor on the size of the cameras.
         exposure: see `RenderOptions`; None is that of the model.
+        optics: what the pictures are taken with.
 
     Raises:
         ValueError: the message names the option.
@@ -131,6 +137,7 @@ class RenderOrder:
     size: str | None = None
     scale: float = 1.0
     exposure: str | None = None
+    optics: Optics = PLAIN
 
     def __post_init__(self) -> None:
         if self.views not in SETS:
@@ -147,6 +154,10 @@ class RenderOrder:
             raise SettingError("--fps: expected together with --video, got no --video")
         if self.exposure not in (None, *get_args(Exposure)):
             raise SettingError(f"--exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r}")
+        if self.buffers and not self.optics.plain:
+            raise SettingError("--buffers: expected without --camera, --aperture and --shutter, got one of them")
+        if self.optics.shutter > 0 and self.path is None:
+            raise SettingError("--shutter: expected together with a path, whose camera moves, got --set alone")
         self._size()
         if self.video is not None:
             _check_video(self.video, FPS if self.fps is None else self.fps)
@@ -161,6 +172,8 @@ class RenderOrder:
         read_run(run)
         cameras = load_cameras(run / CAMERAS_FILE)
         renders, pictures = run / RENDERS_FOLDER, []
+        if self.optics.kind != "pinhole":
+            renders = renders / self.optics.kind
         for group in SETS[self.views]:
             for name, camera in cameras.get(group, {}).items():
                 file = renders / group / picture_name(name)
@@ -169,14 +182,15 @@ class RenderOrder:
         if self.path is not None and self.frames != 0:
             folder, path, fps = self._path(cameras, renders)
             first = size(path[0])
+            path = [resized(size(camera), first.width, first.height) for camera in path]
             for i, camera in enumerate(path):
-                camera = resized(size(camera), first.width, first.height)
-                pictures.append(PictureJob(folder / frame_name(i), camera, True, self.buffers and self.views is None))
+                following = path[i + 1] if i + 1 < len(path) else None
+                wanted = self.buffers and self.views is None
+                pictures.append(PictureJob(folder / frame_name(i), camera, True, wanted, following))
         if not pictures:
             raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
-        return RenderJob(
-            pictures, self.video, fps if self.fps is None else self.fps, cast(Exposure | None, self.exposure)
-        )
+        fps = fps if self.fps is None else self.fps
+        return RenderJob(pictures, self.video, fps, cast(Exposure | None, self.exposure), self.optics)
 
     def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
@@ -213,6 +227,7 @@ class RenderOrder:
         return lambda camera: resized(camera, sides[0], sides[1])
 
     def _scaled(self, camera: Camera) -> Camera:
+        camera = self.optics.resized(camera)
         sides = [max(round(side * self.scale), 1) for side in (camera.width, camera.height)]
         if max(sides) > LARGEST_SIDE:
             raise SettingError(

@@ -41,6 +41,8 @@ class LearningRates:
     """First and last learning rate of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """First and last learning rate of the MLP."""
+    poses: tuple[float, float] = (2e-4, 2e-6)
+    """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):
@@ -115,6 +117,9 @@ class Config:
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""
+    refine_poses: bool = False
+    """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
+    `nexwarp eval --refine-poses` fits them, too."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import torch
 
-from nexwarp.data import Scene, initial_points
+from nexwarp.data import Scene, View, initial_points
+from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import TextureShape
 from nexwarp.train.config import Config
@@ -76,6 +78,28 @@ def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
         ],
         dim=-1,
     )
+
+
+def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCorrections | None:
+    """Return corrections of 0 for the training poses, on a device; None where poses are not refined."""
+    if not config.refine_poses:
+        return None
+    depths = [_typical_depth(view, scene) for view in scene.train]
+    return PoseCorrections([view.camera for view in scene.train], scene.scale, depths).to(device)
+
+
+def _typical_depth(view: View, scene: Scene) -> float:
+    """Return the median z-depth of the points in front of a view's camera, world units; without any, the scale."""
+    points = scene.points if view.points is None or not len(view.points) else view.points
+    depths = view.camera.project(points)[1]
+    depths = depths[depths > view.camera.near]
+    return depths.median().item() if len(depths) else scene.scale
+
+
+def model_facts(scene: Scene, config: Config, iteration: int) -> dict[str, Json]:
+    """Return the facts that a model tells of its training; see `Model.meta`."""
+    near = scene.train[0].camera.near
+    return {"near": near, "scene_scale": scene.scale, "preset": config.preset, "iteration": iteration}
 
 
 def texture_shape(scene: Scene, config: Config) -> TextureShape:

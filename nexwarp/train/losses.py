@@ -35,10 +35,12 @@ class LossWeights:
     """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.1
     """Factor of the relative depth error at the points that were triangulated from the photo."""
+    poses: float = 0.1
+    """With `refine_poses`: factor of the squared pose correction, which keeps poses near the given ones."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "poses"):
             check_range(name, getattr(self, name), 0.0)
 
 

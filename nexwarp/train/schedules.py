@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from nexwarp.model.options import RenderOptions
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam, grid_factors
@@ -15,8 +16,8 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" and "mlp"; `lr`, the
-# learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses are
+# refined, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
@@ -29,6 +30,7 @@ def make_optimizer(
     scale: float,
     make: OptimizerMaker | None = None,
     cells_unit: float = 1.0,
+    poses: PoseCorrections | None = None,
 ) -> torch.optim.Optimizer:
     """Make the optimizer; each of its groups gets the ends of its schedule as `group["ends"]`.
 
@@ -39,6 +41,7 @@ def make_optimizer(
         scale: of the scene, world units, which the means' rates follow.
         make: makes an optimizer of one's own; None makes Adam, on CUDA a `FusedAdam` that regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
+        poses: pose corrections to train; None trains none.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -48,6 +51,8 @@ def make_optimizer(
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
     if config.max_hits:
         parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+    if poses is not None:
+        parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
@@ -95,6 +100,7 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "shN": (rates.shN,) * 2,
         "grid": rates.grid,
         "mlp": rates.mlp,
+        "poses": rates.poses,
     }
 
 

@@ -15,6 +15,7 @@ from nexwarp.checks import check_finite
 from nexwarp.data import Scene
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
@@ -24,7 +25,7 @@ from nexwarp.train.presets import config_from_dict
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
 HEADERS = 2**20  # bytes of a checkpoint beside its parameters, at most
-FLOATS = ("surfels.", "texture.", "adam.", "densify.")  # of tensors that are float32
+FLOATS = ("surfels.", "texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
 
 
 class Snapshot(NamedTuple):
@@ -39,16 +40,23 @@ class Snapshot(NamedTuple):
     state: dict[str, Any]
 
 
-def named_parameters(surfels: Surfels, texture: NeuralTexture) -> Iterator[tuple[str, torch.nn.Parameter]]:
+def named_parameters(
+    surfels: Surfels, texture: NeuralTexture, poses: PoseCorrections | None = None
+) -> Iterator[tuple[str, torch.nn.Parameter]]:
     """Yield all parameters with their names in a checkpoint."""
     yield from ((f"surfels.{name}", x) for name, x in surfels.named_parameters())
     yield from ((f"texture.{name}", x) for name, x in texture.named_parameters())
+    if poses is not None:
+        yield from ((f"poses.{name}", x) for name, x in poses.named_parameters())
 
 
-def learned_tensors(surfels: Surfels, texture: NeuralTexture) -> dict[str, torch.Tensor]:
+def learned_tensors(
+    surfels: Surfels, texture: NeuralTexture, poses: PoseCorrections | None = None
+) -> dict[str, torch.Tensor]:
     """Return what is learned by its names in a checkpoint, and the texture's buffers."""
     tensors = {f"surfels.{name}": x for name, x in surfels.state_dict().items()}
-    return tensors | {f"texture.{name}": x for name, x in texture.state_dict().items()}
+    tensors |= {f"texture.{name}": x for name, x in texture.state_dict().items()}
+    return tensors if poses is None else tensors | {f"poses.{name}": x for name, x in poses.state_dict().items()}
 
 
 def part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 import torch
 
 from nexwarp.render import Rendering
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
@@ -15,7 +16,7 @@ from nexwarp.train.target import Target
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "poses")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -58,6 +59,7 @@ def step_losses(
     cells_unit: float = 1.0,
     own: Mapping[str, OwnLoss] | None = None,
     grid_term: bool = True,
+    poses: PoseCorrections | None = None,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
@@ -70,6 +72,7 @@ def step_losses(
         cells_unit: world units in which the grid's loss counts its cells.
         own: losses of one's own, added as they are.
         grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
+        poses: corrections of the training poses, which have a prior; None where they are not learned.
 
     Raises:
         TypeError, ValueError: an own loss returned no scalar; the message names it.
@@ -92,6 +95,8 @@ def step_losses(
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
         losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
+    if poses is not None and target.view is not None and factors.poses > 0:
+        losses["poses"] = factors.poses * poses.prior(target.view)
     for name, loss in (own or {}).items():
         losses[name] = _scalar(name, loss(out, target), out.image.device)
     return losses

@@ -9,6 +9,7 @@ import torch
 from nexwarp.camera import Camera, visible_points
 from nexwarp.data import Scene
 from nexwarp.render import Color, jitter_factors
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.train.config import Config
 from nexwarp.train.views import TrainingViews
 
@@ -27,6 +28,7 @@ class Target:
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.render` takes it.
+        view: (1,) int64, index of the training view; None where poses are not refined.
     """
 
     camera: Camera
@@ -38,6 +40,14 @@ class Target:
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
+    view: torch.Tensor | None = None
+
+
+def refined(target: Target, poses: PoseCorrections | None) -> Target:
+    """Return a target with the corrected camera; differentiable with respect to the corrections."""
+    if poses is None or target.view is None:
+        return target
+    return dataclasses.replace(target, camera=poses.camera(target.camera, target.view))
 
 
 class TargetMaker:
@@ -51,6 +61,7 @@ class TargetMaker:
         background: tuple[float, float, float],
         generator: torch.Generator,
         noise: torch.Generator,
+        poses: PoseCorrections | None = None,
     ) -> None:
         """Take what targets are made of.
 
@@ -61,7 +72,9 @@ class TargetMaker:
             background: the colour behind everything, where it is not random.
             generator: of random backgrounds, on the CPU.
             noise: of the depth jitter, on the device.
+            poses: corrections of the training poses that are learned; None where they are not.
         """
+        self.poses = poses
         self.scene, self.config, self.views = scene, config, views
         self.background, self.generator, self.noise = background, generator, noise
         self.background_tensor = torch.tensor(background, device=views.device)
@@ -82,6 +95,8 @@ class TargetMaker:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
             target = dataclasses.replace(target, depth_jitter=drawn)
+        if self.poses is not None:
+            target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
         return target
 
     def from_view(self, index: int, factor: int, upcoming: list[int] | None = None) -> Target:
@@ -114,9 +129,11 @@ class TargetMaker:
             return target
         camera, device = target.camera, self.views.device
         key = (index, camera.width)
-        if key not in self.points:
+        if key not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
             mask = target.counts if target.empty is None else ~target.empty
-            seen = camera.project(points.to(device))
+            with torch.no_grad():
+                moved = camera if self.poses is None else self.poses.camera(camera, index)
+                seen = moved.project(points.to(device))
             found = visible_points(*seen, camera.width, camera.height, mask)
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
             self.points[key] = none if found is None else found

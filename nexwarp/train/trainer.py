@@ -13,7 +13,6 @@ from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
-from nexwarp.io.json_files import Json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
@@ -28,7 +27,7 @@ from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
-from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
+from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
@@ -46,8 +45,8 @@ from nexwarp.train.state import (
     scene_digest,
 )
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
-from nexwarp.train.target import Target, TargetMaker
-from nexwarp.train.views import TrainingViews, mean_color
+from nexwarp.train.target import Target, TargetMaker, refined
+from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
 CHECK_EVERY = 100
@@ -70,6 +69,7 @@ class Trainer:
         densifier: density control.
         views: the training views on the device.
         exposures: of the training photos; None where they have one exposure.
+        poses: corrections of the training poses; None where they are not refined.
         background: colour behind everything, three numbers.
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
@@ -112,17 +112,17 @@ class Trainer:
         self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
+        self.poses = initial_poses(scene, config, self.device)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
-        self.iteration, self.seconds = 0, 0.0
+        self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
         self.order: list[int] = []
         self.exposures: Exposures | None = None if calibration is None else calibration.exposures
         gains = None if calibration is None else calibration.gains
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
-        self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise)
-        self.rate_factor, self.views_a_step = 1.0, 1
-        self.ranks = Ranks.alone(self.device)
+        self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise, self.poses)
+        self.views_a_step, self.ranks = 1, Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
@@ -192,9 +192,8 @@ class Trainer:
         return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
-        return make_optimizer(
-            self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer, self.cells_unit
-        )
+        made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
+        return make_optimizer(self.surfels, self.texture, *made)
 
     def _next_view(self) -> int:
         if not self.order:
@@ -210,10 +209,12 @@ class Trainer:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
+            target = refined(target, self.poses)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             given = (taken, target, self.surfels, self.texture, self.config)
-            losses = step_losses(*given, cells_unit=self.cells_unit, own=self.own_losses, grid_term=fused is None)
+            own, poses, grid = self.own_losses, self.poses, fused is None
+            losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
@@ -235,6 +236,8 @@ class Trainer:
         """Update the parameters by their gradients, and the densifier's sums by the errors (N,) of the step's view."""
         with updating():
             self.optimizer.step()
+            if self.poses is not None:
+                self.poses.keep_gauge()
             if errors is not None:
                 self.densifier.accumulate(errors)
         return None
@@ -262,25 +265,19 @@ class Trainer:
     def _remove_floaters(self, last: bool) -> None:
         # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
         # A generator of its own: a search that finds no floaters changes nothing.
+        cameras = self.views.refined_cameras(self.poses)
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last, ranks=self.ranks)
+        chosen = floaters(self.model(), cameras, self._nearest, generator, last=last, ranks=self.ranks)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
-        return Model(self.surfels, self.texture, options=self.render_options(), meta=self._meta())
+        meta = model_facts(self.scene, self.config, self.iteration)
+        return Model(self.surfels, self.texture, options=self.render_options(), meta=meta)
 
     def render_options(self) -> RenderOptions:
         """Return how the scene is rendered at this point of the run."""
         return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
-
-    def _meta(self) -> dict[str, Json]:
-        return {
-            "near": self.scene.train[0].camera.near,
-            "scene_scale": self.scene.scale,
-            "preset": self.config.preset,
-            "iteration": self.iteration,
-        }
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model, with surfels of its own: smooth SH, detail limits and exposures, as configured.
@@ -296,7 +293,9 @@ class Trainer:
         config = self.config
         settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
-            return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
+            cameras = self.views.refined_cameras(self.poses)
+            views = with_cameras(self.scene.train, cameras)
+            return finish_model(self.model(), views, cameras, self.exposures, settings, observe)
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
@@ -357,7 +356,7 @@ class Trainer:
         """Return everything that shapes the future of the run, as copies on the CPU."""
         moments, optimizer = gather_optimizer(self.optimizer, dict(self._named_parameters()))
         numbers, generators = gather_random(self.generator, self.noise, self.device)
-        tensors = learned_tensors(self.surfels, self.texture) | moments
+        tensors = learned_tensors(self.surfels, self.texture, self.poses) | moments
         tensors |= {"densify.errors": self.densifier.errors, **numbers}
         state = {
             "iteration": self.iteration,
@@ -378,6 +377,8 @@ class Trainer:
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
+        if self.poses is not None:
+            self.poses.load(tensors["poses.corrections"])
         self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
@@ -396,4 +397,4 @@ class Trainer:
         return scene_digest(self.scene, self.texture)
 
     def _named_parameters(self) -> Iterator[tuple[str, torch.nn.Parameter]]:
-        return named_parameters(self.surfels, self.texture)
+        return named_parameters(self.surfels, self.texture, self.poses)

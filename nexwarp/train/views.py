@@ -4,12 +4,14 @@ import copy
 import hashlib
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 
 from nexwarp.camera import Camera
 from nexwarp.data import View
 from nexwarp.representation.exposures import DECIMALS, Exposures
+from nexwarp.representation.poses import PoseCorrections
 from nexwarp.train.exposure_calibration import ExposureCalibration
 
 # Photos stay on the GPU when they take less than this share of its free memory.
@@ -61,6 +63,10 @@ class TrainingViews:
 
     def __len__(self) -> int:
         return len(self.photos)
+
+    def refined_cameras(self, poses: PoseCorrections | None) -> list[Camera]:
+        """Return the cameras on the device, with the poses as they are corrected; None corrects none."""
+        return self.cameras if poses is None else poses.cameras(self.cameras)
 
     def fingerprint(self) -> str:
         """Return a digest of the views' names and cameras."""
@@ -147,6 +153,11 @@ class TrainingViews:
             return pixels
         small = torch.nn.functional.avg_pool2d(pixels.permute(2, 0, 1), factor)
         return small.permute(1, 2, 0).contiguous()
+
+
+def with_cameras(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]:
+    """Return views with other cameras, which may be on any device."""
+    return [replace(view, camera=camera.to("cpu")) for view, camera in zip(views, cameras, strict=True)]
 
 
 def mean_color(views: list[View], calibration: ExposureCalibration | None = None) -> tuple[float, float, float]:

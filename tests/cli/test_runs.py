@@ -14,6 +14,7 @@ from benchmarks.inputs import write_blender, write_points
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
+from nexwarp.run.contents import list_files
 from nexwarp.run.metrics import CONVENTION, psnr
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.trainer import Trainer
@@ -197,3 +198,25 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
     assert cli.main(["train", str(path), "--run", str(run), "--device", "cpu", "--resume"]) == 0
     assert cli.main(["train", str(path), "--run", str(run), "--resume", "--background", "white"]) == 2
     assert "--background: expected 0,0.5,1 as in the run to resume, got white" in capsys.readouterr().err
+
+
+def test_other_cameras_render_beside_the_photos(finished, capsys):
+    """Panoramas have twice as many columns as rows, and go to a folder of their own, which --overwrite knows."""
+    before = (finished / "renders" / "test" / "view_000.png").read_bytes()
+    assert cli.main(["render", str(finished), "--camera", "panorama", "--set", "test", "--size", "32x16"]) == 0
+    with Image.open(finished / "renders" / "panorama" / "test" / "view_000.png") as picture:
+        assert picture.size == (32, 16)
+    assert (finished / "renders" / "test" / "view_000.png").read_bytes() == before
+    options = ["--path", "ellipse", "--frames", "2"]
+    assert cli.main(["render", str(finished), *options, "--camera", "fisheye", "--scale", "0.5"]) == 0
+    with Image.open(finished / "renders" / "fisheye" / "ellipse" / "0001.png") as picture:
+        assert picture.size == (18, 18)
+    assert cli.main(["render", str(finished), *options, "--aperture", "0.1", "--shutter", "0.5", "--samples", "2"]) == 0
+    assert list_files(finished)[1] == []
+    capsys.readouterr()
+    for wrong, message in (
+        (["--camera", "panorama", "--buffers"], "--buffers: expected without --camera"),
+        (["--set", "test", "--shutter", "0.5"], "--shutter: expected together with a path"),
+    ):
+        assert cli.main(["render", str(finished), *wrong]) == 2
+        assert message in capsys.readouterr().err

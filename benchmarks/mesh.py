@@ -1,0 +1,119 @@
+"""Chamfer distance between the mesh of a run of the demo scene and the demo's own geometry.
+
+    nexwarp train demo && nexwarp export runs/demo --format mesh
+    python -m benchmarks.mesh runs/demo/export/mesh.ply --picture mesh.png
+
+Accuracy is the distance from points of the mesh to the nearest rectangle of the scene, completeness that from the
+points that the demo's cameras see to the mesh. A bad mesh has a large mean of one or the other; the chamfer distance is
+the mean of both. The picture shows the mesh from a camera of the scene: colours and normals.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from nexwarp.data.demo import HEIGHT, VIEWS, WIDTH, demo_cameras
+from nexwarp.data.demo_room import build_room
+from nexwarp.data.raytrace import Rectangle, first_hits
+
+SAMPLES = 400_000  # points on the mesh
+PIXELS = 3  # every third pixel of the demo's cameras sees a point
+
+
+def read_mesh(path: Path) -> dict[str, np.ndarray]:
+    """Read what `nexwarp.run.mesh.save_mesh` writes: vertices, normals, colors and triangles."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    counts = [int(line.split()[2]) for line in data[:end].decode().splitlines() if line.startswith("element")]
+    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(c, "u1") for c in ("r", "g", "b")]
+    rows = np.frombuffer(data, kinds, counts[0], end)
+    faces = np.frombuffer(data, [("count", "u1"), ("vertices", "<i4", 3)], counts[1], end + rows.nbytes)
+    columns = {"vertices": ("x", "y", "z"), "normals": ("nx", "ny", "nz"), "colors": ("r", "g", "b")}
+    mesh = {name: np.stack([rows[c] for c in names], 1) for name, names in columns.items()}
+    return mesh | {"triangles": faces["vertices"]}
+
+
+def sample(mesh: dict[str, np.ndarray], count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Draw points evenly over a mesh's area, with the colours and normals of its vertices."""
+    rng = np.random.default_rng(seed)
+    a, b, c = (mesh["vertices"][mesh["triangles"][:, i]].astype(float) for i in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    corners = mesh["triangles"][chosen]
+    return {
+        name: sum(w * mesh[name][corners[:, i]].astype(float) for i, w in enumerate((1 - u - v, u, v)))
+        for name in ("vertices", "normals", "colors")
+    }
+
+
+def distance_to(rectangles: list[Rectangle], points: np.ndarray) -> np.ndarray:
+    """Return the distance of points (N, 3) to the nearest of the rectangles."""
+    nearest = np.full(len(points), np.inf)
+    for r in rectangles:
+        offset = points - r.origin
+        a, b = (np.clip(offset @ e / (e @ e), 0, 1) for e in (r.u, r.v))
+        nearest = np.minimum(nearest, np.linalg.norm(points - r.at(a, b), axis=1))
+    return nearest
+
+
+def seen_points(rectangles: list[Rectangle]) -> np.ndarray:
+    """Return the points (N, 3) of the scene that its cameras see."""
+    rig = demo_cameras(WIDTH, HEIGHT, VIEWS)
+    rows, columns = np.mgrid[0 : rig.size[1] : PIXELS, 0 : rig.size[0] : PIXELS]
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
+    points = []
+    for viewmat in rig.viewmats:
+        start = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        directions = pixels @ np.linalg.inv(rig.K).T @ viewmat[:3, :3]
+        hits = first_hits(rectangles, start, directions)
+        seen = hits.ids >= 0
+        points.append(start + directions[seen] / hits.nearness[seen][:, None])
+    return np.concatenate(points)
+
+
+def draw(points: dict[str, np.ndarray], path: Path, view: int = 3, factor: int = 3) -> None:
+    """Write a picture of sampled points from a camera of the demo: their colours, and their normals."""
+    from PIL import Image
+
+    rig = demo_cameras(factor * WIDTH, factor * HEIGHT, VIEWS)
+    viewmat = rig.viewmats[view]
+    local = points["vertices"] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    normals = points["normals"] / np.linalg.norm(points["normals"], axis=1, keepdims=True).clip(1e-9)
+    pixels = (local / local[:, 2:]) @ rig.K.T
+    column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
+    inside = (local[:, 2] > 0.05) & (column >= 0) & (row >= 0) & (column < rig.size[0]) & (row < rig.size[1])
+    order = np.flatnonzero(inside)[np.argsort(-local[inside, 2])]  # far to near
+    place = (row[order].astype(int), column[order].astype(int))
+    pictures = []
+    for values in (points["colors"], 127.5 * (1 + normals @ viewmat[:3, :3].T)):
+        image = np.zeros((rig.size[1], rig.size[0], 3), np.uint8)
+        image[place] = np.clip(values[order], 0, 255).astype(np.uint8)
+        pictures.append(image)
+    Image.fromarray(np.concatenate(pictures, 1)).save(path)
+
+
+def main() -> None:
+    """Print the distances, and draw the mesh."""
+    from scipy.spatial import cKDTree
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("mesh", type=Path)
+    parser.add_argument("--picture", type=Path)
+    args = parser.parse_args()
+    mesh, room = read_mesh(args.mesh), build_room(16)
+    points = sample(mesh, SAMPLES)
+    accuracy = distance_to(room, points["vertices"])
+    completeness = cKDTree(points["vertices"]).query(seen_points(room))[0]
+    print(f"{len(mesh['vertices']):,} vertices, {len(mesh['triangles']):,} triangles")
+    for name, values in (("accuracy", accuracy), ("completeness", completeness)):
+        print(f"{name}: mean {values.mean():.4f}, median {np.median(values):.4f}, 95 % {np.quantile(values, 0.95):.4f}")
+    print(f"chamfer distance: {(accuracy.mean() + completeness.mean()) / 2:.4f} world units")
+    if args.picture is not None:
+        draw(sample(mesh, 10 * SAMPLES), args.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""Cameras that are no pinholes: a ray for each pixel, from a fisheye lens, a panorama or a parallel projection."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from nexwarp.camera import LARGEST_DISTANCE, Camera
+from nexwarp.checks import check_finite, check_range, check_tensors
+
+MAX_SIDE = 32768  # pixels
+MAX_PARAMETER = 1e3  # of a fisheye lens
+BISECTIONS = 60
+# Radius, relative to the focal length, by which the inverse of a lens may miss.
+INVERSE_ERROR = 1e-6
+
+
+@dataclass(frozen=True)
+class RayCamera:
+    """A camera with one ray for each pixel, for rendering; not differentiable.
+
+    `panorama`, `fisheye`, `orthographic` and `pinhole` make one. A hit's depth is in units of its pixel's ray: the
+    distance from the camera for panoramas and fisheye lenses, the z-depth for the others.
+
+    Attributes:
+        viewmat: (4, 4) float, world to camera, a rigid motion; x right, y down, z forward.
+        rays: (H, W, 3) float, camera frame. For rays through the camera's centre, their directions, of any length; a
+            pixel whose ray is 0 sees nothing. For parallel rays, (x, y, 1): the ray starts at (x, y, 0) and goes along
+            z.
+        near: hits at a depth of at most this are ignored.
+        focal: pixels in a world unit at depth 1: f of paper Eq. 4. For parallel rays, at any depth.
+        parallel: whether all rays are parallel.
+        radial: whether surfels are blended in the order of their centres' distances, instead of z-depths.
+
+    Raises:
+        TypeError, ValueError: a type, shape, device or value does not fit; the message names the field.
+    """
+
+    viewmat: torch.Tensor
+    rays: torch.Tensor
+    near: float
+    focal: float
+    parallel: bool = False
+    radial: bool = True
+
+    def __post_init__(self) -> None:
+        check_tensors({"viewmat": (self.viewmat, (4, 4)), "rays": (self.rays, ("H", "W", 3))})
+        height, width, _ = self.rays.shape
+        for name, side in (("width", width), ("height", height)):
+            check_range(name, side, 1, MAX_SIDE)
+        check_range("near", self.near, 0, LARGEST_DISTANCE)
+        check_range("focal", self.focal, 1e-16, 1e16)
+        # The pose is checked as that of any camera.
+        Camera(self.viewmat, torch.eye(3).to(self.viewmat), width, height, self.near)
+        check_finite("rays", self.rays)
+
+    @property
+    def width(self) -> int:
+        """Image width in pixels."""
+        return self.rays.shape[1]
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
+        return self.rays.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        """Device of `viewmat`."""
+        return self.viewmat.device
+
+    @property
+    def position(self) -> torch.Tensor:
+        """(3,) centre of the camera in the world frame; for parallel rays, the middle of the plane where they start."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(self, *args: Any, **kwargs: Any) -> "RayCamera":
+        """Return a copy with `viewmat` and `rays` moved or converted; arguments as of `torch.Tensor.to`."""
+        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), rays=self.rays.to(*args, **kwargs))
+
+    @classmethod
+    def pinhole(cls, camera: Camera) -> "RayCamera":
+        """Return a pinhole camera as rays (x, y, 1); `nexwarp.render` renders the camera itself faster."""
+        x, y = _pixel_centers(camera.width, camera.height)
+        rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+        return cls(camera.viewmat.detach(), rays.to(camera.viewmat), camera.near, camera.focal, radial=False)
+
+    @classmethod
+    def panorama(cls, viewmat: torch.Tensor, width: int, height: int | None = None, near: float = 0.01) -> "RayCamera":
+        """Return an equirectangular panorama of the whole sphere.
+
+        Columns are longitudes, from behind over left, forward (the middle of the image) and right to behind; rows are
+        latitudes from straight up (-y) to straight down.
+
+        Args:
+            viewmat: (4, 4) world to camera.
+            width: pixels around the sphere, at least 4.
+            height: pixels from top to bottom; None is half the width.
+            near: hits no farther than this are ignored, world units.
+        """
+        height = _side("width", width, 4) // 2 if height is None else _side("height", height, 1)
+        x, y = _pixel_centers(width, height)
+        longitude, latitude = (x / width - 0.5) * 2 * math.pi, (y / height - 0.5) * math.pi
+        across = latitude.cos()
+        rays = torch.stack([longitude.sin() * across, latitude.sin(), longitude.cos() * across], -1)
+        return cls(viewmat, rays.to(viewmat), near, width / (2 * math.pi))
+
+    @classmethod
+    def fisheye(
+        cls,
+        viewmat: torch.Tensor,
+        K: torch.Tensor,
+        distortion: Sequence[float],
+        width: int,
+        height: int,
+        near: float = 0.01,
+        max_angle: float = math.pi,
+    ) -> "RayCamera":
+        """Return a fisheye camera of Kannala and Brandt's model, as OpenCV and COLMAP's OPENCV_FISHEYE have it.
+
+        A ray at the angle t to the optical axis falls on the radius f (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9). Pixels
+        beyond `max_angle`, or beyond the angle up to which the radius grows, see nothing.
+
+        Args:
+            viewmat: (4, 4) world to camera.
+            K: (3, 3) intrinsics in pixels, without skew.
+            distortion: k1 to k4.
+            width: image width in pixels.
+            height: image height in pixels.
+            near: hits no farther than this are ignored, world units.
+            max_angle: largest angle to the optical axis, radians, at most pi.
+        """
+        checked = Camera(viewmat, K, _side("width", width, 1), _side("height", height, 1), near)
+        terms = [float(k) for k in distortion]
+        if len(terms) != 4:
+            raise ValueError(f"distortion: expected k1, k2, k3 and k4, got {len(terms)} numbers")
+        for k in terms:
+            check_range("distortion", k, -MAX_PARAMETER, MAX_PARAMETER)
+        check_range("max_angle", max_angle, 1e-3, math.pi)
+        x, y = _pixel_centers(width, height)
+        x, y = (x - checked.cx) / checked.fx, (y - checked.cy) / checked.fy
+        radius = torch.hypot(x, y)
+        angle, valid = _angle_of(radius, terms, max_angle)
+        outward = angle.sin() / radius.clamp_min(1e-300)
+        rays = torch.stack([x * outward, y * outward, angle.cos()], -1) * valid[..., None]
+        return cls(viewmat, rays.to(viewmat), near, checked.focal)
+
+    @classmethod
+    def orthographic(
+        cls, viewmat: torch.Tensor, width: int, height: int, pixel: float, near: float = 0.0
+    ) -> "RayCamera":
+        """Return a parallel projection along z, whose image is centred on the camera.
+
+        Args:
+            viewmat: (4, 4) world to camera.
+            width: image width in pixels.
+            height: image height in pixels.
+            pixel: side of a pixel in world units.
+            near: hits at a z-depth of at most this are ignored.
+        """
+        check_range("pixel", pixel, 1e-16, LARGEST_DISTANCE)
+        x, y = _pixel_centers(_side("width", width, 1), _side("height", height, 1))
+        rays = torch.stack([(x - width / 2) * pixel, (y - height / 2) * pixel, torch.ones_like(x)], -1)
+        return cls(viewmat, rays.to(viewmat), near, 1 / pixel, parallel=True, radial=False)
+
+
+def _side(name: str, value: int, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+    check_range(name, value, least, MAX_SIDE)
+    return value
+
+
+def _pixel_centers(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the x and y (H, W) float64 of the pixels' centres."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5, indexing="ij"
+    )
+    return x, y
+
+
+def _angle_of(radius: torch.Tensor, terms: Sequence[float], largest: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the angles at which a lens has the given radii, and where there are such angles of at most `largest`.
+
+    The lens is inverted where its radius grows, from the optical axis on.
+    """
+    powers = [1.0, *terms]
+
+    def radius_at(t: torch.Tensor) -> torch.Tensor:
+        return sum((k * t ** (2 * i + 1) for i, k in enumerate(powers)), torch.zeros_like(t))
+
+    samples = torch.linspace(0.0, largest, 4097, dtype=torch.float64)
+    falling = (radius_at(samples).diff() <= 0).nonzero()
+    end = samples[int(falling[0])] if len(falling) else samples[-1]
+    low, high = torch.zeros_like(radius), end.expand_as(radius).clone()
+    for _ in range(BISECTIONS):  # bisection: it cannot leave the growing part
+        middle = 0.5 * (low + high)
+        above = radius_at(middle) > radius
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    angle = 0.5 * (low + high)
+    return angle, (radius_at(angle) - radius).abs() < INVERSE_ERROR

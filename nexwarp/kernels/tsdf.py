@@ -1,0 +1,83 @@
+"""Fusion of depth images into a truncated signed distance field (Curless and Levoy 1996), in blocks of voxels.
+
+A thread is a voxel of a block. Read: a view's z-depths, 0 where there are none, and colours. A voxel that projects
+into the image, and is not farther behind the surface than the truncation, takes the view's distance
+
+    min(depth - z, truncation) / truncation
+
+and near the surface its colour, into running means. Nothing is differentiated.
+"""
+
+import functools
+
+import warp as wp
+
+from nexwarp.kernels.types import types
+
+BLOCK_SIDE = 16  # voxels
+
+
+@functools.cache
+def fuse_kernel() -> wp.Kernel:
+    """Make the kernel, in single precision."""
+    t = types(wp.float32)
+    vec3, vec4, mat44 = t.vec3, t.vec4, t.mat44
+    cells = BLOCK_SIDE * BLOCK_SIDE * BLOCK_SIDE
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def fuse(
+        first: wp.int32,
+        blocks: wp.array(dtype=wp.vec3i),
+        voxel: wp.float32,
+        truncation: wp.float32,
+        viewmats: wp.array(dtype=mat44),
+        intrinsics: vec4,
+        size: wp.vec2i,
+        near: wp.float32,
+        depths: wp.array2d(dtype=wp.float32),
+        colors: wp.array2d(dtype=vec3),
+        # outputs, read and written
+        distances: wp.array2d(dtype=wp.float32),
+        weights: wp.array2d(dtype=wp.float32),
+        means: wp.array2d(dtype=vec4),
+    ):
+        thread = first + wp.tid()
+        b = thread // cells
+        local = thread % cells
+        corner = blocks[b]
+        x = vec3(
+            wp.float32(corner[0] * BLOCK_SIDE + local // (BLOCK_SIDE * BLOCK_SIDE)) * voxel,
+            wp.float32(corner[1] * BLOCK_SIDE + (local // BLOCK_SIDE) % BLOCK_SIDE) * voxel,
+            wp.float32(corner[2] * BLOCK_SIDE + local % BLOCK_SIDE) * voxel,
+        )
+        viewmat = viewmats[0]
+        c = viewmat * vec4(x[0], x[1], x[2], 1.0)
+        if not (c[2] > near):
+            return
+        column = wp.floor(intrinsics[0] * c[0] / c[2] + intrinsics[2])
+        row = wp.floor(intrinsics[1] * c[1] / c[2] + intrinsics[3])
+        if not (column >= 0.0 and row >= 0.0 and column < wp.float32(size[0]) and row < wp.float32(size[1])):
+            return
+        depth = depths[int(row), int(column)]
+        if not (depth > 0.0):
+            return
+        distance = depth - c[2]
+        if distance < -truncation:
+            return
+        weight = weights[b, local]
+        weights[b, local] = weight + 1.0
+        seen = wp.min(distance / truncation, 1.0)
+        distances[b, local] += (seen - distances[b, local]) / (weight + 1.0)
+        if distance < truncation:
+            color = colors[int(row), int(column)]
+            mean = means[b, local]
+            count = mean[3] + 1.0
+            share = 1.0 / count
+            means[b, local] = vec4(
+                mean[0] + (color[0] - mean[0]) * share,
+                mean[1] + (color[1] - mean[1]) * share,
+                mean[2] + (color[2] - mean[2]) * share,
+                count,
+            )
+
+    return fuse

@@ -1,0 +1,238 @@
+"""Collection for cameras of any rays; see `nexwarp.kernels.rays`. Not differentiable."""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from nexwarp.checks import check_tensors
+from nexwarp.kernels.rays import UNBOUNDED, collect_rays_kernel, ray_list_kernels
+from nexwarp.kernels.tiles import check_entries
+from nexwarp.kernels.types import types
+from nexwarp.kernels.walk import BLOCK_DIM
+from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.ops.memory import check_memory
+from nexwarp.ops.project import Projection
+from nexwarp.ops.surface import Surface
+
+TILE_SIZE = 16
+SPAN = 8  # tiles along the side of a block of tiles
+BYTES_AN_ENTRY = 40  # of the arrays that `intersect_rays` makes, the sort's included
+# A block whose rays are farther than this from its mean, as a cosine, has no bound.
+LEAST_COSINE = 0.1
+# Rounding may put a ray beside its block's bound: the bounds are a little larger.
+WIDER = 1.0001
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """What rays hit: the fields of `Hits` but `stops`, and the surface.
+
+    Attributes:
+        plain, base: (H, W, 3), ids, depths, weights: (H, W, K), alpha: (H, W), as in `Hits`; a depth is in units of the
+            ray's vector.
+        surface: depths and normals over all hits.
+    """
+
+    plain: torch.Tensor
+    base: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    alpha: torch.Tensor
+    surface: Surface
+
+
+@dataclass(frozen=True)
+class RayTiles:
+    """Lists of the surfels that the rays of each tile may hit, near to far.
+
+    Attributes:
+        surfel_ids: (M,) int32, by tile.
+        tile_offsets: (tiles + 1,) int64, half-open ranges of `surfel_ids`, row by row.
+        columns: tiles in a row.
+    """
+
+    surfel_ids: torch.Tensor
+    tile_offsets: torch.Tensor
+    columns: int
+
+
+@dataclass(frozen=True)
+class RayRecords:
+    """Surfels as rays read them.
+
+    Attributes:
+        records: (N, 4, 4) as in `nexwarp.kernels.surfel`; for parallel rays such that they hold for rays (x, y, 1).
+        planes: (N, 3) g, where t = g . ray / n . ray; None stands for the records' m.
+        normals: (N, 3) unit normals, camera frame.
+        facings: (N,) sign of n . ray where a surfel can be hit; 0 where it cannot.
+    """
+
+    records: torch.Tensor
+    planes: torch.Tensor | None
+    normals: torch.Tensor
+    facings: torch.Tensor
+
+
+def ray_records(projection: Projection, axes: torch.Tensor | None) -> RayRecords:
+    """Return the records of projected surfels for rays through the camera's centre, or for parallel ones.
+
+    Args:
+        projection: the N surfels in the camera's frame.
+        axes: for parallel rays, (N, 2, 3): v1 / s2 and v2 / s1 in the camera frame; None is rays through the centre.
+    """
+    records = projection.records.detach()
+    normals = records[:, 2, :3].contiguous()
+    if axes is None:
+        return RayRecords(records, None, normals, records[:, 3, 3].sign().contiguous())
+    # The moment of the ray from (x, y, 0) along z is (y, -x, 0), and u gets - v2 . moment / s1, v + v1 . moment / s2.
+    records = records.clone()
+    first, second = axes.unbind(1)
+    zero = torch.zeros_like(first[:, 0])
+    planes = torch.stack([-normals[:, 0], -normals[:, 1], records[:, 3, 3]], -1)
+    records[:, 0, :3] = torch.stack([second[:, 1], -second[:, 0], records[:, 0, 2]], -1)
+    records[:, 1, :3] = torch.stack([-first[:, 1], first[:, 0], records[:, 1, 2]], -1)
+    records[:, 2, :3] = torch.stack([zero, zero, normals[:, 2]], -1)
+    return RayRecords(records, planes, normals, normals[:, 2].sign().contiguous())
+
+
+def reaches_of(opacities: torch.Tensor, gammas: torch.Tensor) -> torch.Tensor:
+    """Return (N, 2): what |u| and |v| of a hit cannot exceed, 0 for a surfel that is too transparent to be hit."""
+    limits = 2 * (255.0 * 1.001 * opacities).log()
+    return (limits.clamp_min(0)[:, None] ** (0.5 / gammas)).where(limits[:, None] > 0, 0).contiguous()
+
+
+def intersect_rays(surfels: RayRecords, reaches: torch.Tensor, keys: torch.Tensor, rays: torch.Tensor) -> RayTiles:
+    """List the surfels of each tile of 16 x 16 rays, by rising key; no surfel that a ray hits is left out.
+
+    Args:
+        surfels: the N surfels.
+        reaches: (N, 2), see `reaches_of`.
+        keys: (N,) what sorts surfels near to far; ties by index.
+        rays: (H, W, 3).
+
+    Raises:
+        ValueError, OutOfMemoryError: there are more entries than lists or memory hold.
+    """
+    height, width = rays.shape[:2]
+    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    real = real_of(rays)
+    t = types(real)
+    order = torch.sort(keys.float(), stable=True).indices.int()
+    bounds = [*_bounds(rays, TILE_SIZE), *_bounds(rays, TILE_SIZE * SPAN)]
+    count, device = len(order), rays.device
+    counts = torch.zeros(count, dtype=torch.int64, device=device)
+    none = torch.zeros(0, dtype=torch.int64, device=device)
+    inputs = [
+        array(order, wp.int32),
+        array(surfels.records.contiguous(), t.vec4),
+        array(surfels.facings, real),
+        array(reaches, t.vec2),
+        *(array(x, dtype) for x, dtype in zip(bounds, (t.mat33, t.vec2, t.vec2) * 2, strict=True)),
+        wp.vec2i(columns, rows),
+        SPAN,
+    ]
+    kernel = ray_list_kernels(real).lists
+    unused = array(order.new_zeros(1), wp.int32)
+    launch(rays, kernel, count, [*inputs, array(none, wp.int64)], [array(counts, wp.int64), unused, unused])
+    ends = counts.cumsum(0)
+    total = check_entries(int(ends[-1]), count, columns * rows) if count else 0
+    check_memory(BYTES_AN_ENTRY * total, device, f"a list of {total:,} (tile, surfel) entries")
+    tiles, ids = (torch.zeros(total, dtype=torch.int32, device=device) for _ in range(2))
+    outputs = [array(counts, wp.int64), array(tiles, wp.int32), array(ids, wp.int32)]
+    if total:
+        launch(rays, kernel, count, [*inputs, array(ends, wp.int64)], outputs)
+    tiles, sorting = torch.sort(tiles, stable=True)
+    every = torch.arange(columns * rows + 1, dtype=torch.int32, device=device)
+    return RayTiles(ids[sorting].contiguous(), torch.searchsorted(tiles, every).contiguous(), columns)
+
+
+def _bounds(rays: torch.Tensor, side: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Bound the rays of blocks of `side` x `side` pixels, row by row.
+
+    Returns:
+        (B, 3, 3) frames, whose rows are axes; (B, 2) middles and (B, 2) half extents of the rectangle that holds all
+        rays (x, y, 1) in the block's frame; half extents of UNBOUNDED where there is none.
+    """
+    height, width = rays.shape[:2]
+    columns, rows = -(-width // side), -(-height // side)
+    at = [torch.arange(n * side, device=rays.device).clamp_max(m - 1) for n, m in ((rows, height), (columns, width))]
+    blocks = rays[at[0]][:, at[1]].view(rows, side, columns, side, 3).transpose(1, 2).reshape(-1, side * side, 3)
+    lengths = blocks.norm(dim=-1, keepdim=True)
+    exists = lengths[..., 0] > 0
+    units = blocks / lengths.where(lengths > 0, 1)
+    forward = torch.nn.functional.normalize(units.sum(1), dim=-1)
+    # Any axis across: the coordinate axis that is farthest from the mean ray turns into one.
+    other = torch.eye(3).to(rays)[forward.abs().argmin(-1)]
+    right = torch.nn.functional.normalize(torch.linalg.cross(other, forward), dim=-1)
+    frames = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+    local = units @ frames.mT
+    cosines = local[..., 2].where(exists, 1.0)
+    bounded = (cosines.amin(1) > LEAST_COSINE) & exists.any(1)
+    x = local[..., :2] / cosines.clamp_min(LEAST_COSINE)[..., None]
+    low = x.where(exists[..., None], torch.inf).amin(1)
+    high = x.where(exists[..., None], -torch.inf).amax(1)
+    half = (0.5 * (high - low) * WIDER + 1e-6).where(bounded[:, None], UNBOUNDED)
+    # Where no pixel has a ray, an empty rectangle culls nearly all.
+    half = half.where(exists.any(1)[:, None], 0.0)
+    middle = (0.5 * (low + high)).where(bounded[:, None], 0.0)
+    return frames.nan_to_num(0.0).contiguous(), middle.contiguous(), half.contiguous()
+
+
+def collect_rays(
+    surfels: RayRecords,
+    limits: torch.Tensor,
+    tiles: RayTiles,
+    rays: torch.Tensor,
+    near: float,
+    viewmat: torch.Tensor,
+    *,
+    max_hits: int,
+) -> RayHits:
+    """Walk every ray's list front to back.
+
+    Args:
+        surfels: the N surfels.
+        limits: (N,) as in `Projection`.
+        tiles: their lists.
+        rays: (H, W, 3); where it is 0, there is no ray and nothing is hit.
+        near: hits at a depth of at most this are ignored.
+        viewmat: (4, 4) world to camera, which turns the normals into the world.
+        max_hits: K, 0 to 8.
+    """
+    real = real_of(rays)
+    t = types(real)
+    height, width = rays.shape[:2]
+    check_tensors({"rays": (rays, ("H", "W", 3)), "limits": (limits, (len(surfels.records),))})
+    plain, base, normals = (rays.new_zeros(height, width, 3) for _ in range(3))
+    alpha, expected, median, top = (rays.new_zeros(height, width) for _ in range(4))
+    ids = torch.full((height, width, max_hits), -1, dtype=torch.int32, device=rays.device)
+    depths, weights = (rays.new_zeros(height, width, max_hits) for _ in range(2))
+    parallel = surfels.planes is not None
+    inputs = [
+        array(surfels.records.contiguous(), t.vec4),
+        array(surfels.normals if surfels.planes is None else surfels.planes, t.vec3),
+        array(surfels.normals, t.vec3),
+        array(limits, real),
+        array(tiles.surfel_ids, wp.int32),
+        array(tiles.tile_offsets, wp.int64),
+        array(rays.contiguous().view(-1, 3), t.vec3),
+        wp.vec2i(width, height),
+        tiles.columns,
+        int(parallel),
+        near,
+    ]
+    buffers = [(ids, wp.int32), (depths, real), (weights, real)]
+    outputs = [
+        *(array(x.view(-1, 3), t.vec3) for x in (plain, base)),
+        *(array(x.view(-1, max_hits) if max_hits else x.new_empty(1, 1), dtype) for x, dtype in buffers),
+        *(array(x.view(-1), real) for x in (alpha, expected, median, top)),
+        array(normals.view(-1, 3), t.vec3),
+    ]
+    pixels = TILE_SIZE**2
+    threads = (len(tiles.tile_offsets) - 1) * pixels
+    kernel = collect_rays_kernel(real, max_hits, TILE_SIZE)
+    launch(rays, kernel, threads, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels)
+    normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
+    return RayHits(plain, base, ids, depths, weights, alpha, Surface(expected, median, top, normals))

@@ -1,0 +1,124 @@
+"""Test-time pose optimisation: test cameras moved to where their photos fit the rendering best, the model fixed.
+
+The poses of a refined training agree with each other, but those of its test photos are still the given ones, with their
+errors. As in BARF and its followers, the test poses are then fitted to the test photos before they are judged. The
+model never changes, and metrics.json says that it was done: these figures are not those of given test poses.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.checks import check_range
+from nexwarp.data import View
+from nexwarp.model.model import Model
+from nexwarp.representation.poses import corrected, pose_differences
+
+STEPS = 80  # of each view; the first half sees the photo at half its size
+RATE = 5e-3  # Adam's first learning rate: radians, and shifts in scene scales
+LAST_RATE = 0.02  # the last rate, relative to the first
+
+
+def fit_poses(
+    model: Model,
+    views: Sequence[View],
+    *,
+    steps: int = STEPS,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[list[View], dict[str, float]]:
+    """Return views with the poses at which the model's renderings fit their photos best, and what was done.
+
+    Args:
+        model: the model, on the device to render on; its parameters stay as they are.
+        views: the views.
+        steps: gradient steps of each view.
+        progress: called with each view's name after it is fitted.
+
+    Returns:
+        The views, and entries for metrics.json: how the poses were fitted and how far they moved.
+    """
+    check_range("steps", steps, 1)
+    scale = model.meta.get("scene_scale", 1.0)
+    unit = float(scale) if isinstance(scale, (int, float)) else 1.0
+    fitted = []
+    with _frozen(model), torch.enable_grad():
+        for view in views:
+            fitted.append(dataclasses.replace(view, camera=_fit(model, view, unit, steps)))
+            if progress is not None:
+                progress(view.name)
+    poses = [torch.stack([view.camera.viewmat for view in group]) for group in (views, fitted)]
+    angles, shifts = pose_differences(*poses)
+    facts: dict[str, float] = {
+        "steps": steps,
+        "mean_rotation_degrees": angles.mean().item(),
+        "mean_shift_scene_scales": shifts.mean().item() / unit,
+    }
+    return fitted, facts
+
+
+def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
+    """Return a view's camera on the CPU, at the pose of the smallest L1 error that the descent has met."""
+    given = view.camera.to(model.device)
+    photo = view.image.to(model.device).float() / 255
+    counts = torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo)
+    twist = torch.zeros(6, device=model.device, requires_grad=True)
+    units = torch.tensor([1.0] * 3 + [unit] * 3, device=model.device)
+    optimizer = torch.optim.Adam([twist], lr=RATE)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / steps))
+    pivot = _middle_depth(model, given, unit)
+    small = _halved(given, photo, counts)
+    best, least = given.viewmat, float("inf")
+    for step in range(steps + 1):
+        coarse = small is not None and step < steps // 2
+        camera, target, mask = small if coarse and small is not None else (given, photo, counts)
+        viewmat = corrected(given.viewmat, units * twist, pivot)
+        moved = dataclasses.replace(camera, viewmat=viewmat, checked=(camera.fx, camera.fy, camera.cx, camera.cy))
+        error = ((model.render(moved).image.clamp(0, 1) - target).abs().mean(-1) * mask).sum() / mask.sum().clamp(min=1)
+        if not coarse and error.item() < least:
+            best, least = viewmat.detach(), error.item()
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+        schedule.step()
+    return dataclasses.replace(given, viewmat=best, checked=(given.fx, given.fy, given.cx, given.cy)).to("cpu")
+
+
+@torch.no_grad()
+def _middle_depth(model: Model, camera: Camera, unit: float) -> torch.Tensor:
+    """Return the median z-depth of a rendering, (), world units; where nothing is hit, `unit`."""
+    depths = model.render(camera).median_depth
+    seen = depths[depths > 0]
+    return seen.median() if len(seen) else depths.new_tensor(unit)
+
+
+def _halved(
+    camera: Camera, photo: torch.Tensor, counts: torch.Tensor
+) -> tuple[Camera, torch.Tensor, torch.Tensor] | None:
+    """Return camera, photo and mask at half the size; None where that is less than a pixel."""
+    if min(camera.width, camera.height) < 2:
+        return None
+    layers = torch.cat([photo, counts[..., None]], -1).permute(2, 0, 1)
+    layers = torch.nn.functional.avg_pool2d(layers, 2).permute(1, 2, 0)
+    K = camera.K.clone()
+    K[:2] /= 2
+    return (
+        Camera(camera.viewmat, K, camera.width // 2, camera.height // 2, camera.near),
+        layers[..., :3].contiguous(),
+        (layers[..., 3] == 1).to(photo),
+    )
+
+
+@contextmanager
+def _frozen(model: Model) -> Iterator[None]:
+    """Let no parameter of a model take gradients."""
+    taken = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
+    try:
+        for parameter, _ in taken:
+            parameter.requires_grad_(False)
+        yield
+    finally:
+        for parameter, before in taken:
+            parameter.requires_grad_(before)
