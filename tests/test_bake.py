@@ -16,7 +16,7 @@ from nexwarp.bake.layout import lay_out
 from nexwarp.bake.observe import observe
 from nexwarp.errors import FormatError
 from nexwarp.model.splats_spz import save_splats_spz
-from nexwarp.web.atlas import as_stored, decode_harmonics, encode_harmonics
+from nexwarp.web.atlas import ATLAS_FILE, BAKED_FILE, as_stored, decode_harmonics, encode_baked, encode_harmonics
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 from tests.web.baked_support import bilinear, composited, ring
@@ -124,6 +124,17 @@ def test_codes_are_near_the_values(baked):
     codes_, ranges = encode_harmonics(baked.surfels)
     error = np.abs(decode_harmonics(codes_, ranges) - values)
     assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
+
+
+@pytest.mark.cuda
+def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
+    views = list(cameras.values())
+    there = bake(copy.deepcopy(model).cuda(), views, steps=40)
+    for camera in views:
+        assert psnr(as_stored(there).render(camera).cpu(), as_stored(baked).render(camera)) > 35
+    assert encode_baked(there, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
+    pytest.importorskip("trimesh")
+    save_glb(tmp_path / "scene.glb", there, views)
 
 
 def test_no_cameras_are_refused(model):

@@ -76,13 +76,9 @@ def export_run(
         return _export_cameras(run, folder, source)
     if kind == "compact":
         return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
-    model, cameras = load(run), list(_all_cameras(run).values())
     if kind == "glb":
-        if not cameras:
-            raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
-        check_package()
-        save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
-        return [folder / GLB_FILE]
+        return _export_glb(run, folder, device)
+    model, cameras = load(run), list(_all_cameras(run).values())
     degree = model.options.sh_degree
     if kind == "spz":
         save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
@@ -122,6 +118,16 @@ def export_mesh(
     mesh = extract_mesh(load(run).to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
     save_mesh(folder / MESH_FILE, mesh)
     return [folder / MESH_FILE]
+
+
+def _export_glb(run: Path, folder: Path, device: torch.device | str) -> Sequence[Path]:
+    """Write the baked surfels of a run as a glTF file."""
+    cameras = list(_all_cameras(run).values())
+    if not cameras:
+        raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+    check_package()
+    save_glb(folder / GLB_FILE, bake(load(run).to(device), cameras), cameras)
+    return [folder / GLB_FILE]
 
 
 def _export_cameras(run: Path, folder: Path, source: SceneSource) -> Sequence[Path]:
