@@ -67,13 +67,8 @@ def export_run(
     if kind == "web":
         from nexwarp.web.export import export_web
 
-        return export_web(
-            load(run).to(device),
-            _all_cameras(run),
-            folder or run / EXPORT_FOLDER / WEB_FILE,
-            quality=quality,
-            title=run_title(source),
-        )
+        model, out = load(run).to(device), folder or run / EXPORT_FOLDER / WEB_FILE
+        return export_web(model, _all_cameras(run), out, quality=quality, title=run_title(source))
     folder = folder or run / EXPORT_FOLDER
     if kind == "mesh":
         return export_mesh(run, folder, device)
