@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp import ops
+from nexwarp.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.checks import check_tensors
 from nexwarp.model.options import RenderOptions
@@ -104,7 +105,9 @@ def render_rays(
     image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
     plain = hits.plain
     if exposures is not None:
-        gains = exposures.gains(camera).to(image)
+        size = (camera.width, camera.height, camera.near)
+        posed = Camera(viewmat, torch.eye(3).to(viewmat), *size, checked=(1.0, 1.0, 0.0, 0.0))
+        gains = exposures.gains(posed).to(image)
         image, plain, textured = (x * gains for x in (image, plain, textured))
     s = hits.surface
     surface = (s.expected_depth, s.median_depth, s.top_depth, s.normals)
