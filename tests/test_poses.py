@@ -80,7 +80,10 @@ def test_a_common_motion_and_scale_of_all_cameras_is_no_correction(tiny_scene):
         moved[:3, 3] *= scaling
         change = moved @ torch.linalg.inv(viewmat)
         turn = 0.5 * (change[:3, :3] - change[:3, :3].mT)
-        twists.append(torch.stack([turn[2, 1], turn[0, 2], turn[1, 0], *(change[:3, 3] / tiny_scene.scale)]))
+        twist = torch.stack([turn[2, 1], turn[0, 2], turn[1, 0]])
+        # About a pivot ahead, at a z-depth of one scale.
+        ahead = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        twists.append(torch.cat([twist, change[:3, 3] / tiny_scene.scale - torch.linalg.cross(ahead, twist)]))
     common = torch.stack(twists).float()
     own = 1e-3 * torch.randn(len(given), 6)
     poses.load(own)

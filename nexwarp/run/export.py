@@ -67,13 +67,9 @@ def export_run(
     if kind == "web":
         from nexwarp.web.export import export_web
 
-        return export_web(
-            load(run).to(device),
-            _all_cameras(run),
-            folder or run / EXPORT_FOLDER / WEB_FILE,
-            quality=quality,
-            title=run_title(source),
-        )
+        place = folder or run / EXPORT_FOLDER / WEB_FILE
+        model, cameras_by_name = load(run).to(device), _all_cameras(run)
+        return export_web(model, cameras_by_name, place, quality=quality, title=run_title(source))
     folder = folder or run / EXPORT_FOLDER
     if kind == "mesh":
         return export_mesh(run, folder, device)
@@ -87,13 +83,13 @@ def export_run(
             raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
         save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
         return [folder / GLB_FILE]
-    degree = model.options.sh_degree
+    gaussians = (model.surfels, model.options.sh_degree)
     if kind == "spz":
-        save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=cameras, max_extent=max_extent)
         return [folder / SPZ_FILE]
     files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
     save_surfels_ply(files[0], model.surfels)
-    save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+    save_splats_ply(files[1], *gaussians, cameras=cameras, max_extent=max_extent)
     return files
 
 
