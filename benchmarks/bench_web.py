@@ -10,10 +10,10 @@ of `Model.render`.
 
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 import torch
@@ -24,10 +24,13 @@ from benchmarks.timing import git_commit
 from nexwarp.camera import resized
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.model.model import Model
+from nexwarp.representation.texture import TextureShape
+from nexwarp.train.presets import preset
 from nexwarp.web.renderer import Renderer
 from nexwarp.web.scene_data import SceneData
 from nexwarp.web.scene_file import encode_scene
 from nexwarp.web.scene_reader import decode_scene
+from nexwarp.web.sections import matrix_shapes
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class Case:
         uniform: its weights in a uniform buffer.
         texel_step: pixels between evaluations of the texture.
         least_weight: smallest weight of a textured second hit.
+        small: the network of `--preset web` instead of the scene's, not trained: its picture means nothing.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Case:
     uniform: bool = True
     texel_step: int = 1
     least_weight: float = 0.0
+    small: bool = False
 
 
 CASES = (
@@ -57,6 +62,8 @@ CASES = (
     Case("texture at half resolution", texel_step=2),
     Case("second hits below 1/64 plain", least_weight=1 / 64),
     Case("both", texel_step=2, least_weight=1 / 64),
+    Case("network of preset web", small=True),
+    Case("network of preset web, both", texel_step=2, least_weight=1 / 64, small=True),
 )
 FORMS = (
     Case("half precision, weights in storage", uniform=False),
@@ -137,16 +144,28 @@ def compare(arguments: Arguments, model: Model, scenes: dict[str, SceneData]) ->
         print(text, flush=True)
 
 
-def times(arguments: Arguments, scene: SceneData, camera: nw.Camera) -> None:
+def small_texture(scene: SceneData) -> SceneData:
+    """Return the scene with the texture network of `--preset web`, its weights random."""
+    if scene.texture is None:
+        return scene
+    config = preset("web").texture
+    shape = {**scene.texture.shape, "width": config.width, "hidden_layers": config.hidden_layers, "sh_degree": 1}
+    rng = np.random.default_rng(0)
+    matrices = [0.3 * rng.standard_normal(size).astype(np.float32) for size in matrix_shapes(shape)]
+    return replace(scene, texture=replace(scene.texture, shape=cast(TextureShape, shape), matrices=matrices))
+
+
+def times(arguments: Arguments, scene: SceneData, camera: nw.Camera, cases: Sequence[Case]) -> None:
     """Print the times of the stages for each way to render."""
     reference = None
-    renderers: dict[tuple[bool, bool, bool], Renderer] = {}
-    for case in (*CASES, *(FORMS if arguments.forms else ())):
+    renderers: dict[tuple[bool, bool, bool, bool], Renderer] = {}
+    for case in cases:
         start = time.perf_counter()
-        form = (case.half, case.unrolled, case.uniform)
+        form = (case.half, case.unrolled, case.uniform, case.small)
         if form not in renderers:
-            half, unrolled, uniform = form
-            renderers[form] = Renderer(scene, half=half, unrolled=unrolled, uniform=uniform)
+            half, unrolled, uniform, small = form
+            content = small_texture(scene) if small else scene
+            renderers[form] = Renderer(content, half=half, unrolled=unrolled, uniform=uniform)
         renderer = renderers[form]
         out = renderer.render(camera, texel_step=case.texel_step, least_weight=case.least_weight)
         first = time.perf_counter() - start
@@ -210,10 +229,12 @@ def main(arguments: Arguments) -> None:
     camera = resized(next(iter(sets["test"].values())), width, height)
     print(f"{arguments.run.name} at {width}x{height}, median of {arguments.frames}")
     if arguments.frames:
-        times(arguments, scenes["quantised"], camera)
+        times(arguments, scenes["quantised"], camera, CASES)
     if arguments.frames and torch.cuda.is_available():
         cuda_times(arguments, camera)
     compare(arguments, model, scenes)
+    if arguments.forms:
+        times(arguments, scenes["quantised"], camera, FORMS)
 
 
 if __name__ == "__main__":

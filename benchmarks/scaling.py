@@ -238,8 +238,8 @@ def silent(trainer: ParallelTrainer) -> Iterator[None]:
 
 
 def gradient_bytes(surfels: int, table: int, levels: int = 8, features: int = 4) -> tuple[int, int]:
-    """Return the bytes of the two buckets: the grid's, and those of surfels (60 numbers each) and MLP."""
-    return 4 * levels * table * features, 4 * (60 * surfels + 64 * 32 + 64 * 64 + 48 * 64)
+    """Return the bytes of the two buckets: the grid's, and those of surfels (60 numbers and an error each) and MLP."""
+    return 4 * levels * table * features, 4 * (61 * surfels + 64 * 32 + 64 * 64 + 48 * 64)
 
 
 def simulate(step: float, hidden: float, surfels: int, table: int, gbits: float) -> str:

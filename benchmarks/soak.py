@@ -21,8 +21,8 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.buffers import render_buffers
-from nexwarp.cli.device import keep_freed_memory
 from nexwarp.data import Scene, write_demo
+from nexwarp.memory import keep_freed_memory
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.report import StepReport

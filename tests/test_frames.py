@@ -111,8 +111,9 @@ def test_buffers_are_copied_when_they_are_asked_for() -> None:
         graphs = Graphs()
 
     frame: Any = Frame()
+    stream: Any = None
     frame.result = result
-    out, same, deep = (frames.CapturedRendering.of(frame) for _ in range(3))
+    out, same, deep = (frames.CapturedRendering.of(frame, stream) for _ in range(3))
     assert out.ids is not result.ids and "depths" in vars(out) and "depths" not in vars(same)
     assert out.ids is out.intermediates.hits.ids
     same.take_buffers()
@@ -167,6 +168,20 @@ def test_renderings_outlive_the_next_frames(model: nw.Model) -> None:
     for out, same in zip(outs, (*expected, *expected), strict=True):
         assert_same(out, same, (*BUFFERS, "ids", *LATER))
     assert all(torch.equal(image, out.image) for image, out in zip(images, expected, strict=True))
+
+
+@CUDA
+def test_renderings_of_other_sizes_do_not_overwrite_each_other(model: nw.Model) -> None:
+    """All graphs share the memory of their temporary buffers, in which another one may have its results."""
+    views = [cameras("cuda", 1, width=width, height=45)[0] for width in (61, 33, 90)]
+    with torch.no_grad():
+        with frames.without_graphs():
+            expected = [model.render(camera, max_hits=k) for camera, k in zip(views, (2, 4, 1), strict=True)]
+        for _ in range(4):
+            outs = [model.render(camera, max_hits=k) for camera, k in zip(views, (2, 4, 1), strict=True)]
+            for out, same in zip(reversed(outs), reversed(expected), strict=True):
+                assert_same(out, same, (*BUFFERS, "ids", *LATER))
+    assert len(graphs(model).frames) == 3
 
 
 @CUDA

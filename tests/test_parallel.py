@@ -5,11 +5,13 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import cast
 
 import pytest
 import safetensors.torch
 import torch
 
+from benchmarks import scaling
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.distributed import join, liveness
@@ -18,6 +20,7 @@ from nexwarp.distributed.launch import check_count
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train import presets
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
@@ -36,6 +39,7 @@ from tests.ranks_support import (
     start_ranks,
     wait,
 )
+from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
@@ -123,14 +127,14 @@ def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: i
 def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
     """Whatever the number of ranks, views come in one order, with random numbers of their own."""
     views = len(scene.train)
-    taken: dict[int, list[object]] = {}
+    taken: dict[int, list[int]] = {}
     for size in (2, 3):
         trainers = [alone_as(rank, size, scene, small(iterations=3 * views)) for rank in range(size)]
         for trainer in trainers:
-            trainer.targets.make = lambda index, *_: index  # type: ignore[method-assign,assignment,misc,return-value]
+            trainer.targets.make = lambda index, *_: index  # type: ignore[method-assign]
         while trainers[0].iteration < 3 * views:
             first = trainers[0].iteration
-            chosen: list[object] = [trainer._next_target() for trainer in trainers]
+            chosen = [cast(int, trainer._next_target()) for trainer in trainers]
             for offset in range(trainers[0].views_a_step):
                 taken.setdefault(first + offset, []).append(chosen[offset])
         weights = [trainer.share for trainer in trainers]
@@ -150,6 +154,18 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
+
+
+def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    texture = NeuralTexture(levels=8, table_size=2**10, features=4, residual=True)
+    surfels = make_surfels(random_scene(24))
+    numbers = sum(x.numel() for x in (*surfels.parameters(), *texture.mlp.parameters())) + len(surfels)  # error sums
+    assert scaling.gradient_bytes(24, 2**10) == (4 * texture.grid.numel(), 4 * numbers)
+    assert scaling.main(["--simulate", "--step-ms", "10", "--surfels", "400000"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    counts, efficiencies = [int(row[0]) for row in rows], [float(row[5]) for row in rows]
+    assert counts == [1, 2, 4, 8, 16, 32, 64] and efficiencies[0] == 1.0
+    assert efficiencies == sorted(efficiencies, reverse=True) and efficiencies[3] > 2 * efficiencies[4]
 
 
 # Bad input

@@ -96,7 +96,7 @@ def test_a_run_goes_on_with_any_number_of_ranks(tiny_folder: Path, tmp_path: Pat
     run, alone = tmp_path / "run", tmp_path / "alone"
     options = ["--iterations", "600", "--checkpoint-every", "60"]
     begun = ["train", str(tiny_folder), "--run", str(run)]
-    reached = []
+    reached: list[int] = []
     for count, more in ((2, [*TRAIN, *options]), (1, ["--device", "cpu", "--resume"])):
         process = start([*begun, *more, "--gpus", str(count)])
         before = reached[-1] if reached else 0

@@ -91,7 +91,7 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
     scene = random_scene(600, **size)
     errors = errors_of(scene)
     results = []
-    for count in (1, 2, 3):
+    for count in (1, 2, 3, 20):  # 20 threads share more chunks
         launch.set_num_threads(count)
         passes = Passes(scene, low_pass=low_pass)
         request = passes.hits.error_request
@@ -151,6 +151,12 @@ def test_chunks_cover_the_range_once_whatever_the_threads(dim, align):
     assert covered == dim
     launch.set_num_threads(3)
     assert launch.chunks(dim, align) == parts
+
+
+def test_many_threads_share_more_chunks():
+    assert len(launch.chunks(1_000_003, most=160)) == 160
+    assert launch.chunks(1_000_003, most=160)[-1][1] == 1_000_003
+    assert len(launch.chunks(4096, most=160)) == 16  # chunks have a smallest size
 
 
 # Tiles

@@ -1,5 +1,6 @@
 """The baked scene as a glTF file: one textured quad a surfel, for Blender, three.js and other programs."""
 
+import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from nexwarp.bake.baked import Baked
 from nexwarp.bake.layout import Layout, lay_out_boxes
 from nexwarp.bake.observe import axes
 from nexwarp.camera import Camera
-from nexwarp.errors import SettingError
+from nexwarp.errors import FormatError, SettingError
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.types import ALPHA_MAX
@@ -39,18 +40,17 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
 
     Raises:
         SettingError: trimesh, of the extra `glb`, is not installed.
+        FormatError: no surfel is opaque enough to be seen.
         OSError: `path` cannot be written.
     """
-    try:
-        import trimesh
-        from trimesh.exchange.gltf import export_glb
-    except ImportError:
-        raise SettingError(
-            "--format glb: expected trimesh; install the extra with pip install 'nexwarp[glb]'"
-        ) from None
+    check_package()
+    import trimesh
     from PIL import Image
+    from trimesh.exchange.gltf import export_glb
 
     layout, pixels = _texture(baked, side)
+    if not len(layout.textured()):
+        raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
     corners, places, faces = _quads(baked, layout)
     mesh = trimesh.Trimesh(
         vertices=corners @ upright(cameras).T,
@@ -71,6 +71,12 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
     )
     content = export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit)
     write_atomically(Path(path), content)
+
+
+def check_package() -> None:
+    """Raise SettingError unless trimesh is installed."""
+    if importlib.util.find_spec("trimesh") is None:
+        raise SettingError("--format glb: needs the package trimesh, found none; pip install 'nexwarp[glb]'")
 
 
 def upright(cameras: Sequence[Camera]) -> np.ndarray:

@@ -16,7 +16,7 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -76,6 +76,9 @@ class FrameGraphs:
         # When the memory that all graphs share was last used, and on which stream.
         self.used = torch.cuda.Event()
         self.user: torch.cuda.Stream | None = None
+        # The last rendering, whose buffers may still be in that memory. Any graph overwrites them: the results of one
+        # may lie where another one has its temporary buffers.
+        self.latest: weakref.ref[CapturedRendering] | None = None
 
     def render(
         self,
@@ -146,16 +149,18 @@ class FrameGraphs:
             return had
 
     @contextmanager
-    def using(self) -> Iterator[None]:
-        """Use the graphs' memory on the current stream, after all earlier uses."""
-        stream = torch.cuda.current_stream(self.stream.device)
+    def using(self, stream: torch.cuda.Stream | None = None) -> Iterator[torch.cuda.Stream]:
+        """Use the graphs' memory on a stream, by default the current one, after all earlier uses."""
+        switched = nullcontext() if stream is None else torch.cuda.stream(stream)
+        stream = torch.cuda.current_stream(self.stream.device) if stream is None else stream
         if self.user is not None and self.user != stream:
             stream.wait_event(self.used)
             for frame in self.frames.values():
                 # Their memory is for other use only when this stream is done with it, too.
                 for x in frame.staged:
                     x.record_stream(stream)
-        yield
+        with switched:
+            yield stream
         self.user = stream
         self.used.record(stream)
 
@@ -192,7 +197,6 @@ class _Frame:
         with graphs.using(), ops.captured(self.graph, graphs.stream, graphs.pool):
             self.result = work(self.camera, self.background)
         self.room = self.result.intermediates.tiles.room
-        self.latest: weakref.ref[CapturedRendering] | None = None
 
     def replay(
         self, camera: Camera, background: Color, exposures: Exposures | None
@@ -202,14 +206,14 @@ class _Frame:
         Returns:
             The rendering, and whether the lists of surfels have held all entries, as far as is known.
         """
-        if self.latest is not None and (latest := self.latest()) is not None:
+        if self.graphs.latest is not None and (latest := self.graphs.latest()) is not None:
             latest.take_buffers()
-        with self.graphs.using():
+        with self.graphs.using() as stream:
             self._stage(camera, background, exposures)
             self.graph.replay()
-            rendering = CapturedRendering.of(self)
+            rendering = CapturedRendering.of(self, stream)
             held = ops.held(self.room)
-        self.latest = weakref.ref(rendering)
+        self.graphs.latest = weakref.ref(rendering)
         return rendering, held
 
     def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
@@ -239,16 +243,16 @@ class _Frame:
 class CapturedRendering(Rendering):
     """A rendering by a graph. All but the image is copied from the graph's memory when it is first asked for.
 
-    A rendering that is still there when the graph is replayed gets its copies before.
+    A rendering that is still there when a graph of the model is replayed gets its copies before.
     """
 
     frame: "_Frame | None"
 
     @classmethod
-    def of(cls, frame: _Frame) -> "CapturedRendering":
-        """Return the rendering that the graph was last replayed for."""
+    def of(cls, frame: _Frame, stream: torch.cuda.Stream) -> "CapturedRendering":
+        """Return the rendering that the graph was last replayed for, on a stream."""
         rendering = cls.__new__(cls)
-        rendering.__dict__.update(image=frame.result.image.clone(), frame=frame)
+        rendering.__dict__.update(image=frame.result.image.clone(), frame=frame, stream=stream)
         return rendering
 
     def __getattr__(self, name: str) -> Any:
@@ -265,7 +269,8 @@ class CapturedRendering(Rendering):
         with frame.graphs.lock:
             if self.__dict__["frame"] is None:  # another thread was faster
                 return
-            with frame.graphs.using(), torch.inference_mode(False), torch.no_grad():
+            # On the stream of its image, whichever thread it is that needs the graph's memory.
+            with frame.graphs.using(self.__dict__["stream"]), torch.inference_mode(False), torch.no_grad():
                 copies: dict[int, torch.Tensor] = {}
                 for name in _RELEASABLE:
                     self.__dict__[name] = _copied(getattr(frame.result, name), copies)

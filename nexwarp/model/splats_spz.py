@@ -1,5 +1,6 @@
 """Surfels as quantised Gaussians in Niantic's SPZ format, a tenth of the size of the PLY file; by GaussForge."""
 
+import importlib.util
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -38,12 +39,10 @@ def save_splats_spz(
         ValueError: an argument is out of its range.
         OSError: `path` cannot be written.
     """
-    try:
-        import gaussforge
-    except ImportError:
-        raise SettingError(
-            "--format spz: needs the package gaussforge, found none; pip install 'nexwarp[splats]'"
-        ) from None
+    if importlib.util.find_spec("gaussforge") is None:
+        raise SettingError("--format spz: needs the package gaussforge, found none; pip install 'nexwarp[splats]'")
+    import gaussforge
+
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
         save_splats_ply(ply, surfels, sh_degree, cameras=cameras, max_extent=max_extent)

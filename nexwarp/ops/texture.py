@@ -123,9 +123,10 @@ class _Texture(torch.autograd.Function):
             *layers, coefficients = _mlp(encoded, matrices, keep)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
-        ctx.save_for_backward(
-            positions, depths, directions, resolutions, focal, table, coefficients, *layers, *matrices
-        )
+        # What was clamped, and how colours follow from directions, is all that the backward pass reads of them.
+        read = directions is not None and (clamp or ctx.needs_input_grad[2])
+        kept = coefficients if read else coefficients.new_empty(len(coefficients), 0)
+        ctx.save_for_backward(positions, depths, directions, resolutions, focal, table, kept, *layers, *matrices)
         if directions is None:
             return coefficients[:, :count].to(grid.dtype)
         colors = torch.empty_like(positions)
@@ -148,11 +149,12 @@ class _Texture(torch.autograd.Function):
         scale = gradient_scale(grad, table.dtype)
         grad_directions = None
         if directions is None:
-            signal = torch.zeros_like(coefficients)
+            signal = coefficients.new_zeros(len(coefficients), layers[0].shape[1])
             signal[:, : grad.shape[1]] = grad * scale
         else:
-            signal, grad_directions = _colors_backward(
-                coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
+            signal = coefficients.new_empty(len(coefficients), layers[0].shape[1])
+            grad_directions = _colors_backward(
+                signal, coefficients, directions, grad.contiguous(), scale, ctx.offset, ctx.clamp, need_directions
             )
         unscale = scale.reciprocal()
         with torch.autocast(grad.device.type, enabled=False):
@@ -236,7 +238,7 @@ def _mlp_backward(
             grads.insert(0, _product(signal, layer))
             signal = matrix.T @ signal
             if len(grads) < len(matrices):
-                signal = torch.ops.aten.threshold_backward(signal, layer, 0)
+                signal = _relu_backward(signal, layer)
         return signal, grads
     count = signal.shape[1]
     result = torch.empty_like(layers[0])
@@ -251,10 +253,15 @@ def _mlp_backward(
             if i == 0:
                 torch.mm(matrices[0].T, here, out=result[:, columns])
             else:
-                here = torch.ops.aten.threshold_backward(matrices[i].T @ here, layer, 0)
+                here = _relu_backward(matrices[i].T @ here, layer)
 
     share_columns(count, part)
     return result, [functools.reduce(torch.Tensor.add_, slot.unbind()) for slot in slots]
+
+
+def _relu_backward(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
+    """Zero, in place, the gradient of a layer where the layer is 0."""
+    return torch.ops.aten.threshold_backward.grad_input(signal, layer, 0, grad_input=signal)
 
 
 def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
@@ -351,6 +358,7 @@ def _colors(
 
 
 def _colors_backward(
+    signal: torch.Tensor,
     coefficients: torch.Tensor,
     directions: torch.Tensor,
     grad_colors: torch.Tensor,
@@ -358,11 +366,11 @@ def _colors_backward(
     offset: float,
     clamp: bool,
     need_directions: bool,
-) -> tuple[torch.Tensor, torch.Tensor | None]:
+) -> torch.Tensor | None:
+    """Write the gradient of the coefficients to `signal`, which has their padded shape; return that of directions."""
     real = real_of(directions)
     vec3 = types(real).vec3
     count = len(grad_colors)
-    signal = torch.empty_like(coefficients)
     if signal.shape[1] > count:
         signal[:, count:] = 0
     slots = directions.new_zeros(count if need_directions else 0, 3)
@@ -375,4 +383,4 @@ def _colors_backward(
         arguments,
         [array(signal, STORAGES[coefficients.dtype]), array(slots, vec3)],
     )
-    return signal, slots.view(len(directions), -1, 3).sum(1) if need_directions else None
+    return slots.view(len(directions), -1, 3).sum(1) if need_directions else None

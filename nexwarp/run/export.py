@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from nexwarp.bake.fit import bake
-from nexwarp.bake.glb import save_glb
+from nexwarp.bake.glb import check_package, save_glb
 from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
@@ -81,6 +81,7 @@ def export_run(
     if kind == "glb":
         if not cameras:
             raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        check_package()
         save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
         return [folder / GLB_FILE]
     gaussians = (model.surfels, model.options.sh_degree)

@@ -12,6 +12,7 @@ from nexwarp import ops
 from nexwarp.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.memory import needed_memory
+from nexwarp.model.frames import release_graphs
 from nexwarp.model.options import RenderOptions
 from nexwarp.train.target import Target
 
@@ -121,9 +122,10 @@ class StepGraphs:
         return work(target)
 
     def clear(self) -> None:
-        """Drop all graphs and free their memory."""
+        """Drop all graphs, those of frames too, and free their memory."""
         self.stages.clear()
         self.keeper = self.pool = None
+        release_graphs()
         torch.cuda.empty_cache()
 
     def _run(self, target: Target, work: Callable[[Target], StepResult], state: Hashable) -> StepResult:

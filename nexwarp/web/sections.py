@@ -18,6 +18,7 @@ ALIGNMENT = 8
 MAGIC = b"NXWSCENE"
 FORMAT_VERSION = 1
 LARGEST_HEADER = 4 * 2**20
+LARGEST_SECTION = 2**30  # bytes, unpacked
 SURFEL_ARRAYS = ("means", "quats", "scales", "opacities", "gammas", "limits", "sh")
 
 
@@ -123,8 +124,10 @@ def unpack(section: Section, encoding: object, content: bytes) -> np.ndarray:
     """Return a section's array.
 
     Raises:
-        FormatError: the bytes do not hold the array; never more of them are unpacked than it has.
+        FormatError: the array is too large, or the bytes do not hold it; never more of them are unpacked than it has.
     """
+    if section.bytes > LARGEST_SECTION:
+        raise FormatError(f"section {section.name}: expected at most {LARGEST_SECTION:,} bytes, got {section.bytes:,}")
     if encoding == "deflate":
         try:
             reader = zlib.decompressobj()

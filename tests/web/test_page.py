@@ -19,7 +19,9 @@ from nexwarp.bake.fit import bake as bake_model
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.web import atlas
-from nexwarp.web.export import one_file, page_files
+from nexwarp.web.export import one_file, page_files, static_files
+from nexwarp.web.scene_file import SCENE_FILE
+from nexwarp.web.scene_reader import decode_scene
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.web.baked_support import ring
 
@@ -352,6 +354,19 @@ def test_one_file_from_a_disk(tab, site, tmp_path):
     assert tab.picture().std() > 0.05
     assert not tab.errors
     assert not [url for url in tab.requests if not url.startswith((file.as_uri(), "data:", "blob:"))]
+
+
+def test_the_live_demo_of_the_documentation(tab):
+    folder = Path(__file__).parents[2] / "docs" / "demo_page"
+    files = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert sum(map(len, files.values())) < 3e6
+    site = Site({**static_files(), **files})
+    tab.open(f"{site.url}?renderer=baked")
+    assert tab.picture().std() > 0.1 and not tab.errors
+    model = decode_scene(files[SCENE_FILE])
+    assert len(model) == tab.value("nexwarp.renderer.info.surfels")
+    site.server.shutdown()
+    site.server.server_close()
 
 
 @pytest.mark.slow

@@ -156,6 +156,8 @@ def damaged() -> dict[str, bytes]:
         return changed(sections=[{**e, **values} if e["name"] == name else e for e in header["sections"]])
 
     texture, options = header["texture"], header["options"]
+    large = [{**e, "shape": [3, 2**30, 2]} if e["name"] == "grid" else e for e in header["sections"]]
+    huge = changed(texture={**texture, "table_size": 2**30}, sections=large)
     sh = next(e for e in header["sections"] if e["name"] == "sh")
     bomb = zlib.compress(bytes(50_000_000))
     begin = 16 + length + sh["offset"]
@@ -176,6 +178,7 @@ def damaged() -> dict[str, bytes]:
         "half a surfel": changed(surfels=0.5),
         "other SH": changed(sh_coefficients=7),
         "a table of any size": changed(texture={**texture, "table_size": 2**26}),
+        "a grid of 8 GB": huge,
         "endless levels": changed(texture={**texture, "levels": 10**9}),
         "K of 100": changed(options={**options, "max_hits": 100}),
         "no options": changed(options=None),

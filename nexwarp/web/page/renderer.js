@@ -151,6 +151,9 @@ export class Renderer {
             next("done");
         } catch (error) {
             await reader.cancel();
+            if (error instanceof RangeError) {
+                throw new SceneError("This device has too little memory for the scene.");
+            }
             throw error;
         }
     }

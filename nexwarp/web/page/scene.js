@@ -12,6 +12,7 @@ const MAGIC = "NXWSCENE";
 const VERSION = 1;
 const LARGEST_HEADER = 4 * 2 ** 20;
 const LARGEST_SURFELS = 2 ** 24;
+const LARGEST_SECTION = 2 ** 30;
 const LARGEST_VALUE = 1e16;
 const NEVER = 1e30;
 const CHUNK = 256;
@@ -298,6 +299,7 @@ export class SceneReader {
         while (this.entries.length > 0 && !(name in this.arrays)) {
             const entry = this.entries.shift();
             const size = entry.shape.reduce((product, one) => product * one, SIZES[entry.dtype]);
+            expect(size <= LARGEST_SECTION, `section ${entry.name}: expected at most ${LARGEST_SECTION} bytes, got ${size}`);
             let bytes = await this.content(entry, size);
             expect(["raw", "deflate"].includes(entry.encoding), `section ${entry.name}: expected the encoding raw or deflate`);
             if (entry.encoding === "deflate") {

@@ -1,0 +1,44 @@
+"""`nexwarp export`: the web page, glTF and SPZ of a finished run."""
+
+import pytest
+
+from nexwarp.cli import main as cli
+from nexwarp.web import atlas
+from tests.cli.support import refused
+
+
+@pytest.fixture(autouse=True)
+def few_steps(small_preset, monkeypatch):
+    """Bake quickly."""
+    monkeypatch.setattr("nexwarp.bake.fit.FEWEST_STEPS", 2)
+
+
+def test_a_finished_run_becomes_a_web_page(finished, capsys):
+    assert (
+        cli.main(["export", str(finished), "--format", "web", "--out", str(finished / "page"), "--device", "cpu"]) == 0
+    )
+    names = {file.name for file in (finished / "page").iterdir()}
+    assert {"index.html", "viewer.js", "scene.nxw", atlas.BAKED_FILE, atlas.ATLAS_FILE} <= names
+    assert "<title>tiny</title>" in (finished / "page" / "index.html").read_text()
+
+
+def test_a_finished_run_becomes_gltf_and_spz(finished, monkeypatch, capsys):
+    pytest.importorskip("trimesh")
+    refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")
+    assert not (finished / "export").exists()
+    monkeypatch.setattr("nexwarp.bake.glb.CUTOFF", 0.05)  # surfels of a short training are faint
+    for package, kind, name in (("trimesh", "glb", "scene.glb"), ("gaussforge", "spz", "splats.spz")):
+        pytest.importorskip(package)
+        assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0
+        assert (finished / "export" / name).stat().st_size > 100
+        assert name in capsys.readouterr().out
+        (finished / "export" / name).unlink()
+        with monkeypatch.context() as patch:
+            patch.setattr("importlib.util.find_spec", lambda name: None)
+            refused(capsys, ["export", str(finished), "--format", kind, "--device", "cpu"], package, "pip install")
+        assert not (finished / "export" / name).exists()
+
+
+def test_a_run_without_cameras_has_no_gltf(finished, capsys):
+    (finished / "cameras.json").unlink()
+    refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "cameras.json", "--format glb")
