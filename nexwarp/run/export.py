@@ -67,9 +67,8 @@ def export_run(
     if kind == "web":
         from nexwarp.web.export import export_web
 
-        place = folder or run / EXPORT_FOLDER / WEB_FILE
-        model, cameras_by_name = load(run).to(device), _all_cameras(run)
-        return export_web(model, cameras_by_name, place, quality=quality, title=run_title(source))
+        model, out = load(run).to(device), folder or run / EXPORT_FOLDER / WEB_FILE
+        return export_web(model, _all_cameras(run), out, quality=quality, title=run_title(source))
     folder = folder or run / EXPORT_FOLDER
     if kind == "mesh":
         return export_mesh(run, folder, device)
