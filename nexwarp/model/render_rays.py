@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp import ops
+from nexwarp.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.checks import check_tensors
 from nexwarp.model.options import RenderOptions
-from nexwarp.ops.rays import collect_rays, intersect_rays, ray_records, reaches_of
+from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records, reaches_of
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
@@ -90,6 +91,28 @@ def render_rays(
     keys = distances if camera.radial else projection.centers[:, 2]
     tiles = intersect_rays(records, reaches_of(shape.opacities, shape.gammas), keys, camera.rays)
     hits = collect_rays(records, projection.limits, tiles, camera.rays, camera.near, viewmat, max_hits=max_hits)
+    image, textured = _composed(hits, texture, camera, options, background, detail_limits)
+    plain = hits.plain
+    if exposures is not None:
+        size = (camera.width, camera.height, camera.near)
+        posed = Camera(viewmat, torch.eye(3).to(viewmat), *size, checked=(1.0, 1.0, 0.0, 0.0))
+        gains = exposures.gains(posed).to(image)
+        image, plain, textured = (x * gains for x in (image, plain, textured))
+    s = hits.surface
+    surface = (s.expected_depth, s.median_depth, s.top_depth, s.normals)
+    return RayRendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, *surface)
+
+
+def _composed(
+    hits: RayHits,
+    texture: NeuralTexture | None,
+    camera: RayCamera,
+    options: RenderOptions,
+    background: torch.Tensor,
+    detail_limits: DetailLimits | None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the image and its textured part (H, W, 3)."""
+    max_hits = options.max_hits
     texels, weights = hits.base.new_empty(*hits.alpha.shape, 0, 3), hits.weights[..., :0]
     if texture is not None and max_hits:
         positions, directions = _unproject(hits.depths, camera)
@@ -97,18 +120,11 @@ def render_rays(
         depths = (hits.weights > 0).to(hits.depths) if camera.parallel else hits.depths
         depths = limited_depths(hits.ids, depths, detail_limits, camera.focal)
         clamp = options.clamp_texture
-        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=degree, clamp=clamp)
+        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=options.sh_degree, clamp=clamp)
         weights = hits.weights
     residual = texture is not None and texture.residual
     base = hits.base if texture is None or not max_hits or residual else None
-    image, textured = ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
-    plain = hits.plain
-    if exposures is not None:
-        gains = exposures.gains(camera).to(image)
-        image, plain, textured = (x * gains for x in (image, plain, textured))
-    s = hits.surface
-    surface = (s.expected_depth, s.median_depth, s.top_depth, s.normals)
-    return RayRendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, *surface)
+    return ops.compose(hits.plain, texels, weights, hits.alpha, background, base)
 
 
 def _distances(means: torch.Tensor, camera: RayCamera) -> torch.Tensor:

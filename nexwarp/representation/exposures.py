@@ -12,7 +12,6 @@ import torch
 from torch import nn
 
 from nexwarp.camera import Camera, StagedCamera
-from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.checks import check_tensors
 from nexwarp.determinism import one_thread
 
@@ -139,7 +138,7 @@ class Exposures(nn.Module):
         return dict(self.named_buffers())
 
     @torch.no_grad()
-    def gains(self, camera: Camera | RayCamera) -> torch.Tensor:
+    def gains(self, camera: Camera) -> torch.Tensor:
         """Return a camera's gains (3,), within the range of the photos' gains; far from all photos, their mean."""
         position, direction = poses_of(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)

@@ -79,13 +79,13 @@ def export_run(
     if kind == "glb":
         return _export_glb(run, folder, device)
     model, cameras = load(run), list(_all_cameras(run).values())
-    degree = model.options.sh_degree
+    gaussians = (model.surfels, model.options.sh_degree)
     if kind == "spz":
-        save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=cameras, max_extent=max_extent)
         return [folder / SPZ_FILE]
     files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
     save_surfels_ply(files[0], model.surfels)
-    save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+    save_splats_ply(files[1], *gaussians, cameras=cameras, max_extent=max_extent)
     return files
 
 
