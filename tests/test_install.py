@@ -1,6 +1,5 @@
 """Installation: an editable package is found from every folder, and metadata on PyPI is complete."""
 
-import re
 import shutil
 import subprocess
 import sys
@@ -52,4 +51,3 @@ def test_a_wheel_holds_the_package_alone(clone: Path, tmp_path: Path) -> None:
     dist.mkdir()
     names = zipfile.ZipFile(build("wheel", clone, dist)).namelist()
     assert sorted(n for n in names if ".dist-info/" not in n) == ["nexwarp/__init__.py", "nexwarp/py.typed"]
-

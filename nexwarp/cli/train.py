@@ -20,7 +20,15 @@ from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
-from nexwarp.run.folder import DEMO, SceneSource, claimed_run, create_run, keep_camera_path, read_run
+from nexwarp.run.folder import (
+    DEMO,
+    SceneSource,
+    claimed_run,
+    create_run,
+    keep_camera_path,
+    read_run,
+    rewrite_config,
+)
 from nexwarp.run.log import check_tensorboard
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, preset
@@ -75,7 +83,8 @@ class Train:
     device: Device_ = None
     """Device to train on."""
     resume: bool = False
-    """Continue the run in --run with its settings; other options must agree with them."""
+    """Continue the run in --run with its settings; other options must agree with them. Only --iterations may be larger:
+    schedules are then those of the longer run (docs/resume.md)."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
     """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
@@ -105,6 +114,7 @@ class Train:
             session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
             if resume:
                 session.resume()
+                self._extend(run, trainer, console)
             else:
                 session.check_room()
                 if self.resume:
@@ -118,6 +128,17 @@ class Train:
                 if viewer is not None:
                     viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
+
+    def _extend(self, run: Path, trainer: Trainer, console: Console) -> None:
+        """Write a larger --iterations into the run to resume, and say what it does."""
+        before = read_run(run)[1].iterations
+        if trainer.config.iterations > before:
+            rewrite_config(run, trainer.config)
+            console.print(
+                f"extended from {before:,} to {trainer.config.iterations:,} iterations: from here on, learning rates, "
+                "density control and all other schedules are those of a run of that length",
+                soft_wrap=True,
+            )
 
     def _trainer(
         self, source: SceneSource, config: Config, device: torch.device, resume: bool, console: Console
@@ -225,7 +246,9 @@ class Train:
         """Return the settings of the run to resume; a SettingError names an option that differs."""
         config = read_run(run)[1]
         for name, value in given.items():
-            if getattr(config, name) != value:
+            if name == "iterations" and isinstance(value, int) and value > config.iterations:
+                config = dataclasses.replace(config, iterations=value)
+            elif getattr(config, name) != value:
                 flag = f"--{name.replace('_', '-')}"
                 raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
         changed = with_flag_settings(config, settings)

@@ -18,7 +18,7 @@ from nexwarp.io.json_files import Json, write_json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
-from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TEST, TRAIN, picture_name, remove_leftovers
+from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, picture_name, remove_leftovers
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
@@ -65,7 +65,8 @@ class TrainingSession:
         self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
         remove_leftovers(self.run)
         if has_checkpoint(self.run):
-            self.trainer.restore(self.run, partial(display.warn, self.console))
+            # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
+            self.trainer.restore(self.run, partial(display.warn, self.console), extend=True)
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
         else:
             self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
@@ -94,7 +95,7 @@ class TrainingSession:
                     viewer.between_steps(step.iteration, partial(_describe, step), lambda: stop_signal() is not None)
                 if step.iteration % self.every == 0 or step.iteration == self.total or stop_signal() is not None:
                     with self._model_kept():
-                        trainer.save(self.run)
+                        trainer.save_checkpoint(self.run)
                 if (number := stop_signal()) is not None:
                     raise Stopped(number)
 
@@ -158,8 +159,7 @@ class TrainingSession:
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(run, finished)
-        sets = {TRAIN: scene.train, TEST: scene.test}
-        save_cameras(run / CAMERAS_FILE, {name: {v.name: v.camera for v in views} for name, views in sets.items()})
+        save_cameras(run / CAMERAS_FILE, scene.cameras)
         model = load(run).to(device)
         rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
         facts: dict[str, Json] = {

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Host_, Port_, Run_
-from nexwarp.model.model_file import load
-from nexwarp.run.folder import keep_camera_path, read_run
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.run.opened import open_model
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -19,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class ViewCommand:
-    """Show a run in the browser, with all buffers and an editor of camera paths for render (extra `viewer`)."""
+    """Show a run or a model in the browser, with all buffers and an editor of camera paths (extra `viewer`)."""
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
     host: Host_ = "127.0.0.1"
     """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
@@ -34,16 +33,16 @@ class ViewCommand:
         """Serve the viewer until Ctrl-C."""
         from nexwarp.viewer import Viewer
 
-        source, _, _ = read_run(self.run)
-        model = load(self.run).to(pick_device(self.device))
+        opened = open_model(self.run)
+        model = opened.model.to(pick_device(self.device))
         with Viewer(
             lambda: model,
-            load_cameras(self.run / CAMERAS_FILE),
-            near=near if isinstance(near := model.meta.get("near"), float) else 0.01,
-            title=source.name,
+            opened.cameras,
+            near=opened.near,
+            title=opened.title,
             host=self.host,
             port=self.port,
-            save_path=partial(keep_camera_path, self.run),
+            save_path=partial(keep_camera_path, opened.folder, opened=self.run),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

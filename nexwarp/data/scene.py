@@ -74,6 +74,11 @@ class Scene:
     background: tuple[float, float, float] | None = None
     random_background: bool = False
 
+    @property
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """The cameras by set ("train", "test") and name of the photo."""
+        return {name: {v.name: v.camera for v in views} for name, views in (("train", self.train), ("test", self.test))}
+
     @classmethod
     def from_tensors(
         cls,

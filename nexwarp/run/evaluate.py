@@ -11,7 +11,7 @@ from nexwarp.data import View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.contents import COMPARE, TEST, picture_name
-from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
+from nexwarp.run.metrics import CONVENTION, check_available, flip, lpips_vgg, psnr, ssim
 
 
 class Evaluation(TypedDict, total=False):
@@ -62,8 +62,7 @@ def evaluate(
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
-    if unknown := [name for name in metrics if name not in METRICS]:
-        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
+    _check_names(metrics)
     results: dict[str, dict[str, float | None]] = {}
     for view in views:
         out = model.render(view.camera)
@@ -84,6 +83,18 @@ def evaluate(
             progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
     return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
+
+
+def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
+    """Raise ValueError unless all metrics are known and can be computed on the device."""
+    _check_names(metrics)
+    for name in metrics:
+        check_available(name, device)
+
+
+def _check_names(metrics: Sequence[str]) -> None:
+    if unknown := [name for name in metrics if name not in METRICS]:
+        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
 
 
 def _mean(values: list[float | None]) -> float | None:

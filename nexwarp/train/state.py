@@ -1,10 +1,11 @@
 """State of a training: everything that shapes its future, gathered and put back bit for bit."""
 
+import dataclasses
 import hashlib
 import math
 import random
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.config import Config
+from nexwarp.train.presets import config_from_dict
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -163,6 +166,29 @@ def restore_random(
     np.random.set_state((kind, tensors["rng.numpy"].numpy().astype(np.uint32), *rest))  # noqa: NPY002
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
+
+
+def check_origin(
+    state: Mapping[str, Any], config: Config, views: Json, digest: Callable[[], str], *, extend: bool = False
+) -> None:
+    """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
+
+    Args:
+        state: of the snapshot.
+        config: the settings.
+        views: fingerprint of the training views.
+        digest: returns the digest of the scene.
+        extend: whether the run may have had fewer iterations.
+    """
+    saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
+    if extend and saved.iterations < config.iterations:
+        saved = dataclasses.replace(saved, iterations=config.iterations)
+    if saved != config:
+        raise ValueError("its settings are others")
+    if state["views"] != views:
+        raise ValueError("it has seen other training views than the scene has")
+    if state["scene"] != digest():
+        raise ValueError("the scene's photos, masks or points have changed since")
 
 
 def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:

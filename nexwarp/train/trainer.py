@@ -1,6 +1,6 @@
 """Training: the loop of paper Sec. 4.3, as a class that the command line and `nexwarp.train` drive."""
 
-import dataclasses
+import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from functools import cached_property, reduce
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
@@ -16,6 +17,7 @@ from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
+from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
@@ -28,11 +30,11 @@ from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
-from nexwarp.train.presets import config_from_dict
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
     Snapshot,
+    check_origin,
     check_snapshot,
     checkpoint_bytes,
     gather_optimizer,
@@ -296,8 +298,24 @@ class Trainer:
             watched[name] = parameter
         return watched | {"densify.errors": self.densifier.errors}
 
-    def save(self, run: Path) -> None:
-        """Write a checkpoint: everything that shapes the future of the run.
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write a checkpoint, the model as it is now, and the cameras, which `nexwarp view`, `render` and others open.
+
+        Args:
+            folder: created if it does not exist; `restore` continues from its checkpoint.
+
+        Raises:
+            DivergedError: something is not finite.
+            OSError: a file cannot be written; an older one is as it was.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.save_checkpoint(folder)
+        save_model(folder, self.model())
+        save_cameras(folder / CAMERAS_FILE, self.scene.cameras)
+
+    def save_checkpoint(self, run: Path) -> None:
+        """Write a checkpoint into a folder: everything that shapes the future of the run.
 
         Raises:
             DivergedError: something in it is not finite.
@@ -308,12 +326,14 @@ class Trainer:
             self.good = self.snapshot()
         save_checkpoint(run, *self.good)
 
-    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None) -> None:
+    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
 
         Args:
             run: run folder.
             warn: is told of a damaged checkpoint that is passed over.
+            extend: also accept a checkpoint of a run of fewer iterations. Training goes on as in a run of
+                `config.iterations`: learning rates and all other schedules are those of such a run at that iteration.
 
         Raises:
             FileNotFoundError: there is none.
@@ -321,24 +341,14 @@ class Trainer:
         """
         snapshot = Snapshot(*load_checkpoint(run, warn))
         try:
-            self._check_origin(snapshot)
+            fingerprint = self.views.fingerprint()
+            check_origin(snapshot.state, self.config, fingerprint, lambda: self._scene_digest, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
             told = one_line(found)  # torch's go over several lines
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
-
-    def _check_origin(self, snapshot: Snapshot) -> None:
-        """Raise ValueError unless a snapshot comes from a run of this scene with these settings."""
-        state = snapshot.state
-        saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=self.config.cuda_graphs)
-        if saved != self.config:
-            raise ValueError("its settings are others")
-        if state["views"] != self.views.fingerprint():
-            raise ValueError("it has seen other training views than the scene has")
-        if state["scene"] != self._scene_digest:
-            raise ValueError("the scene's photos, masks or points have changed since")
 
     def checkpoint_size(self) -> int:
         """Return how many bytes a checkpoint takes at most; the model takes less."""
