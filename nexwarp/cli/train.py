@@ -67,6 +67,10 @@ class Train:
     """PLY file of the initial points."""
     format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "detected")] = None
     """Format of the scene, for a folder that holds several."""
+    follow_links: bool = False
+    """Allow photos that symbolic links lead to outside of SCENE, as with DVC, git-annex and caches of hubs."""
+    skip_missing: bool = False
+    """Train without photos that do not exist; they are named."""
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
@@ -203,7 +207,15 @@ class Train:
     def _source(self) -> SceneSource:
         """Return the scene of the options."""
         return SceneSource(
-            self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
+            self.scene,
+            self.images,
+            self.downscale,
+            self.masks,
+            self.background,
+            self.points,
+            self.format,
+            self.follow_links,
+            self.skip_missing,
         )
 
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
@@ -216,6 +228,8 @@ class Train:
             ("--background", None, self.background, old.background),
             ("--points", None, self.points and str(Path(self.points).resolve()), old.points),
             ("--format", None, self.format, old.format),
+            ("--follow-links", False, self.follow_links, old.follow_links),
+            ("--skip-missing", False, self.skip_missing, old.skip_missing),
             ("--preset", "default", self.preset, config.preset),
         ):
             if given not in (default, expected):

@@ -14,7 +14,7 @@ import torch
 
 from nexwarp.camera import Camera
 from nexwarp.data.cache import PhotoCache, cache_folder
-from nexwarp.data.capture import Capture, Cloud, Photo
+from nexwarp.data.capture import Capture, Cloud, Photo, report_missing
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import Array, make_cloud, split_views
@@ -126,6 +126,8 @@ def load_scene(
     background: str | Sequence[float] | None = None,
     points: str | os.PathLike[str] | None = None,
     format: str | None = None,
+    follow_links: bool = False,
+    skip_missing: bool = False,
     progress: ProgressCallback | None = None,
 ) -> Scene:
     """Read a scene: a COLMAP folder, nerfstudio's transforms.json, or Blender's transforms_train.json.
@@ -149,6 +151,9 @@ def load_scene(
             and marks the scene for training on random colours.
         points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
         format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
+        follow_links: allow photos, masks and points that symbolic links in the scene's folder lead to elsewhere, as in
+            the folders of DVC, git-annex and the caches of hubs. A scene from somebody else may name any file then.
+        skip_missing: warn of photos that do not exist, and go on without them.
         progress: called with the number of photos read and their total, from one thread at a time.
 
     Returns:
@@ -173,7 +178,9 @@ def load_scene(
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
     with quiet_pillow():
-        scene = _load(path, images, downscale, masks, color, points, format, progress)
+        kind = find_format(path, format)
+        capture = _read_capture(path, images, kind, follow_links, skip_missing)
+        scene = _load(path, kind, capture, images, downscale, masks, color, points, progress)
     return dataclasses.replace(scene, random_background=random)
 
 
@@ -237,16 +244,15 @@ def find_format(path: Path, format: str | None = None) -> str:
 
 def _load(
     path: Path,
+    kind: str,
+    capture: Capture,
     images: str,
     downscale: int,
     masks: str | None,
     background: tuple[float, float, float] | None,
     points: str | os.PathLike[str] | None,
-    format: str | None,
     progress: ProgressCallback | None,
 ) -> Scene:
-    kind = find_format(path, format)
-    capture = _read_capture(path, images, kind)
     if len(capture.photos) < 2:
         raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
     cloud = read_ply(Path(points)) if points is not None else capture.cloud
@@ -308,14 +314,20 @@ def _check_downscale(downscale: int) -> None:
         raise ValueError(f"downscale: expected at least 1, got {downscale}")
 
 
-def _read_capture(path: Path, images: str, kind: str) -> Capture:
+def _read_capture(
+    path: Path, images: str, kind: str, follow_links: bool = False, skip_missing: bool = False
+) -> Capture:
     if kind == "colmap":
-        capture = read_model(path, path / images)
+        capture = read_model(path, path / images, follow_links)
         _check_folder("images", path, images)
-        return capture
+        photos = [photo for photo in capture.photos if photo.file.is_file()]
+        missing = [photo.name for photo in capture.photos if not photo.file.is_file()]
+        report_missing(capture.source, missing, len(capture.photos), skip_missing)
+        return dataclasses.replace(capture, photos=photos)
     if images != "images":
         _check_folder("images", path, images)
-    return (read_nerfstudio if kind == "nerfstudio" else read_blender)(path, images)
+    read = read_nerfstudio if kind == "nerfstudio" else read_blender
+    return read(path, images, follow_links, skip_missing)
 
 
 def _check_folder(argument: str, path: Path, name: str) -> None:

@@ -44,6 +44,10 @@ class SceneSource:
     """PLY file of the initial points; None takes the scene's points."""
     format: str | None = None
     """Format of the scene, for a folder that holds several; None detects it."""
+    follow_links: bool = False
+    """Whether photos may lie behind symbolic links that leave the scene's folder."""
+    skip_missing: bool = False
+    """Whether to go on without photos that do not exist."""
 
     @property
     def name(self) -> str:
@@ -194,6 +198,9 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         for name in ("images", "masks", "background", "points", "format"):
             if not isinstance(scene.get(name), (str, type(None))):
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
+        for name in ("follow_links", "skip_missing"):
+            if not isinstance(scene.get(name, False), bool):
+                raise ValueError(f"scene: {name}: expected true or false, got {scene[name]!r}")
         known = {field.name for field in dataclasses.fields(SceneSource)}
         source = SceneSource(**{name: value for name, value in scene.items() if name in known})
         return source, config_from_dict(data["config"]), data
