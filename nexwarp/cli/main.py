@@ -1,4 +1,4 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `sfm`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `process`, `sfm`, `warmup`."""
 
 import io
 import os
@@ -17,6 +17,7 @@ from rich.console import Console
 from nexwarp.cli import display
 from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
+from nexwarp.cli.process import Process
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.version import __version__
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "export": Export,
     "view": ViewCommand,
     "info": Info,
+    "process": Process,
     "sfm": Sfm,
     "warmup": Warmup,
 }

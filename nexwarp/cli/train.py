@@ -15,6 +15,7 @@ from nexwarp.cli import display
 from nexwarp.cli.device import keep_freed_memory, pick_device
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
+from nexwarp.cli.process import SCENES, is_video, scene_of_video
 from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
@@ -26,6 +27,7 @@ from nexwarp.run.folder import (
     claimed_run,
     create_run,
     keep_camera_path,
+    prepare_run,
     read_run,
     rewrite_config,
 )
@@ -44,7 +46,8 @@ class Train:
     """Train a scene, evaluate it on its test views, and write everything to a run folder."""
 
     scene: Scene_
-    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
+    """Folder of a COLMAP, nerfstudio or Blender scene, `demo` for the built-in one (docs/scenes.md), or a video, which
+    first becomes the scene scenes/NAME as with `nexwarp process`."""
     run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
     """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
@@ -104,6 +107,8 @@ class Train:
 
     def __call__(self, console: Console) -> None:
         """Train."""
+        if is_video(self.scene):
+            self.scene = str(self._scene_of_video(console))
         source = self._source()
         run = self.run or Path("runs") / source.name
         flags = {"resume": self.resume, "overwrite": self.overwrite}
@@ -203,6 +208,15 @@ class Train:
         )
         print_url(viewer, console)
         return viewer
+
+    def _scene_of_video(self, console: Console) -> Path:
+        """Return the scene of a video; what would stop the training later stops it before the scene is made."""
+        video = Path(self.scene)
+        self._check()
+        pick_device(self.device)
+        run, scene = self.run or Path("runs") / video.stem, SceneSource(str(SCENES / video.stem))
+        prepare_run(run, scene, resume=self.resume, overwrite=self.overwrite)
+        return scene_of_video(video, console)
 
     def _source(self) -> SceneSource:
         """Return the scene of the options."""
