@@ -72,7 +72,24 @@ class Model(nn.Module):
         self.detail_limits = detail_limits
         self.options = RenderOptions() if options is None else options
         self.meta: dict[str, Json] = dict(meta or {})
-        self.register_load_state_dict_pre_hook(_report_removed_parts)
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, torch.Tensor],
+        prefix: str,
+        local_metadata: dict[str, object],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Name the tensors of parts that were set to None, too: torch passes over them when a state dict is loaded."""
+        for part, module in self._modules.items():
+            if strict and module is None:
+                unexpected_keys += [name for name in state_dict if name.startswith(f"{prefix}{part}.")]
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
 
     @property
     def device(self) -> torch.device:
@@ -172,19 +189,3 @@ class Model(nn.Module):
         from nexwarp.model.model_file import save_model
 
         return save_model(path, self)
-
-
-def _report_removed_parts(
-    model: nn.Module,
-    state: dict[str, torch.Tensor],
-    prefix: str,
-    _metadata: object,
-    strict: bool,
-    _missing: list[str],
-    unexpected: list[str],
-    _errors: list[str],
-) -> None:
-    """Name the tensors of parts that were set to None: torch passes over them when a state dict is loaded."""
-    for part, module in model._modules.items():
-        if strict and module is None:
-            unexpected += [name for name in state if name.startswith(f"{prefix}{part}.")]
