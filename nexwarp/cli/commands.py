@@ -14,6 +14,7 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.model.detail import check_detail
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
 from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
@@ -52,6 +53,9 @@ class Render:
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
+    detail: Annotated[float, option("SHARE")] = 1.0
+    """Share of the surfels to render with, above 0 to 1: those that make up most of the training pictures; the texture
+    is coarser below 0.5 (docs/detail.md)."""
     exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
@@ -74,8 +78,9 @@ class Render:
             exposure=self.exposure,
         )
         device = pick_device(self.device)
+        check_detail("--detail", self.detail)
         opened = open_model(self.run)
-        model = opened.model.to(device)
+        model = opened.model_at(self.detail, device)
         job = order.prepare(opened)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)

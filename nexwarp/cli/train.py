@@ -31,7 +31,7 @@ from nexwarp.run.folder import (
     read_run,
     rewrite_config,
 )
-from nexwarp.run.log import check_tensorboard
+from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
@@ -104,6 +104,8 @@ class Train:
     """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
     """Also log to RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
+    wandb: bool = False
+    """Also log to Weights & Biases, by the same names (extra `wandb`); WANDB_MODE=offline needs no account."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -120,7 +122,7 @@ class Train:
             config = self._config(run, resume)
             self._check()
             trainer = self._trainer(source, config, device, resume, console)
-            session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
+            session = TrainingSession(trainer, run, console, sinks=self._sinks(), every=self.checkpoint_every)
             if resume:
                 session.resume()
                 self._extend(run, trainer, console)
@@ -165,14 +167,18 @@ class Train:
             keep_freed_memory()
         return Trainer(scene, self._with_background(config, scene, resume), device)
 
+    def _sinks(self) -> list[str]:
+        """Return where to log beside the run's file."""
+        return [name for name in PACKAGES if getattr(self, name)]
+
     def _check(self) -> None:
         """Raise SettingError for invalid options, before the photos are read."""
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.downscale < 1:
             raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
-        if self.tensorboard:
-            check_tensorboard()
+        for name in self._sinks():
+            check_package(name)
         if self.view:
             from nexwarp.viewer import check_server
 

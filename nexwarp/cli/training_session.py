@@ -1,6 +1,6 @@
 """A training session: the training loop with display, log and checkpoints, and the files of a finished run."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,7 @@ class TrainingSession:
     """One training in a run folder, from its first or resumed iteration to the evaluated model."""
 
     def __init__(
-        self, trainer: Trainer, run: Path, console: Console, *, tensorboard: bool = False, every: int | None = None
+        self, trainer: Trainer, run: Path, console: Console, *, sinks: Collection[str] = (), every: int | None = None
     ) -> None:
         """Prepare the session; nothing runs yet.
 
@@ -45,10 +45,10 @@ class TrainingSession:
             trainer: the trainer, before its first iteration.
             run: run folder.
             console: where to print.
-            tensorboard: whether to log for TensorBoard, too.
+            sinks: where to log beside the run's file: names of `nexwarp.run.log_sinks.PACKAGES`.
             every: iterations between checkpoints; None is a tenth of the run.
         """
-        self.trainer, self.run, self.console, self.tensorboard = trainer, run, console, tensorboard
+        self.trainer, self.run, self.console, self.sinks = trainer, run, console, sinks
         self.total = trainer.config.iterations
         self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
 
@@ -84,7 +84,7 @@ class TrainingSession:
         """
         trainer = self.trainer
         progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
-        log = TrainingLog(self.run, trainer, tensorboard=self.tensorboard)
+        log = TrainingLog(self.run, trainer, tensorboard="tensorboard" in self.sinks, wandb="wandb" in self.sinks)
         with progress_display, log, deferred_stop() as stop_signal:
 
             def observe(step: StepReport) -> None:

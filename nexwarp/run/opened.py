@@ -4,10 +4,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import torch
+
 from nexwarp.camera import Camera
 from nexwarp.cameras.around import surrounding
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
-from nexwarp.errors import MissingError
+from nexwarp.errors import FormatError, MissingError
+from nexwarp.finish.order import ordered
+from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.contents import CONFIG_FILE
@@ -43,10 +47,26 @@ class OpenedModel:
         """The model, on the CPU."""
         return load(self.file)
 
+    def model_at(self, detail: float, device: torch.device) -> Model:
+        """Return the model on a device, at a detail as `Model.at_detail` describes it.
+
+        Models of older versions, with surfels in no order, are ordered by their share of the cameras' pictures.
+        """
+        if detail == 1.0:
+            return self.model.to(device)
+        try:
+            return load(self.file, detail=detail).to(device)
+        except FormatError:
+            whole = self.model.to(device)  # names a damaged file
+            cameras = [camera.to(device) for members in self.cameras.values() for camera in members.values()]
+            if whole.meta.get(ORDERED) is True or not cameras:
+                raise
+            return ordered(whole, cameras).at_detail(detail)
+
     @property
     def near(self) -> float:
         """Near depth of new cameras, world units."""
-        return near if isinstance(near := self.model.meta.get("near"), float) else 0.01
+        return near_depth(self.model)
 
     @cached_property
     def cameras(self) -> dict[str, dict[str, Camera]]:
@@ -61,6 +81,11 @@ class OpenedModel:
             return self.cameras
         ring = surrounding(self.model.surfels.means, self.near)
         return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}
+
+
+def near_depth(model: Model) -> float:
+    """Return the near depth of a model's training cameras, world units; 0.01 if the model does not tell."""
+    return near if isinstance(near := model.meta.get("near"), float) else 0.01
 
 
 def open_model(path: Path) -> OpenedModel:

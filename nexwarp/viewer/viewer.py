@@ -149,11 +149,15 @@ class Viewer:
             model: returns the current model, as in the constructor.
         """
         self.model = model
+        self.redraw()
+        if self.training is not None:
+            self.training.finish(text)
+
+    def redraw(self) -> None:
+        """Draw all pictures anew: the model has changed."""
         for session in list(self.sessions.values()):
             session.drawn_version = -1  # its picture shows the previous model
         self._news.set()
-        if self.training is not None:
-            self.training.finish(text)
 
     # Drawing
 
