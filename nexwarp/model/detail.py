@@ -12,6 +12,7 @@ from nexwarp.representation.texture import NeuralTexture, TextureShape
 
 ORDERED = "ordered"  # entry of `Model.meta`: surfels are ordered by their share of the pictures, largest first
 LEAST = 1e-4  # of a detail
+LOG_SHARE = 6.5  # halvings of the surfels, from a half on, that would cost all levels; docs/detail.md has the figures
 
 
 def check_detail(name: str, detail: float) -> None:
@@ -27,11 +28,8 @@ def surfel_count(detail: float, count: int) -> int:
 
 
 def texture_levels(detail: float, levels: int) -> int:
-    """Return how many of the levels of a texture a detail has, from the coarsest up: all from a half of the surfels on.
-
-    A level less halves the finest cells' number along each axis, about, so the levels go with the logarithm of detail.
-    """
-    return max(1, math.ceil(levels * min(1.0, 1.0 + math.log2(2.0 * detail) / 12.0)))
+    """Return how many levels of a texture a detail has, from the coarsest up: all from a half of the surfels on."""
+    return max(1, math.ceil(levels * min(1.0, 1.0 + math.log2(2.0 * detail) / LOG_SHARE)))
 
 
 def coarse_shape(shape: TextureShape, resolutions: torch.Tensor, levels: int) -> TextureShape:

@@ -20,7 +20,7 @@ from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session
 from nexwarp.viewer.training_panel import TrainingPanel
-from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, vertical_fov
 
 if TYPE_CHECKING:
     import viser
@@ -278,8 +278,8 @@ class Viewer:
     # The page
 
     def _home(self) -> Viewpoint:
-        """The initial view: the first camera, or a view of the surfels' middle if there are no cameras."""
-        first = next(iter(self.cameras.values()), None)
+        """The initial view: the camera with the clearest one, or one of the surfels' middle if there are no cameras."""
+        first = clearest(list(self.cameras.values())) if self.cameras else None
         if first is not None:
             return Viewpoint(camera_to_world(first), vertical_fov(first), first.width, first.height)
         pose = np.eye(4)
