@@ -1,14 +1,22 @@
-"""Texturing of an image's hits, K = 2: hash lookup, MLP, SH and composition."""
+"""Texturing of an image's hits, K = 2, in the shape that training uses: hash lookup, MLP and SH, with detail limits.
+
+The second pair of figures includes the composition.
+"""
 
 import sys
+from typing import Any
 
+import numpy as np
 import torch
 
+import nexwarp as nw
 from benchmarks import suite
-from benchmarks.scenes import SurfelScene, geometry, random_like, texture, workload
+from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
+from nexwarp.finish.detail_limits import measure_detail_limits
+from nexwarp.representation.detail_limits import limited_depths
 
 
 def run(options: Options) -> list[Measurement]:
@@ -17,31 +25,62 @@ def run(options: Options) -> list[Measurement]:
 
 def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """The hits are those of the scene, so that neighbouring ones lie as near each other as they do in use."""
-    field = texture(scene)
+    field, limits = trained_like(scene)
     g = geometry(scene)
     with torch.no_grad():
         hits = g.hits(max_hits)
         positions, directions = ops.unproject(hits.depths, g.viewmat, g.pinhole)
         background = torch.zeros(3, device=options.device)
-    depths = hits.depths.requires_grad_()
-    positions.requires_grad_()
     focal = scene.camera.focal
+    depths = limited_depths(hits.ids, hits.depths, limits, focal).requires_grad_()
+    positions.requires_grad_()
 
-    def forward() -> torch.Tensor:
-        colors = field.colors(positions, depths, directions, focal)
-        return ops.compose(hits.plain, colors, hits.weights, hits.alpha, background)[0]
+    def colors() -> torch.Tensor:
+        return field.colors(positions, depths, directions, focal)
+
+    def composed() -> torch.Tensor:
+        return ops.compose(hits.plain, colors(), hits.weights, hits.alpha, background)[0]
 
     facts = scene.facts
     facts["sizes"] |= {"slots": hits.ids.numel(), "hits": int((hits.ids >= 0).sum())}
-    facts["sizes"]["table_size"] = field.config["table_size"]
-    with torch.no_grad():
-        (signal,) = random_like((forward(),))
-        without = options.time("texturing, forward", forward, **facts)
+    facts["sizes"] |= {name: field.config[name] for name in ("levels", "features", "table_size", "max_resolution")}
     leaves = [positions, depths, *field.parameters()]
-    both = options.time(
-        "texturing, forward + backward", lambda: torch.autograd.grad(forward(), leaves, signal), **facts
-    )
-    return [without, both]
+    found = []
+    for name, forward in (("texturing", colors), ("texturing and composition", composed)):
+        with torch.no_grad():
+            (signal,) = random_like((forward(),))
+            found.append(options.time(f"{name}, forward", forward, **facts))
+        both = _Backward(forward, leaves, signal)
+        found.append(options.time(f"{name}, forward + backward", both, **facts))
+    return found
+
+
+class _Backward:
+    """A function's forward and backward pass."""
+
+    def __init__(self, forward: Any, leaves: list[torch.Tensor], signal: torch.Tensor) -> None:
+        self.forward, self.leaves, self.signal = forward, leaves, signal
+
+    def __call__(self) -> tuple[torch.Tensor, ...]:
+        return torch.autograd.grad(self.forward(), self.leaves, self.signal)
+
+
+def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]:
+    """Return a texture and detail limits as training makes them for a scene; a trained scene has its own.
+
+    The finest level's cells are as large as the pixels of nearly all views at the surfels in front of them.
+    """
+    if scene.model.texture is not None and scene.model.detail_limits is not None:
+        return scene.model.texture, scene.model.detail_limits
+    sizes = []
+    for camera in scene.cameras:
+        depths = camera.project(scene.surfels.means.detach())[1]
+        sizes.append((camera.focal / depths[depths > camera.near]).cpu().numpy())
+    finest = float(np.quantile(np.concatenate(sizes), 0.95))
+    shape = {"levels": 8, "features": 4, "residual": True, "min_resolution": finest / 32, "max_resolution": finest}
+    table = 2**20 if len(scene.surfels) >= SAHAROV else 2**15
+    field = texture(scene, table_size=table, **shape)
+    return field, measure_detail_limits(nw.Model(scene.surfels, field), scene.cameras)
 
 
 if __name__ == "__main__":

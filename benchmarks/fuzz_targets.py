@@ -26,6 +26,7 @@ from benchmarks.fuzz_models import (
     some_trainer,
     some_viewmats,
 )
+from benchmarks.fuzz_web import make_scene_files, read_scene_files
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
@@ -151,7 +152,7 @@ def _ply(folder: Path) -> list[Files]:
 def _surfels_ply(folder: Path) -> list[Files]:
     save_surfels_ply(folder / "a" / "surfels.ply", some_surfels())
     save_surfels_ply(folder / "b" / "surfels.ply", some_surfels().double())
-    return [_files(folder / "a"), _files(folder / "b")]
+    return [_files(folder / "a"), _files(folder / "b"), _files(folder / "c")]
 
 
 def _nerfstudio(folder: Path) -> list[Files]:
@@ -196,6 +197,7 @@ def _model(folder: Path) -> list[Files]:
     full = some_model()
     save_model(folder / "a", full)
     save_model(folder / "b", Model(full.surfels, full.texture, options=full.options))
+    save_model(folder / "c", full, compact=True)
     _read_model(folder / "a")  # the first reading imports modules and kernels for seconds, which no input must pay for
     return [_files(folder / "a"), _files(folder / "b")]
 
@@ -265,7 +267,7 @@ def _read_log(folder: Path) -> None:
 def _options(folder: Path) -> list[Files]:
     render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": True, "clamp_texture": True}
     render |= {"exposure": "photos", "detail_limits": False}
-    settings = ["border=0.1", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
+    settings = ["coarse=0.1", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
     write_json(folder / "options.json", {"render": render, "settings": settings})
     return [_files(folder)]
 
@@ -401,6 +403,7 @@ TARGETS = {
         FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
         FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
+        FuzzTarget("web_scene", make_scene_files, read_scene_files, (".nxw",)),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

@@ -16,7 +16,7 @@ import warp as wp
 import nexwarp as nw
 from nexwarp.determinism import deterministic
 from nexwarp.kernels import launch as launching
-from nexwarp.kernels.catalogue import all_kernels
+from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.walk import BLOCK_DIM
@@ -24,6 +24,7 @@ from nexwarp.ops._interop import array, launch
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
 from nexwarp.run.warmup import Build, compile_all
+from nexwarp.train.adam import FusedAdam
 
 # Width and height: one pixel, less than a tile, whole tiles, a row, and parts of tiles in both directions.
 SIZES = ((1, 1), (17, 33), (31, 7), (16, 16), (50, 1), (5, 64), (33, 47))
@@ -56,8 +57,12 @@ def compile_catalogue(device: torch.device, hits: Sequence[int] = range(MAX_HITS
     """Compile the kernels, several at a time, so that a sweep only launches them."""
     wp.init()
     walks = ("collect", "splat_error", "surface")
-    kernels = catalogue(device, hits)
-    compile_all([Build(k, BLOCK_DIM if k.key.startswith(walks) else 256) for k in kernels], device)
+    blocks = {kernel.module.name: threads for kernel, threads in fused_kernel_builds()}
+    builds = [
+        Build(k, blocks.get(k.module.name, BLOCK_DIM if k.key.startswith(walks) else 256))
+        for k in catalogue(device, hits)
+    ]
+    compile_all(builds, device)
 
 
 def sweep(
@@ -92,6 +97,8 @@ def sweep(
             renderings += 1
         if device.type == "cuda":  # where renderings add by atomics instead
             _reduce(device)
+            for features in (2, 4):
+                _texture(device, next(size), features)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
     names = {kernel.module.name for kernel in catalogue(device, hits)}
@@ -178,6 +185,23 @@ def _losses(device: torch.device, width: int, height: int) -> None:
     total.backward()
     if not all(x.grad is not None and bool(torch.isfinite(x.grad).all()) for x in leaves):
         raise RuntimeError(f"a gradient of the losses is not finite: {width}x{height}")
+
+
+def _texture(device: torch.device, size: tuple[int, int], features: int) -> None:
+    """Look points up in a texture of the shape that the fused kernels take, differentiate, and take a step of Adam."""
+    width, height = size
+    texture = nw.NeuralTexture(32 // features, 2**8, features, 1.0, 6.0).to(device)
+    generator = torch.Generator().manual_seed(0)
+    positions, depths = (torch.rand(height, width, 2, *n, generator=generator).to(device) for n in ((3,), ()))
+    directions = torch.nn.functional.normalize(torch.randn(height, width, 3, generator=generator), dim=-1).to(device)
+    rates = [{"params": [x], "lr": torch.tensor(1e-3, device=device)} for x in texture.parameters()]
+    optimizer = FusedAdam(rates, eps=1e-15)
+    optimizer.regularise(texture, texture.resolutions)
+    texture.colors(positions.requires_grad_(), depths, directions, 100.0).square().sum().backward()
+    optimizer.step()
+    found = [positions.grad, optimizer.grid_loss, *texture.parameters()]
+    if not all(x is not None and bool(torch.isfinite(x).all()) for x in found):
+        raise RuntimeError(f"a result of the fused texture is not finite: {width}x{height}, F = {features}")
 
 
 def _reduce(device: torch.device) -> None:

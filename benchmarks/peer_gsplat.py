@@ -8,6 +8,7 @@ scale regularised by 0.01. D-SSIM is ours, with "same" padding in place of "vali
 has and the examples lack.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, initial_points
 from nexwarp.kernels.sh import BAND_0
+from nexwarp.model.compact import decode, encode
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
@@ -25,6 +27,14 @@ from nexwarp.train.losses import image_loss
 from nexwarp.train.step_losses import SATURATION
 from nexwarp.train.views import TrainingViews, mean_color
 
+CODED = {  # names of the coding of our model files
+    "means": "surfels.means",
+    "quats": "surfels.raw_quats",
+    "scales": "surfels.log_scales",
+    "opacities": "surfels.logit_opacities",
+    "sh0": "surfels.sh0",
+    "shN": "surfels.shN",
+}
 FLOATS = {"3dgs": 59, "2dgs": 58}  # a primitive: means 3, quats 4, scales 3 or 2, opacity 1, SH 48
 NEAR = {"3dgs": 0.01, "2dgs": 0.2}  # the examples' near planes, in the normalised frame
 SH_DEGREE = 3
@@ -39,7 +49,7 @@ class PeerSettings:
     Attributes:
         primitive: "3dgs" or "2dgs".
         strategy: "mcmc", or "default" for gradients that split and duplicate; 2DGS has the default strategy alone.
-            The default strategy has no budget: it stops growing once there are as many primitives as the budget.
+            The default strategy has no budget: it does not grow while there are as many primitives as the budget.
         background: put the photos' mean colour behind everything instead of black.
         exposures: train at the photos' mean exposure and render with predicted gains, as our default does, where our
             gate uses exposures.
@@ -85,6 +95,15 @@ class Gaussians:
     def megabytes(self) -> float:
         """On disk as float32, 10^6 bytes."""
         return len(self.splats["means"]) * FLOATS[self.primitive] * 4 / 1e6
+
+    def compact(self) -> tuple["Gaussians", int]:
+        """Return the Gaussians as a file with the coding of our compact model files gives them, and its bytes."""
+        tensors = {CODED[name]: x.detach().cpu() for name, x in self.splats.items()}
+        coded = encode(tensors)
+        back = decode(coded)
+        splats = {name: torch.nn.Parameter(back[CODED[name]].to(x.device)) for name, x in self.splats.items()}
+        size = sum(x.numel() * x.element_size() for x in coded.values())
+        return dataclasses.replace(self, splats=torch.nn.ParameterDict(splats)), size
 
     def image(self, camera: Camera) -> torch.Tensor:
         """Return an image (H, W, 3), not clamped, at the exposure that is predicted for the camera."""
@@ -197,6 +216,7 @@ class _Control:
                 key_for_gradient=key,
                 **times,
             )
+            self.threshold = self.strategy.grow_grad2d
             self.state = self.strategy.initialize_state(scene_scale=extent)
         self.strategy.check_sanity(self.splats, optimizers)
 
@@ -211,8 +231,7 @@ class _Control:
             rate = self.optimizers["means"].param_groups[0]["lr"]
             self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, lr=rate)
             return
-        if len(self.splats["means"]) >= self.count:
-            self.strategy.grow_grad2d = math.inf
+        self.strategy.grow_grad2d = self.threshold if len(self.splats["means"]) < self.count else math.inf
         self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=False)
 
 

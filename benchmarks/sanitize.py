@@ -33,7 +33,7 @@ from nexwarp.train.presets import preset
 from nexwarp.train.trainer import Trainer
 
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
-# Iterations of a full run: all degrees of spherical harmonics, then a step beyond the frame with a density round.
+# Iterations of a full run: all degrees of spherical harmonics, then a step with a density round.
 ITERATIONS = (10_001, 10_100)
 SURFELS = 200
 PACKAGED = ("nvidia/cu13/compute-sanitizer", "nvidia/cuda_sanitizer_api/bin")  # nvidia-cuda-sanitizer-api, by version

@@ -91,10 +91,14 @@ class Geometry:
         """List the surfels of each tile."""
         return ops.intersect_tiles(*self.shape, projection, self.viewmat, self.pinhole)
 
+    def collect(self, projection: ops.Projection, tiles: ops.Tiles, max_hits: int = 2) -> ops.Hits:
+        """Walk the lists."""
+        return ops.collect(projection, tiles, self.pinhole, max_hits=max_hits)
+
     def hits(self, max_hits: int = 2) -> ops.Hits:
         """Run the whole collection stage: project, tiles, collect."""
         projection = self.project()
-        return ops.collect(projection, self.tiles(projection), self.pinhole, max_hits=max_hits)
+        return self.collect(projection, self.tiles(projection), max_hits)
 
 
 @torch.no_grad()

@@ -7,6 +7,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Before cuBLAS is used: without it torch has no deterministic matrix products on CUDA. The size is that of its default.
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
+if "RANK" in os.environ:
+    # Of several ranks: torch's warnings of closed connections would bury the line that says which rank has ended.
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
+
 from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli.version import __version__ as __version__

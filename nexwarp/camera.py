@@ -86,6 +86,11 @@ class Camera:
         return (self.fx * self.fy) ** 0.5
 
     @property
+    def pixel_focal(self) -> float:
+        """Focal length of the image's pixels: `focal` may be lower, to limit the detail of the texture."""
+        return (self.fx * self.fy) ** 0.5
+
+    @property
     def device(self) -> torch.device:
         """Device of `viewmat`."""
         return self.viewmat.device
@@ -120,11 +125,13 @@ class StagedCamera(Camera):
     """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
 
     Attributes:
-        focal_length: (1,) `Camera.focal` of the camera that was copied last, on the device of `viewmat`; `fx` to `cy`
-            are those of the first one.
+        focals: (2,) `Camera.focal` and `Camera.pixel_focal` of the camera that was copied last, on the device of
+            `viewmat`; `fx` to `cy` are those of the first one.
+        falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
     """
 
-    focal_length: torch.Tensor = field(kw_only=True)
+    focals: torch.Tensor = field(kw_only=True)
+    falloff: torch.Tensor | None = field(default=None, kw_only=True)
 
     @classmethod
     def of(cls, camera: Camera) -> "StagedCamera":
@@ -136,19 +143,26 @@ class StagedCamera(Camera):
             camera.height,
             camera.near,
             checked=(camera.fx, camera.fy, camera.cx, camera.cy),
-            focal_length=camera.viewmat.new_full((1,), camera.focal),
+            focals=camera.viewmat.new_tensor([camera.focal, camera.pixel_focal]),
         )
 
     @property
     def focal(self) -> torch.Tensor:  # type: ignore[override]  # a graph reads the number from the device
         """(1,) focal length in pixels, on the device."""
-        return self.focal_length
+        return self.focals[:1]
+
+    @property
+    def pixel_focal(self) -> torch.Tensor:  # type: ignore[override]
+        """(1,) focal length of the image's pixels, on the device."""
+        return self.focals[1:]
 
     def copy_(self, camera: Camera) -> None:
-        """Overwrite the tensors with those of another camera of the same size and near depth."""
+        """Overwrite the tensors but the falloff with those of another camera of the same size and near depth."""
         self.viewmat.copy_(camera.viewmat)
         self.K.copy_(camera.K)
-        self.focal_length.fill_(camera.focal)
+        # From pageable memory, which is read before the call returns.
+        focals = torch.tensor([camera.focal, camera.pixel_focal], dtype=torch.float64)
+        self.focals.copy_(focals.to(self.focals.dtype), non_blocking=True)
 
 
 def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.Tensor:

@@ -77,7 +77,8 @@ def check_version(value: object, known: int) -> None:
     if type(value) is not int or not 1 <= value <= known:
         newer = type(value) is int and value > known
         reason = "; a newer nexwarp wrote the file, update nexwarp to read it" if newer else ""
-        raise ValueError(f"expected format version {known}, got {value!r:.60}{reason}")
+        expected = "1" if known == 1 else f"1 to {known}"
+        raise ValueError(f"expected format version {expected}, got {value!r:.60}{reason}")
 
 
 def check_range(name: str, value: float, low: float, high: float = float("inf")) -> None:

@@ -9,6 +9,7 @@
       MissingError      (FileNotFoundError)  a file or folder that does not exist
       StorageError      (OSError)            a disk that is full, read-only or failing
       DivergedError     (RuntimeError)       a training whose numbers are no longer finite
+      RankError         (RuntimeError)       ranks of a training that are missing, differ or have ended
       OutOfMemoryError  (MemoryError)        a GPU or computer with too little memory for the task
 
 Arguments of Python functions that are out of range or of another type raise plain ValueError and TypeError.
@@ -70,6 +71,10 @@ class DivergedError(NexwarpError, RuntimeError):
     def __init__(self, message: str, report: Mapping[str, object] | None = None) -> None:
         super().__init__(message)
         self.report: dict[str, object] = dict(report or {})
+
+
+class RankError(NexwarpError, RuntimeError):
+    """Ranks of a training on several GPUs are missing, differ from each other, or have ended."""
 
 
 class OutOfMemoryError(NexwarpError, MemoryError):

@@ -12,7 +12,7 @@ from nexwarp.camera import Camera
 from nexwarp.checks import check_finite, check_range, check_tensors
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.memory import needed_memory
+from nexwarp.memory import keep_freed_memory, needed_memory
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
@@ -292,9 +292,7 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
         return shape
     row = camera.viewmat[2].to(shape.means)
     depths = torch.addmv(row[3], shape.means, row[:3])
-    # Focal length of the image's pixels: `camera.focal` may be lower, to limit the detail of the texture.
-    focal = (camera.fx * camera.fy) ** 0.5
-    blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, focal)
+    blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, camera.pixel_focal)
     return Activated(shape.means, shape.quats, *blurred)
 
 
@@ -304,6 +302,11 @@ def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
         if background.device.type == "cpu":
             check_finite("background", background.detach())
         return background.expand(3) if background.ndim == 0 else background
+    return torch.stack([like.new_full((), x) for x in background_numbers(background, like.dtype)])
+
+
+def background_numbers(background: float | Sequence[float], dtype: torch.dtype) -> list[float]:
+    """Return a background that is no tensor as three numbers; raise TypeError or ValueError where it is none."""
     values: Sequence[object]
     if isinstance(background, numbers.Real):
         values = [background] * 3
@@ -317,9 +320,9 @@ def _background(background: Color, like: torch.Tensor) -> torch.Tensor:
     if len(numbers_) != 3:
         raise TypeError(f"background: expected three numbers or a tensor, got {values}")
     for x in numbers_:
-        if not abs(x) <= torch.finfo(like.dtype).max:
+        if not abs(x) <= torch.finfo(dtype).max:
             raise ValueError(f"background: expected finite values, got {x}")
-    return torch.stack([like.new_full((), x) for x in numbers_])
+    return numbers_
 
 
 def _check_types(
@@ -356,7 +359,9 @@ def _check_types(
         raise TypeError(f"surfels: expected float32 or float64 parameters, got {surfels.means.dtype}")
     if surfels.device.type == "cuda":
         torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
-    elif surfels.device.type != "cpu":
+    elif surfels.device.type == "cpu":
+        keep_freed_memory()
+    else:
         raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {surfels.device}")
 
 

@@ -17,9 +17,9 @@ import warp as wp
 
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
-from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
-from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.tiles import (
     LARGEST_INT,
@@ -32,7 +32,7 @@ from nexwarp.kernels.tiles import (
     tile_polygon_kernel,
 )
 from nexwarp.kernels.types import types
-from nexwarp.kernels.unproject import unproject_kernel
+from nexwarp.kernels.unproject import unproject_kernels
 from nexwarp.kernels.walk import BLOCK_DIM
 
 
@@ -169,8 +169,8 @@ def project(
     records = _new(means, (len(means), 4), types(real).vec4)
     centers = _new(means, len(means), means.dtype)
     limits = _new(means, len(means), real, requires_grad=False)
-    inputs = [means, quats, scales, opacities, gammas, colors, viewmat, 0]
-    _launch(tape, project_kernel(real), len(means), inputs, [records, centers, limits])
+    inputs = [means, quats, scales, opacities, gammas, colors, viewmat]
+    _launch(tape, project_kernels(real).forward, len(means), inputs, [records, centers, limits])
     return records, centers, limits
 
 
@@ -273,8 +273,8 @@ def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) 
     real = _real(depths)
     t = types(real)
     positions, directions = _new(depths, depths.shape, t.vec3), _new(depths, depths.shape[0], t.vec3)
-    inputs = [depths, viewmat, 0, image.matrices(depths), image.size[0]]
-    _launch(tape, unproject_kernel(real), depths.shape[0], inputs, [positions, directions])
+    inputs = [depths, viewmat, image.matrices(depths), image.size[0]]
+    _launch(tape, unproject_kernels(real).forward, depths.shape[0], inputs, [positions, directions])
     return positions, directions
 
 
@@ -340,5 +340,5 @@ def compose(
     """Image and textured, (P) vec3 each, of plain and base (P) vec3, colors (P, K) vec3, weights (P, K), alphas (P)."""
     image, textured = _new(plain, plain.shape, plain.dtype), _new(plain, plain.shape, plain.dtype)
     inputs = [plain, base, colors, weights, alphas, background]
-    _launch(tape, compose_kernel(_real(plain)), len(plain), inputs, [image, textured])
+    _launch(tape, compose_kernels(_real(plain)).forward, len(plain), inputs, [image, textured])
     return image, textured

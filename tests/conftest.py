@@ -5,6 +5,8 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch reads it: the cores are shared by processes, not by threads
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # before torch reads it, for the ranks that tests fork
+
 import signal
 from collections.abc import Iterator
 from pathlib import Path

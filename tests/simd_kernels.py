@@ -12,7 +12,7 @@ WIDTH = 8
 
 # By name: (function of the snippets' namespace f and the arguments a, b), for one function of arithmetic, exp_log and
 # masks each. A kernel made of it writes its values and, by `wp.grad` of the contraction with g, its derivatives.
-ARITHMETIC = ("times", "over", "scaled", "exp", "log", "pick", "at_least", "at_most")
+ARITHMETIC = ("times", "over", "scaled", "exp", "exp2", "log2", "pick", "at_least", "at_most")
 
 
 def function_kernel(real: type, name: str) -> wp.Kernel:
@@ -46,7 +46,8 @@ def function_kernel(real: type, name: str) -> wp.Kernel:
 def _function(real: type, name: str, f: Any) -> Callable[..., Any]:
     reals = f.reals
     splat, scaled, times, over, pick, below = f.splat, f.scaled, f.times, f.over, f.pick, f.below
-    power_of_e, logarithm, at_least, at_most = f.power_of_e, f.logarithm, f.at_least, f.at_most
+    power_of_e, power_of_2, binary_logarithm = f.power_of_e, f.power_of_2, f.binary_logarithm
+    at_least, at_most = f.at_least, f.at_most
     ONE = wp.constant(real(1.0))
 
     @wp.func
@@ -59,8 +60,10 @@ def _function(real: type, name: str, f: Any) -> Callable[..., Any]:
             return scaled(b[0], a) + splat(b[1])
         elif wp.static(name == "exp"):
             return power_of_e(a)
-        elif wp.static(name == "log"):
-            return logarithm(a)
+        elif wp.static(name == "exp2"):
+            return power_of_2(a)
+        elif wp.static(name == "log2"):
+            return binary_logarithm(a)
         elif wp.static(name == "pick"):
             return pick(below(a, b), a, b)
         elif wp.static(name == "at_least"):

@@ -15,6 +15,7 @@ import torch
 import nexwarp as nw
 from benchmarks import __main__ as command
 from benchmarks import bench_cpu, bench_frame, bench_peers, bench_sizes
+from benchmarks.gpu_time import busy
 from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
 from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
@@ -181,7 +182,7 @@ def test_frames_of_the_trained_scene_are_timed_with_its_options(
 
 def test_frames_of_an_untrained_scene_have_what_a_finished_model_has() -> None:
     model = bench_frame.finished(small_scene())
-    assert model.texture is not None and model.detail_limits is not None
+    assert model.texture is not None and model.detail_limits is not None and model.exposures is not None
     assert (model.detail_limits.nearest < NEVER).any() and (model.detail_limits.farthest < NEVER).any()
     again = bench_frame.finished(replace(small_scene(), model=model))
     assert again.texture is model.texture and again.detail_limits is model.detail_limits
@@ -246,8 +247,8 @@ def test_peer_gets_the_same_scene() -> None:
 
     g = geometry(small_scene())
     assert isinstance(g.pinhole, Pinhole)
-    rasterize, leaves = bench_peers.gsplat_call(g, Peer)
-    assert len(rasterize()) == 2
+    call = bench_peers.gsplat_call(g, Peer)
+    assert len(call.forward()) == 2
     assert seen == {
         "means": (300, 3),
         "quats": (300, 4),
@@ -257,7 +258,25 @@ def test_peer_gets_the_same_scene() -> None:
         "viewmats": (1, 4, 4),
         "Ks": (1, 3, 3),
     }
-    assert all(x.is_leaf and x.requires_grad for x in leaves)
+    assert all(x.is_leaf and x.requires_grad for x in call.leaves)
+
+
+def test_time_of_a_gpu_counts_kernels_side_by_side_once_and_gaps_never() -> None:
+    assert busy([(5.0, 7.0), (0.0, 2.0), (1.0, 3.0), (5.5, 6.0)]) == 5.0
+    assert busy([]) == 0.0
+
+
+def test_entries_walked_by_our_side_end_at_each_pixel_s_last_hit() -> None:
+    g = geometry(small_scene())
+    projection = g.project()
+    tiles = g.tiles(projection)
+    hits = g.collect(projection, tiles)
+    listed, walked = bench_peers.our_call(g).walked()
+    assert listed == len(tiles.surfel_ids)
+    y, x = torch.meshgrid(torch.arange(30), torch.arange(43), indexing="ij")
+    starts = tiles.tile_offsets[(y // tiles.tile_size) * tiles.columns + x // tiles.tile_size]
+    assert walked == pytest.approx((hits.stops - starts).double().mean().item())
+    assert 0 < walked < listed
 
 
 # Cost against size

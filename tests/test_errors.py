@@ -21,6 +21,7 @@ from nexwarp.errors import (
     MissingError,
     NexwarpError,
     OutOfMemoryError,
+    RankError,
     RunError,
     SceneError,
     SettingError,
@@ -41,6 +42,7 @@ KIN = {
     MissingError: FileNotFoundError,
     StorageError: OSError,
     DivergedError: RuntimeError,
+    RankError: RuntimeError,
     OutOfMemoryError: MemoryError,
 }
 

@@ -30,7 +30,6 @@ def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory, few_looks
         max_surfels=500,
         texture=TextureConfig(levels=4, table_size=2**10, width=16),
         rates=LearningRates(means=(5e-4, 5e-6), scales=2.5e-2, opacities=0.05, sh0=1.25e-2, grid=(2e-2, 2e-4)),
-        metering=False,
     )
     nw.train(tiny_scene, config, device="cpu").save(folder)
     sets = {"train": tiny_scene.train, "test": tiny_scene.test}

@@ -99,6 +99,8 @@ def test_numbers_are_fetched_only_for_lines(trainer, tmp_path, total, expected):
     """Between lines the step's tensors are not touched: nothing waits for the device."""
 
     class Step:
+        views = 1
+
         def __init__(self, iteration: int) -> None:
             self.iteration = iteration
 

@@ -136,16 +136,19 @@ def checkpoint_version(tmp_path: Path, version: object) -> tuple[Path, Callable[
     return tmp_path / "checkpoint", lambda: load_checkpoint(tmp_path)
 
 
-KINDS = [model_version, config_version, metrics_version, cameras_version, checkpoint_version]
+KINDS = {model_version: 2, config_version: 1, metrics_version: 1, cameras_version: 1, checkpoint_version: 1}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_the_known_version_is_read(tmp_path: Path, kind: Callable[..., Any]) -> None:
+def test_only_known_versions_are_read(tmp_path: Path, kind: Callable[..., Any]) -> None:
+    newest = KINDS[kind]
+    known = "1" if newest == 1 else f"1 to {newest}"
     for number, version in enumerate(WRONG_VERSIONS):
         file, read = kind(tmp_path / str(number), version)
-        refused(ValueError, read, names=file, match=f"expected format version 1, got {version!r}")
-    file, read = kind(tmp_path / "newer", 2)
-    message = "expected format version 1, got 2; a newer nexwarp wrote the file, update nexwarp to read it"
+        refused(ValueError, read, names=file, match=f"expected format version {known}, got {version!r}")
+    file, read = kind(tmp_path / "newer", newest + 1)
+    wrote = "a newer nexwarp wrote the file, update nexwarp to read it"
+    message = f"expected format version {known}, got {newest + 1}; {wrote}"
     refused(ValueError, read, names=file, match=message)
 
 

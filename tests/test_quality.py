@@ -16,17 +16,27 @@ from benchmarks.peer_gsplat import PeerSettings
 from benchmarks.quality.__main__ import main
 from benchmarks.quality.jobs import TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import read_results
-from benchmarks.quality.rows import GSPLAT, PEERS, ROWS, Row
+from benchmarks.quality.rows import GSPLAT, MEGABYTES, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
-from benchmarks.quality.scenes import ARC_VIEWS, VARIANTS, held_out_arc, inner_validation, moved, of_training_views
+from benchmarks.quality.scenes import (
+    ARC_VIEWS,
+    VARIANTS,
+    held_out_arc,
+    inner_validation,
+    moved,
+    of_training_views,
+    with_near,
+)
 from benchmarks.timing import ROOT
 from nexwarp.data import Scene, View
 from nexwarp.data.demo import write_demo
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.run.metrics import psnr
+from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
+from nexwarp.train.trainer import Trainer
 from tests.narrowing import present
 from tests.tolerances import assert_close
 
@@ -151,7 +161,7 @@ def test_rows_that_differ_late_share_their_first_iterations() -> None:
 def test_rows_of_finishing_share_their_first_iterations() -> None:
     jobs = list(table_jobs("changes", ("fox",), (0,), 300, 40))
     shared = {tuple(job.row for job in g.jobs): g.iterations for g in group_jobs(jobs, ROWS) if g.iterations}
-    finished = ("no footprints", "no SH smoothing", "no metering")
+    finished = ("no footprints", "no SH smoothing")
     assert shared == {("default", *finished, "floaters left"): 249}
 
 
@@ -224,6 +234,13 @@ def test_an_interrupted_benchmark_takes_its_workers_along(folder: Path, tmp_path
     assert not (tmp_path / "out.jsonl").exists()
 
 
+def test_near_planes_are_moved_alone(scene: Scene) -> None:
+    other = with_near(scene, near=0.5)
+    for one, two in zip((*scene.train, *scene.test), (*other.train, *other.test), strict=True):
+        assert two.camera.near == 0.5 and torch.equal(one.camera.viewmat, two.camera.viewmat)
+    assert torch.equal(scene.points, other.points)
+
+
 def test_validation_views_are_training_views(scene: Scene) -> None:
     part = inner_validation(scene)
     names = [view.name for view in scene.train]
@@ -252,6 +269,21 @@ def test_an_arc_starts_from_what_its_training_views_show(scene: Scene) -> None:
     assert (part.colors.float() - before).abs().median() < 16
     without = dataclasses.replace(scene, train=[dataclasses.replace(view, points=None) for view in scene.train])
     assert of_training_views(without) is without
+
+
+def test_files_of_a_budget_have_its_size(scene: Scene, tmp_path: Path) -> None:
+    """Compact files of the table by megabytes: as many bytes as its primitives, its grid and its MLP take."""
+    model = Trainer(scene, Config(max_surfels=100, texture=TextureConfig(table_size=2**12)), "cpu").finish()
+    coded = 77 * len(model.surfels) + present(model.texture).grid.numel()
+    known = model.save(tmp_path, compact=True).stat().st_size - coded
+    for row, count in MEGABYTES:
+        budget = {37_000: 5, 68_400: 5, 74_900: 10, 136_900: 10}[count] * 10**6
+        if row.preset is None:
+            size = 73 * count
+        else:
+            texture = with_settings(preset("default"), row.settings).texture
+            size = 77 * count + texture.levels * texture.features * present(texture.table_size) + known
+        assert 0.99 * budget < size <= budget, (row.name, size)
 
 
 def test_settings_of_the_peers_are_checked() -> None:

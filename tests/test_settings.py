@@ -69,8 +69,7 @@ def test_unknown_settings_are_refused(name: str) -> None:
     ("settings", "message"),
     [
         ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
-        ({"border": 0.7}, "border: expected at least 0 and at most 0.5, got 0.7"),
-        ({"clamp_texture": True}, "clamp_texture: expected False with texture.residual, got True"),
+        ({"coarse": 1.5}, "coarse: expected at least 0 and at most 1, got 1.5"),
         ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
     ],
 )
@@ -93,43 +92,6 @@ def test_a_window_sees_what_the_camera_sees_there(scene: Scene) -> None:
     again = nw.Camera(window.viewmat, window.K, 20, 30, camera.near)
     assert (again.cx, again.cy, again.fx) == pytest.approx((window.cx, window.cy, window.fx))
     assert camera.crop(0, 0, camera.width, camera.height).cx == camera.cx
-
-
-# Beyond the frame
-
-
-def test_beyond_the_frame_the_photos_edge_goes_on(scene: Scene) -> None:
-    trainer = make_trainer(scene, border=0.25)
-    for _ in range(20):
-        view = trainer.targets.from_view(0, 1)
-        shifted = trainer.targets.shifted(view)
-        left = round(view.camera.cx - shifted.camera.cx)
-        top = round(view.camera.cy - shifted.camera.cy)
-        assert abs(left) <= 12 and abs(top) <= 9
-        assert shifted.counts is not None and shifted.beyond is not None
-        for row in (0, 17, 35):
-            for column in (0, 20, 47):
-                r, c = row + top, column + left
-                inside = 0 <= r < 36 and 0 <= c < 48
-                expected = view.photo[min(max(r, 0), 35), min(max(c, 0), 47)]
-                assert torch.equal(shifted.photo[row, column], expected)
-                assert bool(shifted.counts[row, column]) == inside
-                assert bool(shifted.beyond[row, column]) != inside
-
-
-def test_a_hidden_edge_does_not_go_on(scene: Scene) -> None:
-    mask = torch.ones(36, 48, dtype=torch.bool)
-    mask[:, 40:] = False
-    hidden = dataclasses.replace(scene, train=[dataclasses.replace(v, mask=mask) for v in scene.train])
-    trainer = make_trainer(hidden, border=0.25)
-    for _ in range(10):
-        shifted = trainer.targets.shifted(trainer.targets.from_view(0, 1))
-        left = round(scene.train[0].camera.cx - shifted.camera.cx)
-        column = 47 - max(left, 0)  # shows the photo's last column
-        if left <= 0:
-            continue
-        assert shifted.counts is not None and shifted.beyond is not None
-        assert not shifted.beyond[:, column + 1 :].any() and not shifted.counts[:, column:].any()
 
 
 # Backgrounds
@@ -210,7 +172,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
     halves = dataclasses.replace(scene, train=views)
     alphas = {}
     for mode in ("ignore", "background"):
-        trainer = make_trainer(halves, iterations=60, mask_mode=mode, border=0.0)
+        trainer = make_trainer(halves, iterations=60, mask_mode=mode)
         trainer.run()
         with torch.no_grad():
             view = trainer.targets.from_view(0, 1)

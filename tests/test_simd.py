@@ -25,7 +25,8 @@ EXPECTED: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
     "over": lambda a, b: a / b,
     "scaled": lambda a, b: b[:, :1] * a + b[:, 1:2],
     "exp": lambda a, b: a.exp(),
-    "log": lambda a, b: a.log(),
+    "exp2": lambda a, b: a.exp2(),
+    "log2": lambda a, b: a.log2(),
     "pick": lambda a, b: torch.where(a < b, a, b),
     "at_least": lambda a, b: a.clamp_min(1.0),
     "at_most": lambda a, b: a.clamp_max(1.0),
@@ -102,16 +103,17 @@ def test_exp_and_log_of_whatever_comes() -> None:
     """To 2 units in the last place; what has no value must not come out as one."""
     x = torch.cat([torch.linspace(-86, 86, 4001), torch.tensor([1e-20, 1e-8, 1e30, float("nan"), float("inf")])])
     x = torch.nn.functional.pad(x, (0, -len(x) % WIDTH)).view(-1, WIDTH).contiguous()
-    exps, logs = torch.zeros_like(x), torch.zeros_like(x)
-    for name, values in (("exp", exps), ("log", logs)):
+    exps, exps2, logs = (torch.zeros_like(x) for _ in range(3))
+    for name, values in (("exp", exps), ("exp2", exps2), ("log2", logs)):
         run(function_kernel(wp.float32, name), x, x, x, values, *(torch.zeros_like(x) for _ in range(2)))
-    x, exps, logs = (t.flatten()[:4006].double() for t in (x, exps, logs))
+    x, exps, exps2, logs = (t.flatten()[:4006].double() for t in (x, exps, exps2, logs))
     fine = torch.isfinite(x) & (x.abs() <= 86)
     assert ((exps / x.exp() - 1).abs()[fine] < 2.4e-7).all()
+    assert ((exps2 / x.exp2() - 1).abs()[fine] < 2.4e-7).all()
     above_0 = fine & (x > 0) | (x == 1e30)
-    expected = x[above_0].log()
+    expected = x[above_0].log2()
     assert ((logs[above_0] - expected).abs() <= 2.4e-7 * expected.abs().clamp_min(1)).all()
-    assert exps[-2].isnan() and logs[-2].isnan() and logs[-1].isnan()
+    assert exps[-2].isnan() and exps2[-2].isnan() and logs[-2].isnan() and logs[-1].isnan()
 
 
 # The forms

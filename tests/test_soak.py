@@ -19,7 +19,6 @@ from benchmarks.soak import (
     phase,
     spans,
 )
-from nexwarp.cli.device import keep_freed_memory
 from nexwarp.train.trainer import Trainer
 from tests.trainer_support import small
 
@@ -109,8 +108,6 @@ def test_frames_and_steps_leave_memory_as_it_is(device, capsys):
 @pytest.mark.parametrize("count", [2000])
 def test_loads_and_renderings_leave_nothing_behind(tiny_scene, tmp_path, device, count):
     """Neither memory nor open files nor threads, over renderings of 84 cameras with and without gradients."""
-    if device.type == "cpu":
-        keep_freed_memory()
     trainer = Trainer(tiny_scene, small(max_surfels=60), device)
     trainer.run(until=3)
     file = trainer.finish().save(tmp_path / "model.safetensors")

@@ -18,6 +18,7 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config, LearningRates, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.trainer import Trainer
+from tests.exposed import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
 
@@ -81,9 +82,9 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
 
 @pytest.mark.cuda
 def test_deterministic_runs_are_the_same_on_cuda(scene):
-    runs = []
+    runs, exposed = [], with_exposures(scene)
     for _ in range(3):
-        trainer = Trainer(scene, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
+        trainer = Trainer(exposed, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
         trainer.run()
         runs.append(trainer)
     assert not torch.are_deterministic_algorithms_enabled()
@@ -144,9 +145,8 @@ def test_progress_tells_what_happened(scene):
         assert p.loss() == pytest.approx(sum(x.item() for x in p.losses.values()), rel=1e-6)
         error = (p.image.detach().double().clamp(0, 1) - p.target.double()).square().mean().item()
         assert p.psnr() == pytest.approx(-10 * math.log10(error), abs=1e-4)
-    always = {"l1", "dssim", "texture", "alpha", "opacity", "grid"}
     for p in seen:
-        assert set(p.losses) == always | ({"border"} if p.iteration % 4 == 0 else {"depth"})
+        assert set(p.losses) == {"l1", "dssim", "texture", "alpha", "opacity", "grid", "depth"}
     counts = [p.surfels for p in seen]
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
     assert counts[2] == 63 == int(1.05 * counts[0])
@@ -244,7 +244,7 @@ def test_surfels_settle_with_two_hits(scene):
 
 
 def test_views_are_drawn_without_replacement(scene):
-    trainer, drawn = Trainer(scene, small(iterations=24, border=0.0, exposures=False), "cpu"), []
+    trainer, drawn = Trainer(scene, small(iterations=24, exposures=False), "cpu"), []
     photos = [view.image.float() / 255 for view in scene.train]
 
     def note(progress: Any) -> None:

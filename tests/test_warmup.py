@@ -107,7 +107,7 @@ SETTINGS = {
     "no texture, floaters left": Config(max_hits=0, densify=DensifyConfig(floaters=False)),
     "K = 3": Config(max_hits=3),
     "deterministic": Config(deterministic=True),
-    "options": Config(low_pass=True, clamp_texture=True, sh_degree=1, texture=TextureConfig(residual=False)),
+    "options": Config(low_pass=True, sh_degree=1, texture=TextureConfig(residual=False)),
 }
 
 
@@ -161,7 +161,7 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_rehearsal_changes_only_what_is_not_compiled_in() -> None:
     for config in SETTINGS.values():
         tiny = warmup.tiny(config)
-        kept = ("preset", "max_hits", "sh_degree", "low_pass", "clamp_texture", "clamp_image", "losses", "background")
+        kept = ("preset", "max_hits", "sh_degree", "low_pass", "clamp_image", "losses", "background")
         assert all(getattr(tiny, name) == getattr(config, name) for name in kept)
         assert replace(tiny.texture, table_size=config.texture.table_size) == config.texture
 

@@ -92,3 +92,7 @@ def describe_worst(error: torch.Tensor, actual: torch.Tensor, expected: torch.Te
         return "No elements."
     where = tuple(int(i) for i in torch.unravel_index(error.argmax(), error.shape))
     return f"Worst at {where}: actual {actual[where].item():.9g}, expected {expected[where].item():.9g}"
+
+
+WEB_PSNR = {"full": 50.0, "quantised": 40.0}
+"""Least PSNR, dB, of the WGSL renderer's pictures against `Model.render`, by the scene file's quality."""

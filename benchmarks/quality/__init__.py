@@ -18,6 +18,6 @@ a metric over the number of primitives.
 Metrics are those of `nexwarp.run.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had.
 Speed and memory of a training count only when it ran alone (`--jobs 1`).
 
-Three names are those of older versions, because kept results refer to them: the table and the variant `arc` (held-out
-arc), and the rows "no footprints" (detail limits) and "no metering" (auto exposure).
+Two names are those of older versions, because kept results refer to them: the table and the variant `arc` (held-out
+arc), and the row "no footprints" (detail limits).
 """

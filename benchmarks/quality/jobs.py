@@ -11,11 +11,13 @@ from benchmarks.quality.rows import (
     DEMO_CONFIG,
     DEMOS,
     HITS,
+    MEGABYTES,
     NO_TEXTURE,
     PAPER,
     PEER,
     PEERS,
     REMOVALS,
+    SUSPECTS,
     Row,
 )
 from nexwarp.train.config import Config
@@ -24,7 +26,20 @@ from nexwarp.train.settings import with_settings
 
 SCENES = ("train", "fox", "saharov", "kitchen25")
 DEMO = "demo"  # the built-in scene
-TABLES = ("peers", "curve", "paper", "ablation", "hits", "changes", "arc", "frames", "demo")
+TABLES = (
+    "peers",
+    "megabytes",
+    "sizes",
+    "curve",
+    "paper",
+    "ablation",
+    "hits",
+    "changes",
+    "suspects",
+    "arc",
+    "frames",
+    "demo",
+)
 CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
 
 
@@ -74,16 +89,18 @@ def table_jobs(
         scenes: names of scenes; `curve`, `arc` and `frames` are of fox alone, `demo` of the built-in scene.
         seeds: of each row.
         iterations: of each training; `demo` has its own.
-        size: budget of primitives; `curve` and `demo` have their own.
+        size: budget of primitives; `megabytes`, `sizes`, `curve` and `demo` have their own.
 
     Raises:
         ValueError: `table` is unknown.
     """
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...] = ()
     sizes: tuple[int, ...] = (size,)
     variants: tuple[str, ...] = ("",)
     if table == "peers":
         rows, sizes = (DEFAULT, *PEERS), (size, size // 4)
+    elif table == "sizes":
+        rows, sizes = (DEFAULT,), CURVE
     elif table == "curve":
         rows, sizes, scenes = (DEFAULT, PEER), CURVE, ("fox",)
     elif table == "paper":
@@ -94,6 +111,8 @@ def table_jobs(
         rows = (DEFAULT, NO_TEXTURE, *HITS)
     elif table == "changes":
         rows = (DEFAULT, *CHANGES)
+    elif table == "suspects":
+        rows = (PAPER, *SUSPECTS)
     elif table == "arc":
         rows, variants, scenes = (DEFAULT, PAPER), ("arc",), ("fox",)
     elif table == "frames":
@@ -101,15 +120,15 @@ def table_jobs(
     elif table == "demo":
         rows, variants, scenes = DEMOS, ("arc",), (DEMO,)
         sizes, iterations = (DEMO_CONFIG.max_surfels,), DEMO_CONFIG.iterations
-    else:
+    elif table != "megabytes":
         raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
     seeds = tuple(seeds)
+    sized = MEGABYTES if table == "megabytes" else [(row, count) for count in sizes for row in rows]
     for scene in scenes:
-        for count in sizes:
+        for row, count in sized:
             for variant in variants:
-                for row in rows:
-                    for seed in seeds:
-                        yield TrainingJob(scene, variant, row.name, count, seed, iterations)
+                for seed in seeds:
+                    yield TrainingJob(scene, variant, row.name, count, seed, iterations)
 
 
 def config_of(job: TrainingJob, row: Row) -> Config:
@@ -149,7 +168,6 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         config,
         max_hits=min(config.max_hits, 2),
         densify=dataclasses.replace(config.densify, floaters=False),
-        metering=False,
         footprints=False,
         smooth_sh=0.0,
     )

@@ -38,6 +38,12 @@ PEERS = (
     Row("gsplat default", None, _BACKGROUND | {"strategy": "default"}),
     Row("gsplat 2DGS", None, _BACKGROUND | {"strategy": "default", "primitive": "2dgs"}),
 )
+# Compact files of 5 and 10 MB (10^6 bytes): 77 bytes a surfel and one a number of the grid; 73 bytes a Gaussian.
+MEGABYTES = (
+    (Row("5 MB", settings={"texture.table_size": 2**16}), 37_000),
+    (Row("10 MB", settings={"texture.table_size": 2**17}), 74_900),
+    *((row, size) for row in PEERS[2:4] for size in (68_400, 136_900)),
+)
 NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
 # The ablations of the paper.
 REMOVALS = (
@@ -56,9 +62,6 @@ CHANGES = (
     Row("no footprints", settings={"footprints": False}),
     Row("no SH smoothing", settings={"smooth_sh": 0.0}),
     Row("no exposures", settings={"exposures": False}),
-    Row("no metering", settings={"metering": False}),
-    Row("no vignetting", settings={"vignetting": False}),
-    Row("no border steps", settings={"border": 0.0}),
     Row("no depth loss", settings={"losses.depth": 0.0}),
     Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
     Row("constant MLP rate", settings={"rates.mlp": [1e-3, 1e-3]}),
@@ -72,9 +75,19 @@ CHANGES = (
     Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),
     Row("paper's resolutions", settings={"texture.min_resolution": 16.0, "texture.max_resolution": 256.0}),
 )
+# What may set the paper's preset apart from the publication on captures with few pixels.
+SUSPECTS = (
+    Row("paper, K = 0", "paper", {"max_hits": 0}),
+    *(Row(f"paper, T = 2^{power}", "paper", {"texture.table_size": 2**power}) for power in (16, 18)),
+    Row("paper, low-pass", "paper", {"low_pass": True}),
+    Row("paper, residual texture", "paper", {"texture.residual": True}),
+)
 # `nexwarp train demo`, and the paper's preset with a run as short: with the demo's rates, without our additions.
 DEMO_CONFIG = with_settings(preset("default"), DEMO_SETTINGS)
 _SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
 _AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_CONFIG.rates.mlp[0],) * 2}
 DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
-ROWS = {row.name: row for row in (DEFAULT, PAPER, *PEERS, *REMOVALS, *HITS, *CHANGES, *DEMOS)}
+ROWS = {
+    row.name: row
+    for row in (DEFAULT, PAPER, *PEERS, *REMOVALS, *HITS, *CHANGES, *SUSPECTS, *DEMOS, *(row for row, _ in MEGABYTES))
+}

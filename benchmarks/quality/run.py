@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from benchmarks.quality.jobs import TrainingJob, config_of
-from benchmarks.quality.metrics import quarter_psnr, train_psnr, zoom_psnr
+from benchmarks.quality.metrics import RenderImage, quarter_psnr, train_psnr, zoom_psnr
 from benchmarks.quality.results import METRICS
 from benchmarks.quality.rows import Row
 from benchmarks.quality.scenes import scene_of
@@ -25,6 +25,7 @@ from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.model.model_file import load
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
@@ -48,10 +49,19 @@ class SharedStart:
 
 @dataclass(frozen=True)
 class Trained:
-    """Renderings of the test views after a training, (H, W, 3) uint8 on the CPU, and the facts of its result."""
+    """What a training leaves.
+
+    Attributes:
+        renderings: of the test views, (H, W, 3) uint8 on the CPU.
+        facts: of its result.
+        compact: the same renderings by the model as it is in a compact file.
+        compact_bytes: size of that file.
+    """
 
     renderings: list[tuple[View, torch.Tensor]]
     facts: dict[str, Any]
+    compact: list[tuple[View, torch.Tensor]]
+    compact_bytes: int
 
 
 def train_shared_start(jobs: Sequence[TrainingJob], data: Path, row: Row, iterations: int, folder: Path) -> SharedStart:
@@ -92,9 +102,10 @@ def run_job(
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
-        of GPU memory (torch's); of nexwarp `config`, a digest of its settings, `removed_last`, the floaters that the
-        last search removed, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its
-        shared start, if any; the metrics by view; device, date and commit.
+        of GPU memory (torch's); `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest
+        of its settings, `removed_last`, the floaters that the last search removed, `train_psnr`, `zoom_psnr` and
+        `quarter_psnr`; `together`, the rows and iterations of its shared start, if any; the metrics by view; device,
+        date and commit.
     """
     device = _device()
     scene = scene_of(job, data)
@@ -109,12 +120,15 @@ def run_job(
     peak = {}
     if device.type == "cuda":
         peak["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
-    views = _compare(job, trained, pictures)
+    views = _compare(job, trained.renderings, pictures)
+    coded = _compare(job, trained.compact, None)
     return {
         **asdict(job),
         "settings": row.settings,
         **{key: _mean(v[key] for v in views.values()) for key in METRICS},
         **trained.facts,
+        "compact": {key: _mean(v[key] for v in coded.values()) for key in METRICS}
+        | {"megabytes": trained.compact_bytes / 1e6},
         **peak,
         "views": views,
         "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
@@ -139,10 +153,12 @@ def _device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _compare(job: TrainingJob, trained: Trained, pictures: Path | None) -> dict[str, dict[str, float | None]]:
+def _compare(
+    job: TrainingJob, renderings: Sequence[tuple[View, torch.Tensor]], pictures: Path | None
+) -> dict[str, dict[str, float | None]]:
     """Return the metrics of each test view, and save its pictures."""
     views = {}
-    for view, image in trained.renderings:
+    for view, image in renderings:
         photo = to_uint8(view.image)
         figures = {name: metric(image, photo, view.mask) for name, metric in METRIC_FUNCTIONS.items()}
         views[view.name] = figures
@@ -177,6 +193,8 @@ def _train_nexwarp(
     with tempfile.TemporaryDirectory() as temporary:
         file = model.save(Path(temporary) if models is None else models / file_name(job))
         megabytes = file.stat().st_size / 1e6
+        coded = model.save(Path(temporary) / "compact.safetensors", compact=True)
+        compact, compact_bytes = load(coded).to(device), coded.stat().st_size
     facts = {
         "primitives": len(trainer.surfels),
         "removed_last": count - len(trainer.surfels),
@@ -188,8 +206,15 @@ def _train_nexwarp(
         "quarter_psnr": quarter_psnr(scene, image),
         **shared,
     }
-    with torch.no_grad():
-        return Trained([(view, to_uint8(image(view.camera)).cpu()) for view in scene.test], facts)
+    return Trained(
+        _renderings(scene, image), facts, _renderings(scene, lambda camera: compact.render(camera).image), compact_bytes
+    )
+
+
+@torch.no_grad()
+def _renderings(scene: Scene, image: RenderImage) -> list[tuple[View, torch.Tensor]]:
+    """Return the test views with their renderings."""
+    return [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
 
 
 def _restore(trainer: Trainer, folder: Path) -> None:
@@ -213,8 +238,7 @@ def _train_gsplat(job: TrainingJob, row: Row, scene: Scene, device: torch.device
     def image(camera: Camera) -> torch.Tensor:
         return gaussians.image(camera.to(device))
 
-    with torch.no_grad():
-        renderings = [(view, to_uint8(image(view.camera)).cpu()) for view in scene.test]
+    coded, compact_bytes = gaussians.compact()
     facts = {
         "primitives": len(gaussians.splats["means"]),
         "megabytes": gaussians.megabytes,
@@ -222,7 +246,8 @@ def _train_gsplat(job: TrainingJob, row: Row, scene: Scene, device: torch.device
         "train_psnr": train_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
     }
-    return Trained(renderings, facts)
+    compact = _renderings(scene, lambda camera: coded.image(camera.to(device)))
+    return Trained(_renderings(scene, image), facts, compact, compact_bytes)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

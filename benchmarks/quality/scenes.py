@@ -77,9 +77,20 @@ def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] =
     )
 
 
+def with_near(scene: Scene, near: float = 0.2) -> Scene:
+    """Move the near planes of all cameras to a z-depth, world units; the default is that of the authors' code."""
+
+    def view(v: View) -> View:
+        c = v.camera
+        return dataclasses.replace(v, camera=Camera(c.viewmat, c.K, c.width, c.height, near))
+
+    return dataclasses.replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test])
+
+
 VARIANTS = {
     "inner": inner_validation,
     "arc": held_out_arc,
+    "near": with_near,
     "x100": lambda scene: moved(scene, factor=100.0),
     "moved": lambda scene: moved(scene, shift=(1000.0, 0.0, 0.0)),
 }

@@ -1,4 +1,4 @@
-"""Hook of mkdocs: documents of the repository outside docs/ become pages, and links work as they do on GitHub.
+"""Hook of mkdocs: documents outside docs/ and the live demo become pages, and links work as they do on GitHub.
 
 A page of the site stands where its file stands in the repository, except that docs/ is the root. A link to a source
 file, which the site does not have, becomes its plain text.
@@ -16,16 +16,22 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/results/README.md", "benchmarks/notes/*.md")
+# The live demo: its scene is in docs/demo_page/, the page itself in the package.
+DEMO_FOLDER, DEMO_TITLE = "demo_page", "nexwarp demo"
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?!https?:|#)([^)#\s]+)(#[^)\s]*)?\)")
 log = logging.getLogger("mkdocs.plugins.pages")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the documents outside docs/."""
+    """Add the documents outside docs/, and the page of the live demo."""
     for pattern in PAGES:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File.generated(config, name, content=path.read_text(encoding="utf-8")))
+    for path in sorted([*ROOT.glob("nexwarp/web/page/*"), *ROOT.glob("nexwarp/web/shaders/*.wgsl")]):
+        folder = DEMO_FOLDER if path.parent.name == "page" else f"{DEMO_FOLDER}/shaders"
+        text = path.read_text(encoding="utf-8").replace("__TITLE__", DEMO_TITLE)
+        files.append(File.generated(config, f"{folder}/{path.name}", content=text))
     return files
 
 

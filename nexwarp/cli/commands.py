@@ -17,7 +17,7 @@ from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
 from nexwarp.model.detail import check_detail
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
-from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
+from nexwarp.run.contents import RENDERS_FOLDER
 from nexwarp.run.export import export_run
 from nexwarp.run.folder import read_metrics
 from nexwarp.run.opened import OpenedModel, open_model
@@ -96,24 +96,41 @@ class Export:
     --format ply writes surfels.ply, the surfels with all their properties, and splats.ply, which viewers of 3D Gaussian
     splatting open: the surfels as Gaussians, without the texture.
 
+    --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
+
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.
+
+    --format web writes a web page that shows the scene in any browser, without an installation: as it is with WebGPU,
+    with its texture baked into an image elsewhere.
+
+    --format glb writes scene.glb for Blender, three.js and others (extra `glb`): the surfels as textured quads.
+
+    --format spz writes splats.spz, the Gaussians of splats.ply at a tenth of the size (extra `splats`).
     """
 
     run: Run_
     """Run folder, or a model's folder or .safetensors file."""
-    format: Annotated[str, option("{ply,cameras}")] = "ply"
+    format: Annotated[str, option("{ply,compact,cameras,web,glb,spz}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
-    """Output folder."""
+    """Output folder. Of --format web, NAME.html writes one file with everything, which is also the default:
+    RUN/export/scene.html."""
+    quality: Annotated[str, option("{quantised,full}")] = "quantised"
+    """Of --format web: quantised files are a fifth to a half as large."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
-    """In splats.ply, surfels larger than this fraction of their distance to the nearest camera become several
-    Gaussians; inf splits none."""
+    """In splats.ply and splats.spz, surfels larger than this fraction of their distance to the nearest camera become
+    several Gaussians; inf splits none."""
+    device: Device_ = None
+    """Device to bake the texture on, for web and glb."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
+        device = pick_device(self.device)
         opened = open_model(self.run)
-        for file in export_run(opened, self.format, self.out or opened.folder / EXPORT_FOLDER, self.max_extent):
+        with console.status("exporting"):
+            files = export_run(opened, self.format, self.out, self.max_extent, self.quality, device)
+        for file in files:
             console.print(str(file), soft_wrap=True)
 
 

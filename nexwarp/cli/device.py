@@ -1,14 +1,16 @@
 """Choice and set-up of the device that a command runs on."""
 
-import ctypes
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
+import warp as wp
 
+from nexwarp.distributed.join import Place, code_digest, is_rank
+from nexwarp.distributed.launch import check_count
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
-
-# Parameters of glibc's mallopt.
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
+from nexwarp.kernels.launch import get_num_threads, set_num_threads
 
 
 def pick_device(name: str | None) -> torch.device:
@@ -22,17 +24,41 @@ def pick_device(name: str | None) -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
 
 
-def keep_freed_memory() -> None:
-    """Let glibc keep freed memory for reuse, for training on a CPU.
+@contextmanager
+def joined_ranks(name: str | None, gpus: int | None) -> Iterator[Ranks]:
+    """Join the other ranks of a training, if torchrun has started this process as one of several.
 
-    Each step allocates the same blocks again. Getting them from the system anew, page by page, would take a tenth of
-    the step's time. No effect with other C libraries.
+    Args:
+        name: of the device; None selects CUDA if available, else the CPU.
+        gpus: number of ranks that the command asks for; None is what there is.
+
+    Yields:
+        The ranks; this process alone where it is none of several.
+
+    Raises:
+        SettingError: there is no such device, or there are other ranks than the command asks for.
+        RankError: see `Ranks.join`.
     """
-    if not sys.platform.startswith("linux"):
+    if not is_rank():
+        if gpus is not None:
+            check_count(gpus, name)
+        yield Ranks.alone(pick_device(name))
         return
-    try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return
-    for parameter, value in ((M_MMAP_THRESHOLD, 32 * 2**20), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 64 * 2**20)):
-        mallopt(parameter, value)
+    place = Place.of_environment()
+    if gpus not in (None, place.size):
+        raise SettingError(f"--gpus: expected {place.size}, as many as torchrun has started, got {gpus}")
+    facts = {"code of nexwarp": code_digest(), "version of torch": torch.__version__, "version of Warp": wp.__version__}
+    device, fault = pick_device(name), None
+    if device.type == "cuda" and place.local_rank >= (found := torch.cuda.device_count()):
+        fault = f"rank {place.rank}: expected a GPU of its own, but {found} are there for {place.local_size} ranks"
+    elif device.type == "cuda":
+        torch.cuda.set_device(place.local_rank)
+        wp.set_device(f"cuda:{place.local_rank}")
+        properties = torch.cuda.get_device_properties(place.local_rank)
+        facts["GPU"] = f"{properties.name} with {properties.total_memory / 2**30:.0f} GiB"
+    else:
+        facts["device"] = "a CPU"
+        set_num_threads(max(1, get_num_threads() // place.local_size))
+    hint = "; --resume continues from the last checkpoint"
+    with Ranks.join(pick_device(name), facts, fault=fault, hint=hint) as ranks:
+        yield ranks

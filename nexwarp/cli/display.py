@@ -140,7 +140,7 @@ class TrainingDisplay:
         if self.console.is_terminal:
             due = now - self.shown >= REFRESH_SECONDS
         else:
-            due = step.iteration % max(self.total // LOG_LINES, 1) == 0
+            due = step.passed(max(self.total // LOG_LINES, 1))
         if not due and step.iteration < self.total:
             return
         self.shown = now

@@ -13,6 +13,7 @@ from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Run_, option
 from nexwarp.data import Scene
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
@@ -84,6 +85,7 @@ def evaluate_run(
     mask_mode: str,
     metrics: Sequence[str] = ("psnr", "ssim"),
     facts: dict[str, Json] | None = None,
+    ranks: Ranks | None = None,
 ) -> dict[str, Json]:
     """Evaluate a model on its test views and write metrics.json.
 
@@ -95,6 +97,7 @@ def evaluate_run(
         mask_mode: see `evaluate`.
         metrics: see `evaluate`.
         facts: the file's entries beside the metrics; None keeps those of an existing file.
+        ranks: see `evaluate`; this is rank 0.
 
     Returns:
         The entries of metrics.json.
@@ -102,8 +105,9 @@ def evaluate_run(
     if not scene.test:
         raise SceneError(f"{scene.path}: expected test views, found none")
     with display.counting(console, "evaluating", len(scene.test)) as done:
+        renders = run / RENDERS_FOLDER
         results = evaluate(
-            model, scene.test, renders=run / RENDERS_FOLDER, mask_mode=mask_mode, metrics=metrics, progress=done
+            model, scene.test, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
         )
     entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
     entries |= cast(dict[str, Json], results)

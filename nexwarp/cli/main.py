@@ -22,9 +22,12 @@ from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.version import __version__
 from nexwarp.cli.view import ViewCommand
+from nexwarp.distributed.launch import launch
+from nexwarp.distributed.liveness import end_process, may_speak
 from nexwarp.errors import NexwarpError
 from nexwarp.memory import needed_memory
 
+PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
     "eval": Eval,
@@ -109,15 +112,16 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_ERROR
     given = sys.argv[1:] if arguments is None else arguments
     try:
-        return _run([argument for argument in given if argument != "--debug"], debug="--debug" in given)
+        return _run(given)
     except BrokenPipeError:
         # Otherwise Python would try to write the rest when it ends, and report that it cannot.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE
 
 
-def _run(arguments: list[str], debug: bool) -> int:
+def _run(given: list[str]) -> int:
     """Run a command and return its exit code; BrokenPipeError if nobody reads its output any more."""
+    debug, arguments = "--debug" in given, [argument for argument in given if argument != "--debug"]
     if arguments == ["--version"]:
         print(f"nexwarp {__version__}", flush=True)
         return 0
@@ -128,6 +132,8 @@ def _run(arguments: list[str], debug: bool) -> int:
         raise
     console = OutputConsole()
     try:
+        if isinstance(command, Train) and (count := command.starts()):
+            return launch(count, [*PROGRAM, *given])
         with stopped_by_signals(), display.plain_warnings(console):
             command(console)
         sys.stdout.flush()
@@ -137,27 +143,34 @@ def _run(arguments: list[str], debug: bool) -> int:
         number = getattr(stop, "number", signal.SIGINT)
         hint = "; continue with --resume" if isinstance(command, Train) else ""
         _complain(f"{'interrupted' if number == signal.SIGINT else 'terminated'}{hint}", None)
-        return 128 + number
+        return end_process(128 + number)
     except Exception as error:
-        trace = error if debug else None
-        if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
-            _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
-            return 2
-        if isinstance(error, (NexwarpError, ValueError, OSError)):
-            _complain(f"error: {error}", trace)
-            return 2
-        if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
-            hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
-            _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
-            return 3
-        hint = "" if debug else "; --debug shows the traceback"
-        _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
-        return 3
+        return end_process(_tell(error, command, debug))
     return 0
 
 
+def _tell(error: Exception, command: Callable[[Console], None], debug: bool) -> int:
+    """Print one line about an error; return the exit code."""
+    trace = error if debug else None
+    if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
+        _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
+        return 2
+    if isinstance(error, (NexwarpError, ValueError, OSError)):
+        _complain(f"error: {error}", trace)
+        return 2
+    if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
+        hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
+        _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
+        return 3
+    hint = "" if debug else "; --debug shows the traceback"
+    _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
+    return 3
+
+
 def _complain(text: str, trace: Exception | None) -> None:
-    """Print one line on stderr, below the traceback of an error if one is given."""
+    """Print one line on stderr, below the traceback of an error if one is given; of several ranks, one does."""
+    if not may_speak():
+        return
     if trace is not None:
         traceback.print_exception(trace)
     line = " ".join(f"nexwarp: {text}".split())

@@ -20,7 +20,7 @@ def option(metavar: str, default: str | None = None) -> object:
 Scene_ = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Run_ = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda if available, else cpu")]
-Preset_ = Annotated[str, option("{default,paper}")]
+Preset_ = Annotated[str, option("{default,web,paper}")]
 Port_ = Annotated[int, option("PORT")]
 Host_ = Annotated[str, option("ADDRESS")]
 

@@ -7,23 +7,26 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import torch
 import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.device import keep_freed_memory, pick_device
+from nexwarp.cli.device import joined_ranks
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.process import SCENES, is_video, scene_of_video
 from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
+from nexwarp.distributed.join import is_rank
+from nexwarp.distributed.launch import check_count
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
 from nexwarp.run.folder import (
     DEMO,
     SceneSource,
+    began,
     claimed_run,
     create_run,
     keep_camera_path,
@@ -33,7 +36,8 @@ from nexwarp.run.folder import (
 )
 from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
-from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
 from nexwarp.train.trainer import Trainer
 
@@ -77,7 +81,8 @@ class Train:
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     preset: Preset_ = "default"
-    """Settings to start from: nexwarp's defaults, or those of the paper (docs/paper.md)."""
+    """Settings to start from: nexwarp's defaults, those of the paper (docs/paper.md), or `web`, defaults with a smaller
+    texture network for web pages on weak GPUs (docs/web.md)."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
@@ -89,6 +94,9 @@ class Train:
     """Make CUDA runs bitwise reproducible, which is slower; CPU runs always are."""
     device: Device_ = None
     """Device to train on."""
+    gpus: Annotated[int | None, option("N", "1")] = None
+    """Number of GPUs of this machine to train on, each in a process of its own; with --device cpu, of processes.
+    `torchrun` starts the same on several machines (docs/gpus.md)."""
     resume: bool = False
     """Continue the run in --run with its settings; other options must agree with them. Only --iterations may be larger:
     schedules are then those of the longer run (docs/resume.md)."""
@@ -109,19 +117,26 @@ class Train:
 
     def __call__(self, console: Console) -> None:
         """Train."""
+        with joined_ranks(self.device, self.gpus) as ranks:
+            self._train(ranks, console if ranks.first else Console(quiet=True))
+
+    def starts(self) -> int:
+        """Return how many processes this command is to start; 0 if it trains in this one."""
+        if is_rank() or self.gpus in (None, 1):
+            return 0
+        assert self.gpus is not None
+        check_count(self.gpus, self.device)
+        return self.gpus
+
+    def _train(self, ranks: Ranks, console: Console) -> None:
         if is_video(self.scene):
-            self.scene = str(self._scene_of_video(console))
-        source = self._source()
-        run = self.run or Path("runs") / source.name
-        flags = {"resume": self.resume, "overwrite": self.overwrite}
+            # Rank 0 makes the scene; the others find it.
+            made = str(self._scene_of_video(console)) if ranks.first else None
+            self.scene = str(ranks.share(made)) if ranks.size > 1 else str(made)
+        run = self.run or Path("runs") / self._source().name
         with ExitStack() as claim:
-            resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
-            if resume:
-                source = self._resumed_source(source, run)
-            device = pick_device(self.device)
-            config = self._config(run, resume)
-            self._check()
-            trainer = self._trainer(source, config, device, resume, console)
+            source, config, resume = self._plan(run, ranks, claim, console)
+            trainer = self._trainer(source, config, ranks, resume, console)
             session = TrainingSession(trainer, run, console, sinks=self._sinks(), every=self.checkpoint_every)
             if resume:
                 session.resume()
@@ -131,17 +146,21 @@ class Train:
                 if self.resume:
                     console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
             with self._viewer(trainer, run, source.name, console) as viewer:
-                if not resume:
-                    _tell_foreign(console, run, create_run(run, source, trainer.config, device.type))
+                if not resume and ranks.first:
+                    names = create_run(run, source, trainer.config, ranks.device.type, ranks.launch)
+                    _tell_foreign(console, run, names)
                 session.train(viewer)
                 model = session.finish()
                 claim.close()  # while the viewer shows the result, other commands may write to the run
+                ranks.close()
                 if viewer is not None:
                     viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
 
     def _extend(self, run: Path, trainer: Trainer, console: Console) -> None:
         """Write a larger --iterations into the run to resume, and say what it does."""
+        if not trainer.ranks.first:
+            return
         before = read_run(run)[1].iterations
         if trainer.config.iterations > before:
             rewrite_config(run, trainer.config)
@@ -151,11 +170,31 @@ class Train:
                 soft_wrap=True,
             )
 
-    def _trainer(
-        self, source: SceneSource, config: Config, device: torch.device, resume: bool, console: Console
-    ) -> Trainer:
+    def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[SceneSource, Config, bool]:
+        """Claim the run folder, on rank 0; return scene, settings and whether to resume, the same on all ranks."""
+        source, config, resume = self._source(), None, False
+        if ranks.first:
+            # Ranks that torchrun has restarted go on with the run that they had begun.
+            again = ranks.restarted and began(run, ranks.launch)
+            flags = {"resume": self.resume or again, "overwrite": self.overwrite and not again}
+            resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
+            if resume:
+                source = self._resumed_source(source, run)
+            config = self._config(run, resume)
+            self._check()
+        if ranks.size > 1:
+            mine = None if config is None else [dataclasses.asdict(source), config.as_dict(), resume]
+            told = ranks.share(mine)
+            assert isinstance(told, list)
+            source, config = SceneSource(**(told[0] | {"path": source.path})), config_from_dict(told[1])
+            resume = told[2]
+        assert config is not None
+        return source, config, resume
+
+    def _trainer(self, source: SceneSource, config: Config, ranks: Ranks, resume: bool, console: Console) -> Trainer:
         """Load the scene and return the trainer."""
-        console.print(f"{source.name} on {device_name(device)}, preset {config.preset}")
+        device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
+        console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = source.load(progress)
         size = scene.train[0].camera
@@ -163,9 +202,8 @@ class Train:
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
             f"{len(scene.points):,} points"
         )
-        if device.type == "cpu":
-            keep_freed_memory()
-        return Trainer(scene, self._with_background(config, scene, resume), device)
+        config = self._with_background(config, scene, resume)
+        return Trainer(scene, config, device) if ranks.size == 1 else ParallelTrainer(scene, config, device, ranks)
 
     def _sinks(self) -> list[str]:
         """Return where to log beside the run's file."""
@@ -196,7 +234,7 @@ class Train:
         self, trainer: Trainer, run: Path, title: str, console: Console
     ) -> AbstractContextManager["Viewer | None"]:
         """Return a context with the viewer of the training; with None, without --view."""
-        if not self.view:
+        if not self.view or not trainer.ranks.first:
             return nullcontext()
         from nexwarp.viewer import Viewer
 
@@ -219,7 +257,6 @@ class Train:
         """Return the scene of a video; what would stop the training later stops it before the scene is made."""
         video = Path(self.scene)
         self._check()
-        pick_device(self.device)
         run, scene = self.run or Path("runs") / video.stem, SceneSource(str(SCENES / video.stem))
         prepare_run(run, scene, resume=self.resume, overwrite=self.overwrite)
         return scene_of_video(video, console)

@@ -1,9 +1,10 @@
 """A training session: the training loop with display, log and checkpoints, and the files of a finished run."""
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,8 +18,9 @@ from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import load, save_model
+from nexwarp.model.model_file import MODEL_FILE, load, save_model
 from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, picture_name, remove_leftovers
+from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
@@ -49,6 +51,7 @@ class TrainingSession:
             every: iterations between checkpoints; None is a tenth of the run.
         """
         self.trainer, self.run, self.console, self.sinks = trainer, run, console, sinks
+        self.ranks = trainer.ranks
         self.total = trainer.config.iterations
         self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
 
@@ -58,13 +61,17 @@ class TrainingSession:
         Args:
             kept: number of checkpoints that the run has already.
         """
-        check_room(self.run, max(FILES_AT_A_TIME - kept, 1) * self.trainer.checkpoint_size())
+        if self.ranks.first:
+            check_room(self.run, max(FILES_AT_A_TIME - kept, 1) * self.trainer.checkpoint_size())
 
     def resume(self) -> None:
         """Restore the run's newest complete checkpoint, if it has one."""
-        self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
-        remove_leftovers(self.run)
-        if has_checkpoint(self.run):
+        found = False
+        if self.ranks.first:
+            self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
+            remove_leftovers(self.run)
+            found = has_checkpoint(self.run)
+        if self.ranks.share(found):
             # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
             self.trainer.restore(self.run, partial(display.warn, self.console), extend=True)
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
@@ -74,6 +81,8 @@ class TrainingSession:
     def train(self, viewer: "Viewer | None" = None) -> None:
         """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
 
+        Of several ranks, all stop after the step in which the signal of one has reached them. Rank 0 writes.
+
         Args:
             viewer: shows the training between steps; None shows nothing.
 
@@ -82,26 +91,36 @@ class TrainingSession:
             StorageError: the disk is full; the current model is in the run if there was room for it.
             Stopped: a signal ended the training; a checkpoint of its last step is in the run.
         """
-        trainer = self.trainer
+        trainer, ranks = self.trainer, self.ranks
         progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
         log = TrainingLog(self.run, trainer, tensorboard="tensorboard" in self.sinks, wandb="wandb" in self.sinks)
-        with progress_display, log, deferred_stop() as stop_signal:
+        with ExitStack() as stack:
+            if ranks.first:
+                stack.enter_context(progress_display)
+                stack.enter_context(log)
+            stop_signal = stack.enter_context(deferred_stop())
 
             def observe(step: StepReport) -> None:
-                progress_display(step)
-                with self._model_kept():
-                    log(step)
+                if ranks.first:
+                    progress_display(step)
+                    with self._model_kept():
+                        log(step)
                 if viewer is not None:
                     viewer.between_steps(step.iteration, partial(_describe, step), lambda: stop_signal() is not None)
-                if step.iteration % self.every == 0 or step.iteration == self.total or stop_signal() is not None:
+                number = ranks.agree(stop_signal(), now=step.iteration == self.total)
+                if step.passed(self.every) or step.iteration == self.total or number is not None:
                     with self._model_kept():
                         trainer.save_checkpoint(self.run)
-                if (number := stop_signal()) is not None:
+                if ranks.size == 1:
+                    number = stop_signal()  # also one that came during the save
+                if number is not None:
+                    ranks.leave_together()
                     raise Stopped(number)
 
             def warn(text: str) -> None:
-                display.warn(self.console, text)
-                log.rewind()
+                if ranks.first:
+                    display.warn(self.console, text)
+                    log.rewind()
 
             try:
                 trainer.run(observe, warn)
@@ -114,10 +133,13 @@ class TrainingSession:
         report = {"message": str(error), **error.report}
         outcome = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {run}"
         try:
-            write_json(run / DIVERGED_FILE, report)
-            save_model(run, trainer.model())
+            if self.ranks.first:
+                write_json(run / DIVERGED_FILE, report)
+                save_model(run, trainer.model())
         except OSError as problem:
             outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
+        outcome = str(self.ranks.share(outcome))
+        self.ranks.leave_together()
         return DivergedError(f"{error}; {outcome}", report)
 
     @contextmanager
@@ -156,9 +178,13 @@ class TrainingSession:
 
     def _finish(self) -> Model:
         trainer, scene, run, device = self.trainer, self.trainer.scene, self.run, self.trainer.device
+        if not self.ranks.first:
+            return self._finish_with_others()
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(run, finished)
+        if self.ranks.size > 1:
+            self.ranks.share_bytes(file.read_bytes())
         save_cameras(run / CAMERAS_FILE, scene.cameras)
         model = load(run).to(device)
         rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
@@ -173,9 +199,9 @@ class TrainingSession:
         }
         rows = {}
         if scene.test:
-            rows = figures(
-                evaluate_run(model, scene, run, self.console, mask_mode=trainer.config.mask_mode, facts=facts)
-            )
+            mask_mode = trainer.config.mask_mode
+            results = evaluate_run(model, scene, run, self.console, mask_mode=mask_mode, facts=facts, ranks=self.ranks)
+            rows = figures(results)
         rows |= {
             "surfels": f"{len(model.surfels):,}",
             "model file": f"{megabytes:.1f} MB",
@@ -186,6 +212,16 @@ class TrainingSession:
         if scene.test:
             strip = run / RENDERS_FOLDER / COMPARE / picture_name(scene.test[0].name)
             self.console.print(f"photo, render, error: {strip}")
+        return model
+
+    def _finish_with_others(self) -> Model:
+        """Return the model that rank 0 has finished; render a share of the test views for it."""
+        trainer = self.trainer
+        with TemporaryDirectory() as folder:
+            (Path(folder) / MODEL_FILE).write_bytes(self.ranks.share_bytes(None))
+            model = load(folder).to(trainer.device)
+        if trainer.scene.test:
+            evaluate(model, trainer.scene.test, mask_mode=trainer.config.mask_mode, ranks=self.ranks)
         return model
 
 

@@ -14,6 +14,7 @@ from nexwarp.model.detail import check_detail
 from nexwarp.model.model_file import load
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.opened import OpenedModel, near_depth, open_model
+from nexwarp.web.export import web_page
 
 if TYPE_CHECKING:
     from nexwarp.viewer import GradualModel, Viewer
@@ -44,6 +45,7 @@ class ViewCommand:
         check_detail("--detail", self.detail)
         opened = open_model(self.run)
         model = self._model(opened)
+        named = {name: camera for views in opened.cameras.values() for name, camera in views.items()}
         with Viewer(
             model,
             opened.cameras,
@@ -52,6 +54,7 @@ class ViewCommand:
             host=self.host,
             port=self.port,
             save_path=partial(keep_camera_path, opened.folder, opened=self.run),
+            make_page=lambda: web_page(model(), named, opened.title),
         ) as viewer:
             model.read_rest(viewer.redraw)
             show_until_interrupted(viewer, console)

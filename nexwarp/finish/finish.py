@@ -28,13 +28,11 @@ class FinishSettings:
     Attributes:
         smooth_sh: strength of the surfels' SH smoothing; 0 keeps the SH as trained.
         detail_limits: measure how close and how far the training views saw each surfel.
-        auto_exposure: predict the gains of rendered views by their brightness, too, where the photos' follow it.
         deterministic: give the same bits in every run, also on CUDA.
     """
 
     smooth_sh: float
     detail_limits: bool
-    auto_exposure: bool
     deterministic: bool
 
 
@@ -69,10 +67,8 @@ def finish_model(
         seen = counted(cameras, "measuring detail limits", observe)
         finished.detail_limits = measure_detail_limits(finished, seen)
     if exposures is not None:
-        exposures = copy.deepcopy(exposures)
-        if settings.auto_exposure:
-            progress = partial(observe, "predicting auto exposure")
-            exposures = with_auto_exposure(exposures, finished, cameras, progress=progress)
+        progress = partial(observe, "predicting auto exposure")
+        exposures = with_auto_exposure(copy.deepcopy(exposures), finished, cameras, progress=progress)
         finished.exposures = exposures.to(model.device)
     finished.meta = model.meta | {"smooth_sh": settings.smooth_sh}
     with deterministic(settings.deterministic and model.device.type == "cuda"):

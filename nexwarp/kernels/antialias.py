@@ -79,7 +79,7 @@ def antialias_kernels(real: type) -> SimpleNamespace:
         opacities: wp.array(dtype=real),
         gammas: wp.array(dtype=vec2),
         farthest: wp.array(dtype=real),
-        focal: real,
+        focals: wp.array(dtype=real),
         # outputs
         wide_scales: wp.array(dtype=vec2),
         wide_opacities: wp.array(dtype=real),
@@ -88,7 +88,7 @@ def antialias_kernels(real: type) -> SimpleNamespace:
         i = first + wp.tid()
         scale = scales[i]
         gamma = gammas[i]
-        variance = blur(depths[i], focal, farthest[i])
+        variance = blur(depths[i], focals[0], farthest[i])
         if variance > ZERO:
             x = share(scale[0], variance)
             y = share(scale[1], variance)
@@ -108,7 +108,7 @@ def antialias_kernels(real: type) -> SimpleNamespace:
         opacities: wp.array(dtype=real),
         gammas: wp.array(dtype=vec2),
         farthest: wp.array(dtype=real),
-        focal: real,
+        focals: wp.array(dtype=real),
         grad_wide_scales: wp.array(dtype=vec2),
         grad_wide_opacities: wp.array(dtype=real),
         grad_wide_gammas: wp.array(dtype=vec2),
@@ -119,13 +119,13 @@ def antialias_kernels(real: type) -> SimpleNamespace:
         grad_gammas: wp.array(dtype=vec2),
     ):
         i = first + wp.tid()
-        if blur(depths[i], focal, farthest[i]) > ZERO:
+        if blur(depths[i], focals[0], farthest[i]) > ZERO:
             depth, scale, opacity, gamma, _focal, _farthest, _s, _o, _g = wp.grad(antialiased_dot)(
                 depths[i],
                 scales[i],
                 opacities[i],
                 gammas[i],
-                focal,
+                focals[0],
                 farthest[i],
                 grad_wide_scales[i],
                 grad_wide_opacities[i],

@@ -5,15 +5,26 @@ from collections.abc import Iterator, Sequence
 import warp as wp
 
 from nexwarp.kernels.activate import activate_kernels
+from nexwarp.kernels.adam import adam_kernel
 from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
-from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
+from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
+from nexwarp.kernels.fused_texture import (
+    BACKWARD_THREADS,
+    FORWARD_THREADS,
+    fused_kernels,
+    half_scale,
+    order_gradients,
+    pack_matrices,
+)
 from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.limit_depths import limit_depths_kernel
 from nexwarp.kernels.photometric import photometric_kernels
-from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
@@ -27,7 +38,7 @@ from nexwarp.kernels.tiles import (
     tile_polygon_kernel,
 )
 from nexwarp.kernels.types import MAX_HITS, types
-from nexwarp.kernels.unproject import unproject_kernel
+from nexwarp.kernels.unproject import unproject_kernels
 
 
 def all_kernels(
@@ -40,6 +51,8 @@ def all_kernels(
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     yield from thread_kernels(real, storage, tile_size, ssim_lengths=(1, SIMD_WIDTH) if cpu else (1,), cpu=cpu)
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
+    if not cpu:
+        yield from (kernel for kernel, _ in fused_kernel_builds())
     # What training itself has no use for: the antialiasing of trained surfels, depths and normals.
     yield antialias_kernels(real).backward
     yield from (surface_kernel(real, low_pass, tile_size) for low_pass in (False, True))
@@ -59,11 +72,15 @@ def thread_kernels(
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
-    yield from (project_kernel(real), unproject_kernel(real), compose_kernel(real), depth_keys_kernel(real))
+    yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
+    for kernels in (unproject_kernels(real), compose_kernels(real)):
+        yield from (kernels.forward, kernels.backward)
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
-    yield antialias_kernels(real).forward
+    yield from (antialias_kernels(real).forward, limit_depths_kernel(real))
     yield from (surfel_ids_kernel, tile_offsets_kernel)
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
+    if not cpu:
+        yield adam_kernel()
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
     for length in ssim_lengths:
         ssim = ssim_kernels(real, length)
@@ -83,6 +100,16 @@ def thread_kernels(
         lists = list_kernels(real, low_pass, tile_size)
         yield tile_polygon_kernel(real, low_pass, tile_size)
         yield from (lists.count, lists.emit)
+
+
+def fused_kernel_builds(features: Sequence[int] = (2, 4)) -> Iterator[tuple[wp.Kernel, int]]:
+    """Yield the kernels of texturing in one kernel each way, for GPUs, with the threads of their blocks."""
+    yield from ((kernel, 256) for kernel in (half_scale, pack_matrices, order_gradients))
+    for count in features:
+        kernels = fused_kernels(count)
+        yield kernels.forward, FORWARD_THREADS
+        yield kernels.backward, BACKWARD_THREADS
+        yield fused_scatter_kernel(count), SCATTER_THREADS
 
 
 def walk_kernels(

@@ -18,7 +18,7 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import load_function
+from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
@@ -31,7 +31,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
-    load = load_function(4, real)
+    load = record_row_function(real)
     vec, ivec, colors = buffer_types(real, max_hits)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
@@ -70,15 +70,14 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
         middle, half = w.block_of(xy, intrinsics)
         focal = vec2(intrinsics[0], intrinsics[1])
-        # Threads outside the image cull along: all lanes of a warp must reach the votes together.
-        done = int(0)
-        if not inside:
-            done = 1
+        # Threads outside the image cull along: all lanes of a warp must reach the votes together. They hit nothing, as
+        # pixels whose walk has ended: their transmittance is too low.
         transmittance = real(1.0)
+        if not inside:
+            transmittance = real(0.0)
         color = vec3()
         buffer_ids = ivec()
         buffer_weights = vec()
-        buffer_depths = vec()
         buffer_colors = colors()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
@@ -88,7 +87,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         width = warp_size()
         lane = lane_index()
         for batch in range(bounds[0], bounds[1], width):
-            if any_in_warp(1 - done) == 0:
+            if any_in_warp(wp.where(transmittance >= TRANSMITTANCE_MIN, 1, 0)) == 0:
                 break
             mine = w.candidate(
                 batch + lane,
@@ -109,51 +108,43 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                 source = lowest_lane(left)
                 left = left & (left - 1)
                 i = from_lane(mine, source)
-                if done == 0:
-                    ra = load(records, i, 0)
-                    rb = load(records, i, 1)
-                    rn = load(records, i, 2)
-                    rc = load(records, i, 3)
-                    u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
-                    alpha = real(0.0)
-                    # On a GPU some lane nearly always needs the exponentials.
-                    if width > 1 or not h.far_outside(u, v, limits[i]):
-                        center = vec3()
-                        if wp.static(low_pass):
-                            center = centers[i]
-                        alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
-                    if alpha >= ALPHA_MIN and depth > near:
-                        weight = alpha * transmittance
-                        transmittance = transmittance * (ONE - alpha)
-                        stop = batch + source + 1
-                        # Insert into the buffer before the first lighter hit, and move that and all behind it down by
-                        # one, so that of equal ones the nearer stays; what falls out is blended as plain.
-                        displaced = int(0)
-                        out_id = int(i)
-                        out_weight = real(weight)
-                        out_depth = real(depth)
-                        out_color = vec3(rc[0], rc[1], rc[2])
-                        for j in range(wp.static(max_hits)):
-                            if displaced == 1 or out_weight > buffer_weights[j]:
-                                displaced = 1
-                                w_ = buffer_weights[j]
-                                i_ = buffer_ids[j]
-                                d_ = buffer_depths[j]
-                                c_ = vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2])
-                                buffer_weights[j] = out_weight
-                                buffer_ids[j] = out_id
-                                buffer_depths[j] = out_depth
-                                buffer_colors[j, 0] = out_color[0]
-                                buffer_colors[j, 1] = out_color[1]
-                                buffer_colors[j, 2] = out_color[2]
-                                out_weight = w_
-                                out_id = i_
-                                out_depth = d_
-                                out_color = c_
-                        # Out of an empty slot comes the weight 0.
-                        color += out_color * out_weight
-                        if transmittance < TRANSMITTANCE_MIN:
-                            done = 1
+                ra = load(records, i, 0)
+                rb = load(records, i, 1)
+                rn = load(records, i, 2)
+                rc = load(records, i, 3)
+                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                alpha = real(0.0)
+                # On a GPU some lane nearly always needs the exponentials.
+                if width > 1 or not h.far_outside(u, v, limits[i]):
+                    center = vec3()
+                    if wp.static(low_pass):
+                        center = centers[i]
+                    alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
+                if alpha >= ALPHA_MIN and depth > near and transmittance >= TRANSMITTANCE_MIN:
+                    weight = alpha * transmittance
+                    transmittance = transmittance * (ONE - alpha)
+                    stop = batch + source + 1
+                    # Insert into the buffer before the first lighter hit, and move that and all behind it down by one,
+                    # so that of equal ones the nearer stays; what falls out is blended as plain.
+                    displaced = bool(False)
+                    out_id = int(i)
+                    out_weight = real(weight)
+                    out_color = vec3(rc[0], rc[1], rc[2])
+                    for j in range(wp.static(max_hits)):
+                        w_ = buffer_weights[j]
+                        i_ = buffer_ids[j]
+                        c_ = vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2])
+                        displaced = displaced or out_weight > w_
+                        buffer_weights[j] = wp.where(displaced, out_weight, w_)
+                        buffer_ids[j] = wp.where(displaced, out_id, i_)
+                        buffer_colors[j, 0] = wp.where(displaced, out_color[0], c_[0])
+                        buffer_colors[j, 1] = wp.where(displaced, out_color[1], c_[1])
+                        buffer_colors[j, 2] = wp.where(displaced, out_color[2], c_[2])
+                        out_weight = wp.where(displaced, w_, out_weight)
+                        out_id = wp.where(displaced, i_, out_id)
+                        out_color = wp.where(displaced, c_, out_color)
+                    # Out of an empty slot comes the weight 0.
+                    color += out_color * out_weight
         if not inside:
             return
         p = xy[1] * size[0] + xy[0]
@@ -161,8 +152,18 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         kept = vec3()
         for j in range(wp.static(max_hits)):
             kept += vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2]) * buffer_weights[j]
-            ids[p, j] = buffer_ids[j]
-            depths[p, j] = buffer_depths[j]
+            i = buffer_ids[j]
+            # Computed again: in the loop, depths would cost registers and moves.
+            depth = real(0.0)
+            if i >= 0:
+                ra = load(records, i, 0)
+                rb = load(records, i, 1)
+                rn = load(records, i, 2)
+                u, v, depth = h.plane(ra, rb, rn, load(records, i, 3)[3], d[0], d[1])
+                if wp.static(low_pass):
+                    _alpha, depth = h.kernel(u, v, depth, ra, rb, rn, centers[i], d[0], d[1], focal, near)
+            ids[p, j] = i
+            depths[p, j] = depth
             weights[p, j] = buffer_weights[j]
         base[p] = kept
         alphas[p] = ONE - transmittance

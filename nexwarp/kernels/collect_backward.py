@@ -18,8 +18,9 @@ where the sum over all i is known from the outputs,
 
     rest = gN . N + gB . B + sum_k gW_k W_k + gA A,
 
-and the walk subtracts its terms one by one. Each hit is differentiated by `wp.grad` of the function that `collect`
-calls. Frozen: the lists, which hits count, which are in the buffer, where the walk ends.
+and the walk subtracts its terms one by one. Of each hit, seven derivatives are computed, with respect to a . d, b . d,
+n . d and the like (see `hit_gradients`); the record's follow by products with the ray and the weight. Frozen: the
+lists, which hits count, which are in the buffer, where the walk ends.
 """
 
 import functools
@@ -27,7 +28,7 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.fixed_point import fixed_point_add, fixed_point_record_sum
-from nexwarp.kernels.native.vector_loads import load_function
+from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import (
     any_in_warp,
     ballot,
@@ -61,8 +62,7 @@ def collect_backward_kernel(
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
-    load = load_function(4, real)
-    hit_dot = h.hit_dot
+    load = record_row_function(real)
     vec, ivec, _ = buffer_types(real, max_hits)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
@@ -171,47 +171,53 @@ def collect_backward_kernel(
                 center = vec3()
                 if wp.static(low_pass):
                     center = centers[i]
-                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                u, v, plane_depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                depth = plane_depth
                 alpha = real(0.0)
                 # Straight on, so that the compiler can use the exponentials again for the derivative.
                 if width > 1 or not h.far_outside(u, v, limits[i]):
-                    alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
+                    alpha, depth = h.kernel(u, v, plane_depth, ra, rb, rn, center, d[0], d[1], focal, near)
                 if not (k < stop and alpha >= ALPHA_MIN and depth > near):
                     alpha = ZERO
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
-                    g0 = vec4()
-                    g1 = vec4()
-                    g2 = vec4()
-                    g3 = vec4()
+                    gu = real(0.0)
+                    gv = real(0.0)
+                    gt = real(0.0)
+                    gm = real(0.0)
+                    go = real(0.0)
+                    g1 = real(0.0)
+                    g2 = real(0.0)
                     gc = vec3()
-                    share = real(0.0)
+                    weight = alpha * transmittance
+                    g = gn
                     if alpha > ZERO:
-                        weight = alpha * transmittance
-                        share = weight * error
                         q = ga
-                        gt = real(0.0)
-                        g = gn
                         for j in range(wp.static(max_hits)):
                             if i == buffered_ids[j]:
                                 q += gw[j]
                                 gt = gd[j]
                                 g = gb
                         q += g[0] * rc[0] + g[1] * rc[1] + g[2] * rc[2]
-                        g3 = vec4(g[0] * weight, g[1] * weight, g[2] * weight, ZERO)
                         rest -= q * weight
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
-                        transmittance = transmittance * (ONE - alpha)
-                        g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
-                            ra, rb, rn, rc[3], center, d[0], d[1], focal, near, grad_alpha, gt
+                        gu, gv, gt, gm, go, g1, g2, gx, gy, gz = h.hit_gradients(
+                            u, v, plane_depth, ra, rb, rn, center, d[0], d[1], focal, near, grad_alpha, gt
                         )
-                        g3[3] = gm
+                        if wp.static(low_pass):
+                            gc = h.center_gradient(center, focal, gx, gy, gz)
+                    transmittance = transmittance * (ONE - alpha)
+                    share = weight * error
+                    r0 = vec4(gu * d[0], gu * d[1], gu, go)
+                    r1 = vec4(gv * d[0], gv * d[1], gv, g1)
+                    r2 = vec4(gt * d[0], gt * d[1], gt, g2)
+                    r3 = vec4(g[0] * weight, g[1] * weight, g[2] * weight, gm)
                     slot = int(i)
                     if k < gradient_slots.shape[0]:
                         slot = gradient_slots[k]
                     if wp.static(fixed_point):
-                        put_record(grad_records, slot, g0, g1, g2, g3, bad)
+                        put_record(grad_records, slot, r0, r1, r2, r3, bad)
                     else:
-                        add_record(grad_records, slot, g0, g1, g2, g3)
+                        add_record(grad_records, slot, r0, r1, r2, r3)
                     if wp.static(low_pass):
                         gc = sum3(gc)
                     if wp.static(with_errors):

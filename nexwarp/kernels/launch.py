@@ -1,6 +1,6 @@
 """Launches that use every CPU core: a CPU launch is a serial loop that frees the GIL, so threads share the range.
 
-The number of chunks is fixed, whatever the number of threads, so that nothing depends on how many there are.
+A chunk's threads write what no other chunk's do, so that nothing depends on how many chunks there are.
 """
 
 import functools
@@ -12,7 +12,9 @@ from typing import Any, Literal
 
 import warp as wp
 
+# Chunks at most, or a few for each core where there are many: those that finish early take over what is left.
 CHUNKS = 16
+CHUNKS_A_THREAD = 4
 SMALLEST_CHUNK = 256
 # Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
 LIGHT_CHUNK = 2048
@@ -69,9 +71,9 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
-def chunks(dim: int, align: int = 1, smallest: int = SMALLEST_CHUNK) -> list[tuple[int, int]]:
-    """Split [0, dim) into at most CHUNKS ranges of at least `smallest`, at multiples of `align`."""
-    size = max(smallest, -(-dim // CHUNKS))
+def chunks(dim: int, align: int = 1, smallest: int = SMALLEST_CHUNK, most: int = CHUNKS) -> list[tuple[int, int]]:
+    """Split [0, dim) into at most `most` ranges of at least `smallest`, at multiples of `align`."""
+    size = max(smallest, -(-dim // most))
     size = -(-size // align) * align
     return [(first, min(first + size, dim)) for first in range(0, dim, size)]
 
@@ -141,7 +143,8 @@ def launch(
     if not device.is_cpu:
         part((0, shape[0]))
         return
-    ranges = chunks(shape[0], align, smallest) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
+    most = max(CHUNKS, CHUNKS_A_THREAD * _threads)
+    ranges = chunks(shape[0], align, smallest, most) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
     if _threads == 1 or len(ranges) == 1:
         for bounds in ranges:
             part(bounds)

@@ -13,7 +13,7 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.fixed_point import fixed_point_add
-from nexwarp.kernels.native.vector_loads import load_function
+from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_sum
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
@@ -26,7 +26,7 @@ def splat_error_kernel(real: type, low_pass: bool, tile_size: int, fixed_point: 
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
-    load = load_function(4, real)
+    load = record_row_function(real)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
     sum1, put1 = warp_sum(real), fixed_point_add(real)

@@ -15,7 +15,7 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import load_function
+from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
@@ -28,7 +28,7 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
-    load = load_function(4, real)
+    load = record_row_function(real)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
     ALPHA_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.ZERO, t.HALF, t.ONE

@@ -266,7 +266,9 @@ def depth_keys_kernel(real: type) -> wp.Kernel:
 def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     """Make the kernels that count and emit (tile, surfel) entries: `sharing` threads a surfel, in depth order.
 
-    The threads of a surfel take turns at its tile rows: near surfels cover many, and alone one thread would be long.
+    `entries` gets each entry's own index, and `surfels` its surfel; without `surfels`, a null array, `entries` gets the
+    surfel. The threads of a surfel take turns at its tile rows: near surfels cover many, and alone one thread would be
+    long.
     """
     t = types(real)
     vec2, vec3 = t.vec2, t.vec3
@@ -329,8 +331,11 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
                 # `count`: never write past the list's or the thread's own end.
                 if e < end:
                     tiles[e] = row * grid[0] + column
-                    entries[e] = e
-                    surfels[e] = i
+                    if surfels:
+                        entries[e] = e
+                        surfels[e] = i
+                    else:
+                        entries[e] = i
                 e += 1
 
     return SimpleNamespace(count=count, emit=emit)

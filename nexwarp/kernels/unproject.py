@@ -1,11 +1,13 @@
 """Hit points and ray directions in the world frame, for the texturing pass (paper Sec. 4.2).
 
 A thread is a pixel. Read: depths (P, K) and the world-to-camera matrix. Written: for a hit at z-depth t the point
-origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's SH. Differentiated with respect
-to depths and the matrix by Warp's own adjoint.
+origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's SH; backward, the gradients of
+depths and, a pixel, of the matrix. Warp's own adjoint, which serves tapes, adds by atomics to places that only one
+thread has.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -14,18 +16,24 @@ from nexwarp.kernels.types import types
 
 
 @functools.cache
-def unproject_kernel(real: type) -> wp.Kernel:
-    """Make the kernel; `viewmat_step` is 0 for one shared viewmat, 1 for a gradient slot a pixel."""
+def unproject_kernels(real: type) -> SimpleNamespace:
+    """Make the kernel and its derivative."""
     t = types(real)
-    vec3, mat33, mat44 = t.vec3, t.mat33, t.mat44
+    vec3, vec4, mat33, mat44 = t.vec3, t.vec4, t.mat33, t.mat44
     f = frame_functions(real)
+
+    @wp.func
+    def ray_of(p: int, width: int, intrinsics: vec4):
+        """Direction through pixel p in the camera frame; its z is 1."""
+        x = (real(float(p % width)) + real(0.5) - intrinsics[2]) / intrinsics[0]
+        y = (real(float(p // width)) + real(0.5) - intrinsics[3]) / intrinsics[1]
+        return vec3(x, y, real(1.0))
 
     @wp.kernel(module="unique")
     def unproject(
         first: wp.int32,
         depths: wp.array2d(dtype=real),
         viewmats: wp.array(dtype=mat44),
-        viewmat_step: wp.int32,
         Ks: wp.array(dtype=mat33),
         width: wp.int32,
         # outputs
@@ -33,14 +41,53 @@ def unproject_kernel(real: type) -> wp.Kernel:
         directions: wp.array(dtype=vec3),
     ):
         p = first + wp.tid()
-        viewmat = viewmats[p * viewmat_step]
-        intrinsics = f.intrinsics_of(Ks)
-        x = (real(float(p % width)) + real(0.5) - intrinsics[2]) / intrinsics[0]
-        y = (real(float(p // width)) + real(0.5) - intrinsics[3]) / intrinsics[1]
-        ray = f.rotate_back(viewmat, vec3(x, y, real(1.0)))
+        viewmat = viewmats[0]
+        ray = f.rotate_back(viewmat, ray_of(p, width, f.intrinsics_of(Ks)))
         origin = -f.rotate_back(viewmat, f.translation(viewmat))
         directions[p] = wp.normalize(ray)
         for h in range(depths.shape[1]):
             positions[p, h] = origin + ray * depths[p, h]
 
-    return unproject
+    @wp.func
+    def direction_dot(viewmat: mat44, ray: vec3, grad: vec3):
+        return wp.dot(wp.normalize(f.rotate_back(viewmat, ray)), grad)
+
+    @wp.func
+    def position_dot(viewmat: mat44, point: vec3, grad: vec3):
+        """Of a point in the camera frame."""
+        return wp.dot(f.rotate_back(viewmat, point - f.translation(viewmat)), grad)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def unproject_backward(
+        first: wp.int32,
+        depths: wp.array2d(dtype=real),
+        viewmats: wp.array(dtype=mat44),
+        Ks: wp.array(dtype=mat33),
+        width: wp.int32,
+        grad_positions: wp.array2d(dtype=vec3),
+        grad_directions: wp.array(dtype=vec3),
+        # outputs
+        grad_depths: wp.array2d(dtype=real),
+        grad_viewmats: wp.array(dtype=mat44),
+    ):
+        p = first + wp.tid()
+        viewmat = viewmats[0]
+        d = ray_of(p, width, f.intrinsics_of(Ks))
+        ray = f.rotate_back(viewmat, d)
+        grad_viewmat = mat44()
+        if grad_directions:
+            if grad_viewmats:
+                grad_viewmat, _r, _g = wp.grad(direction_dot)(viewmat, d, grad_directions[p])
+        for h in range(depths.shape[1]):
+            grad = vec3()
+            if grad_positions:
+                grad = grad_positions[p, h]
+            if grad_depths:
+                grad_depths[p, h] = wp.dot(ray, grad)
+            if grad_viewmats:
+                of_position, _p, _h = wp.grad(position_dot)(viewmat, d * depths[p, h], grad)
+                grad_viewmat += of_position
+        if grad_viewmats:
+            grad_viewmats[p] = grad_viewmat
+
+    return SimpleNamespace(forward=unproject, backward=unproject_backward)

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import load_function
+from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import warp_size
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
@@ -60,7 +60,7 @@ def walk_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNamespac
     vec2, vec3, vec4, mat33, HALF = t.vec2, t.vec3, t.vec4, t.mat33, t.HALF
     intrinsics_of = frame_functions(real).intrinsics_of
     misses_block = hit_functions(real, low_pass).misses_block
-    load = load_function(4, real)
+    load = record_row_function(real)
     # Half of the distances between the outer pixel centres of a block, and a little.
     HALF_WIDTH, HALF_HEIGHT = wp.constant(real(3.51)), wp.constant(real(1.51))
     pixels = tile_size * tile_size

@@ -10,7 +10,9 @@ from torch import nn
 from typing_extensions import Unpack
 
 from nexwarp.camera import Camera
+from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
+from nexwarp.model import frames
 from nexwarp.model.options import RenderChanges, RenderOptions
 from nexwarp.render import Color, Rendering, render
 from nexwarp.representation.detail_limits import DetailLimits
@@ -143,6 +145,7 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
+        jitter = (depth_jitter, generator)
         if isinstance(camera, Sequence) and not isinstance(camera, str):
             return [
                 self.render(item, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
@@ -151,20 +154,50 @@ class Model(nn.Module):
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
         options = self.options.changed(**changes) if changes else self.options
-        return render(
+        return self._render(camera, options.background if background is None else background, options, jitter)
+
+    def _render(
+        self,
+        camera: Camera,
+        background: Color,
+        options: RenderOptions,
+        jitter: tuple[float | torch.Tensor, torch.Generator | None],
+    ) -> Rendering:
+        """Render one camera, by a CUDA graph where that is possible."""
+        parts = frames.Parts(
             self.surfels,
             self.texture if options.max_hits else None,
-            camera if camera.device == self.device else camera.to(self.device),
-            options.max_hits,
-            options.background if background is None else background,
-            options.sh_degree,
-            options.low_pass,
-            options.clamp_texture,
-            depth_jitter,
-            generator,
-            exposures=self.exposures if options.exposure == "photos" else None,
-            detail_limits=self.detail_limits if options.detail_limits else None,
+            self.exposures if options.exposure == "photos" else None,
+            self.detail_limits if options.detail_limits else None,
         )
+
+        def work(camera: Camera, background: Color) -> Rendering:
+            return render(
+                parts.surfels,
+                parts.texture,
+                camera,
+                options.max_hits,
+                background,
+                options.sh_degree,
+                options.low_pass,
+                options.clamp_texture,
+                *jitter,
+                exposures=parts.exposures,
+                detail_limits=parts.detail_limits,
+            )
+
+        if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:
+            rendering = frames.render_by_graph(work, parts, options, camera, background)
+            if rendering is not None:
+                return rendering
+        camera = camera if camera.device == self.device else camera.to(self.device)
+        try:
+            return work(camera, background)
+        except OutOfMemoryError:
+            if not frames.release_graphs():
+                raise
+        # Outside of the handler: the error's traceback would keep alive what has been allocated.
+        return work(camera, background)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.
@@ -188,12 +221,13 @@ class Model(nn.Module):
 
         return at_detail(self, detail)
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
+    def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> Path:
         """Write the model; `nexwarp.load` reads it.
 
         Args:
             path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
                 `model.safetensors` is written.
+            compact: write 8 and 16 bits a number: about a third of the size, for a loss of thousandths of a dB.
 
         Returns:
             The file that was written.
@@ -203,4 +237,4 @@ class Model(nn.Module):
         """
         from nexwarp.model.model_file import save_model
 
-        return save_model(path, self)
+        return save_model(path, self, compact=compact)

@@ -15,15 +15,19 @@ from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
+from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
+from nexwarp.model.compact import STORED, code_names, decode, encode
 from nexwarp.model.detail import ORDERED, check_detail, coarse_shape, surfel_count, texture_levels
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import BUFFERS, Exposures
+from nexwarp.representation.merged_texture import MergedTexture, make_texture
 from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture, TextureShape
+from nexwarp.representation.texture import NeuralTexture
 
 FORMAT_VERSION = 1
+COMPACT_VERSION = 2  # of compact files, which older readers cannot read
 SUFFIX = ".safetensors"
 MODEL_FILE = "model.safetensors"
 FRAME = "COLMAP world, cameras x right, y down, z forward"
@@ -38,18 +42,20 @@ FIXED_NAMES = {
     *DETAIL_LIMITS.values(),
     *(f"exposures.{name}" for name in BUFFERS),
 }
+CODE_NAMES = code_names()
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits")
 LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 
-def save_model(path: str | os.PathLike[str], model: Model) -> Path:
+def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = False) -> Path:
     """Write a model: surfels, exposures and detail limits in float32, grid and MLP in half precision.
 
     Args:
         path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
             `model.safetensors` is written.
         model: the model.
+        compact: write 8 and 16 bits a number instead, about a third of the size (`nexwarp.model.compact`).
 
     Returns:
         The file that was written.
@@ -59,16 +65,17 @@ def save_model(path: str | os.PathLike[str], model: Model) -> Path:
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     if model.texture is not None:
         for name, x in model.texture.state_dict().items():
-            tensors[f"texture.{name}"] = x if name == "resolutions" else x.half()
+            tensors[f"texture.{name}"] = x.clone() if name.endswith(("resolutions", "cells")) else x.half()
     if model.detail_limits is not None:
         tensors |= {stored: getattr(model.detail_limits, name) for name, stored in DETAIL_LIMITS.items()}
     if model.exposures is not None:
         tensors |= {f"exposures.{name}": x for name, x in model.exposures.state_dict().items()}
-    tensors = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
+    tensors = {name: x.detach().cpu() for name, x in tensors.items()}
+    tensors = {name: x.contiguous() for name, x in (encode(tensors) if compact else tensors).items()}
     meta = {
         **model.meta,
         **dataclasses.asdict(model.options),
-        "format_version": FORMAT_VERSION,
+        "format_version": COMPACT_VERSION if compact else FORMAT_VERSION,
         "frame": FRAME,
         "texture": None if model.texture is None else model.texture.config,
     }
@@ -108,12 +115,15 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
             kinds = {
                 name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape())
                 for name in file.keys()
-                if name in FIXED_NAMES or name in header.texture_shapes
+                if name in FIXED_NAMES or name in header.texture_shapes or (header.compact and name in CODE_NAMES)
             }
             _check_kinds(path, kinds, header)
             if detail < 1.0 and header.meta.get(ORDERED) is not True:
                 raise FormatError(f"{path}: expected surfels in the order of their share of the pictures, for a detail")
-            tensors = {name: file.get_slice(name)[_first_parts(name, kinds, detail)] for name in kinds}
+            if detail < 1.0 and header.compact:
+                return load(path).at_detail(detail)  # codes are decoded together
+            parts = {name: _first_parts(name, kinds, detail) for name in kinds if detail < 1.0}
+            tensors = {n: file.get_slice(n)[parts[n]] if n in parts else file.get_tensor(n) for n in kinds}
     except FormatError:
         raise
     except (SafetensorError, OSError) as error:
@@ -132,8 +142,6 @@ def _first_parts(name: str, kinds: Mapping[str, tuple[str, list[int]]], detail: 
     """Return the part of a tensor that a detail has."""
     shape = kinds[name][1]
     everything = tuple(slice(size) for size in shape)
-    if detail == 1.0:
-        return everything
     if name.startswith("surfels.") or name in DETAIL_LIMITS.values():
         return (slice(surfel_count(detail, shape[0])), *everything[1:])
     if name.startswith("texture."):
@@ -155,16 +163,20 @@ class _Header:
         texture: the arguments of `NeuralTexture`; None for a model without texture.
         texture_shapes: names and shapes of the texture's tensors.
         meta: the other entries.
+        compact: whether the tensors are coded.
     """
 
     options: RenderOptions
     texture: dict[str, Json] | None
     texture_shapes: dict[str, list[int]]
     meta: dict[str, Json]
+    compact: bool
 
 
 def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
     """Make a model from a file's metadata and tensors; raise an error if they do not fit."""
+    if header.compact:
+        tensors = decode(tensors)
     surfels = Surfels(_part(tensors, "surfels."))
     limits = None
     if any(stored in tensors for stored in DETAIL_LIMITS.values()):
@@ -183,15 +195,25 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
     check_bounds(tensors)
     texture = None
     if header.texture is not None:
-        texture = NeuralTexture(**header.texture)  # type: ignore[arg-type]  # the constructor checks the types
+        texture = make_texture(header.texture)
         texture.load_state_dict(_part(tensors, "texture."))
-        texture.half_precision = fits_half(tensors)
+        for prefix, part in _simple_textures(texture):
+            own = {f"texture.{name}": x for name, x in _part(tensors, prefix).items()}
+            check_bounds(own)
+            part.half_precision = fits_half(own)
     return Model(surfels, texture, exposures, limits, header.options, header.meta)
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Return the tensors with a prefix in their names, as float32, by the names without it."""
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
+
+
+def _simple_textures(texture: NeuralTexture) -> list[tuple[str, NeuralTexture]]:
+    """Return a texture, or the parts of a merged one, with the prefixes of their tensors."""
+    if isinstance(texture, MergedTexture):
+        return [(f"texture.parts.{index}.", part) for index, part in enumerate(texture.textures)]
+    return [("texture.", texture)]
 
 
 def _read_header(path: Path, text: str | None) -> _Header:
@@ -205,7 +227,7 @@ def _read_header(path: Path, text: str | None) -> _Header:
     if not isinstance(meta, dict):
         raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {text[:40]!r}")
     try:
-        check_version(meta.get("format_version"), FORMAT_VERSION)
+        check_version(meta.get("format_version"), COMPACT_VERSION)
     except ValueError as error:
         raise FormatError(f"{path}: {error}") from None
     try:
@@ -214,20 +236,22 @@ def _read_header(path: Path, text: str | None) -> _Header:
         if not isinstance(texture, (dict, type(None))):
             raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
         if texture is not None:
-            texture = {name: value for name, value in texture.items() if name in TextureShape.__annotations__}
             with torch.device("meta"):  # allocates nothing, even if the metadata gives huge sizes
-                state = NeuralTexture(**texture).state_dict()
+                state = make_texture(texture).state_dict()
             shapes = {f"texture.{name}": list(x.shape) for name, x in state.items()}
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise _no_model(path, error) from None
-    return _Header(options, texture, shapes, meta)
+    return _Header(options, texture, shapes, meta, compact=meta["format_version"] == COMPACT_VERSION)
 
 
 def _check_kinds(path: Path, kinds: Mapping[str, tuple[str, list[int]]], header: _Header) -> None:
     """Check the dtypes of all tensors and the shapes of the texture's before anything is allocated."""
     try:
         for name, (dtype, shape) in kinds.items():
-            if dtype not in DTYPES:
+            coded = COMPACT_DTYPES.get(name) if header.compact else None
+            if coded is not None and dtype != STORED[coded]:
+                raise ValueError(f"{name}: expected {STORED[coded]}, got {dtype}")
+            if coded is None and dtype not in DTYPES:
                 raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
             expected = header.texture_shapes.get(name, shape)
             if expected != shape:

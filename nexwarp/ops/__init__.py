@@ -5,13 +5,14 @@ from nexwarp.ops.antialias import antialias
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.graphs import captured
+from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import Surface, surface
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import ListCapacity, Tiles, fits, intersect_tiles
+from nexwarp.ops.tiles import ListCapacity, Tiles, fits, held, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -29,7 +30,9 @@ __all__ = [
     "collect",
     "compose",
     "fits",
+    "held",
     "intersect_tiles",
+    "limit_depths",
     "plain_colors",
     "project",
     "splat_error",

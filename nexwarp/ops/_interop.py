@@ -136,11 +136,6 @@ def uses_simd(like: torch.Tensor) -> bool:
     return launching.uses_simd(device_of(like))
 
 
-def grad_like(tensor: torch.Tensor, needed: bool) -> torch.Tensor | None:
-    """Zeros to add gradients to, or None when nobody needs them."""
-    return torch.zeros_like(tensor, memory_format=torch.contiguous_format) if needed else None
-
-
 def sums_in_fixed_point(like: torch.Tensor) -> bool:
     """Whether sums by atomics must not depend on their order: on CUDA, under torch's deterministic algorithms."""
     return like.is_cuda and torch.are_deterministic_algorithms_enabled()

@@ -17,7 +17,7 @@ def antialias(
     opacities: torch.Tensor,
     gammas: torch.Tensor,
     farthest: torch.Tensor,
-    focal: float,
+    focal: float | torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Blur surfels where a pixel covers more of them than it did in training.
 
@@ -29,7 +29,7 @@ def antialias(
         opacities: (N,).
         gammas: (N, 2).
         farthest: (N,) largest depth / focal at which a training view saw the surfel, world units.
-        focal: of the camera, pixels.
+        focal: of the camera, pixels; a number, or a tensor (1,) on the device.
 
     Returns:
         (N, 2) scales, (N,) opacities and (N, 2) gammas; those given where depth / focal is no larger than in training.
@@ -47,7 +47,8 @@ def antialias(
         }
     )
     tensors = (x.contiguous() for x in (depths, scales, opacities, gammas))
-    return _Antialias.apply(farthest.contiguous(), float(focal), *tensors)
+    focal = focal.to(farthest) if isinstance(focal, torch.Tensor) else farthest.new_full((1,), float(focal))
+    return _Antialias.apply(farthest.contiguous(), focal, *tensors)
 
 
 def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
@@ -55,28 +56,25 @@ def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
     return [array(x, real if x.ndim == 1 else types(real).vec2) for x in tensors]
 
 
-class _Context(Context):
-    focal: float
-
-
 class _Antialias(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: _Context, farthest: torch.Tensor, focal: float, *shape: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(
+        ctx: Context, farthest: torch.Tensor, focal: torch.Tensor, *shape: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
         real = real_of(farthest)
         wide = tuple(torch.empty_like(x) for x in shape[1:])
-        inputs = [*_arrays(real, (*shape, farthest)), focal]
+        inputs = _arrays(real, (*shape, farthest, focal))
         launch(farthest, antialias_kernels(real).forward, len(farthest), inputs, _arrays(real, wide))
-        ctx.save_for_backward(*shape, farthest)
-        ctx.focal = focal
+        ctx.save_for_backward(*shape, farthest, focal)
         return wide
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        *shape, farthest = ctx.saved_tensors
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        *shape, farthest, focal = ctx.saved_tensors
         real = real_of(farthest)
         found = [torch.empty_like(x) for x in shape]
-        inputs = [*_arrays(real, (*shape, farthest)), ctx.focal, *_arrays(real, (x.contiguous() for x in grads))]
+        inputs = _arrays(real, (*shape, farthest, focal, *(x.contiguous() for x in grads)))
         launch(farthest, antialias_kernels(real).backward, len(farthest), inputs, _arrays(real, found))
         wanted = (x if need else None for x, need in zip(found, ctx.needs_input_grad[2:], strict=True))
         return (None, None, *wanted)

@@ -84,7 +84,14 @@ def collect(
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
     request = SplatErrorRequest()
     buffers = _Collect.apply(
-        projection.records, projection.centers, projection.limits, tiles, camera, max_hits, low_pass, request
+        projection.records.contiguous(),
+        projection.centers,
+        projection.limits,
+        tiles,
+        camera,
+        max_hits,
+        low_pass,
+        request,
     )
     plain, base, ids, depths, weights, alpha, stops = buffers
     return Hits(plain, base, ids, depths, weights, alpha, stops, request)

@@ -14,8 +14,9 @@ import torch
 
 from nexwarp.kernels import launch as launching
 
-# Columns that one part has at least, and what parts begin at multiples of.
-SMALLEST_PART, ALIGN = 2048, 16
+# Columns that one part has at least, and what parts begin at multiples of. Small parts stay in a core's cache from one
+# layer to the next; what they add up does not depend on the number of threads, so their number must not either.
+SMALLEST_PART, ALIGN, MOST_PARTS = 2048, 16, 64
 
 
 def share_columns(count: int, part: Callable[[int, slice], None]) -> None:
@@ -37,7 +38,7 @@ def parts_of(count: int) -> int:
 
 
 def _parts(count: int) -> list[slice]:
-    return [slice(*bounds) for bounds in launching.chunks(count, ALIGN, SMALLEST_PART)]
+    return [slice(*bounds) for bounds in launching.chunks(count, ALIGN, SMALLEST_PART, MOST_PARTS)]
 
 
 @functools.lru_cache(maxsize=1)

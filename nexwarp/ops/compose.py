@@ -3,9 +3,9 @@
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.compose import compose_kernel
+from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, grad_like, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 def compose(
@@ -59,28 +59,32 @@ class _Compose(torch.autograd.Function):
         real = real_of(plain)
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
         outputs = [array(x.view(-1, 3), types(real).vec3) for x in (image, textured)]
-        launch(plain, compose_kernel(real), plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs)
-        ctx.save_for_backward(*inputs)  # type: ignore[arg-type]  # torch saves None too
+        launch(
+            plain, compose_kernels(real).forward, plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs
+        )
+        ctx.save_for_backward(*inputs[2:])  # type: ignore[arg-type]  # never None: only base is
+        ctx.set_materialize_grads(False)
         return image, textured
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Context, grad_image: torch.Tensor, grad_textured: torch.Tensor
+        ctx: Context, grad_image: torch.Tensor | None, grad_textured: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        plain, alpha = inputs[0], inputs[4]
-        real = real_of(plain)
-        grads = [grad_like(x, need) for x, need in zip(inputs[:5], ctx.needs_input_grad, strict=False)]
-        incoming = [array(x.contiguous().view(-1, 3), types(real).vec3) for x in (grad_image, grad_textured)]
-        launch(
-            plain,
-            compose_kernel(real),
-            plain.shape[0] * plain.shape[1],
-            _arrays(real, list(inputs)),
-            [None, None],
-            adjoint=(_arrays(real, [*grads, None]), incoming),
-        )
+        colors, weights, alpha, background = ctx.saved_tensors
+        if grad_image is None and grad_textured is None:
+            return (None,) * 6
+        need_plain, *needed, need_background = ctx.needs_input_grad
+        real = real_of(weights)
+        shapes = ((*alpha.shape, 3), colors.shape, weights.shape, alpha.shape)
+        grads = [weights.new_empty(s) if need else None for s, need in zip(shapes, needed, strict=True)]
+        signals = [None if x is None else x.contiguous() for x in (grad_image, grad_textured)]
+        _, _, *inputs = _arrays(real, [None, None, colors, weights, None, background])
+        incoming = [array(None if x is None else x.view(-1, 3), types(real).vec3) for x in signals]
+        _, *outputs, _ = _arrays(real, [None, *grads, None])
+        launch(weights, compose_kernels(real).backward, alpha.numel(), [*inputs[:2], inputs[3], *incoming], outputs)
+        plain = grad_image if need_plain else None
         # One colour for all pixels: torch's sum instead of every thread adding to one place.
-        background = (grad_image * (1 - alpha)[..., None]).sum((0, 1)) if ctx.needs_input_grad[5] else None
-        return (*grads, background)
+        if not need_background or grad_image is None:
+            return (plain, *grads, None)
+        return (plain, *grads, (grad_image * (1 - alpha)[..., None]).sum((0, 1)))

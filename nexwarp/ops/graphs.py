@@ -1,5 +1,6 @@
 """Recording of launches, torch's and Warp's alike, as CUDA graphs."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -33,7 +34,9 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
             with suppress(RuntimeError):
                 wp.capture_end(stream=ours)
             try:
-                graph.capture_end()
+                with warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", "The CUDA Graph is empty")  # nothing was launched before it
+                    graph.capture_end()
             except RuntimeError:
                 # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
                 with suppress(RuntimeError):

@@ -6,9 +6,9 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.checks import check_tensors
-from nexwarp.kernels.project import project_kernel
+from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, grad_like, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 @dataclass(frozen=True)
@@ -82,37 +82,36 @@ class _Project(torch.autograd.Function):
         outputs = [array(records, t.vec4), array(centers, t.vec3), array(limits, real)]
         launch(
             means,
-            project_kernel(real),
+            project_kernels(real).forward,
             len(means),
-            [*_arrays(real, (*inputs[:6], inputs[6][None])), 0],
+            _arrays(real, (*inputs[:6], inputs[6][None])),
             outputs,
         )
-        ctx.save_for_backward(*inputs)
+        ctx.save_for_backward(*inputs[:3], inputs[6])
         ctx.mark_non_differentiable(limits)
+        ctx.set_materialize_grads(False)
         return records, centers, limits
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Context, grad_records: torch.Tensor, grad_centers: torch.Tensor, _limits: None
+        ctx: Context, grad_records: torch.Tensor | None, grad_centers: torch.Tensor | None, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        means, viewmat = inputs[0], inputs[6]
+        means, quats, scales, viewmat = ctx.saved_tensors
         real, count = real_of(means), len(means)
         t = types(real)
-        grads = [grad_like(x, need) for x, need in zip(inputs[:6], ctx.needs_input_grad, strict=False)]
+        if grad_records is None:
+            grad_records = means.new_zeros(count, 4, 4)
+        grads = [torch.empty_like(x) for x in (means, quats, scales)]
+        grads += [means.new_empty(count), torch.empty_like(scales), torch.empty_like(means)]
         # A slot a surfel, then one sum: no contention, and a fixed order.
-        step = int(ctx.needs_input_grad[6])
-        grad_viewmats = viewmat.new_zeros(count, 4, 4) if step else None
-        viewmats = viewmat.expand(count, 4, 4) if step else viewmat[None]
-        outputs = [None, None, None]
-        adjoint_outputs = [array(grad_records.contiguous(), t.vec4), array(grad_centers.contiguous(), t.vec3), None]
-        launch(
-            means,
-            project_kernel(real),
-            count,
-            [*_arrays(real, (*inputs[:6], viewmats)), step],
-            outputs,
-            adjoint=([*_arrays(real, (*grads, grad_viewmats)), None], adjoint_outputs),
-        )
-        return (*grads, None if grad_viewmats is None else grad_viewmats.sum(0))
+        grad_viewmats = viewmat.new_empty(count, 4, 4) if ctx.needs_input_grad[6] else None
+        inputs = [array(x, dtype) for x, dtype in zip((means, quats, scales), (t.vec3, t.vec4, t.vec2), strict=True)]
+        inputs += [
+            array(viewmat[None], t.mat44),
+            array(grad_records.contiguous(), t.vec4),
+            array(None if grad_centers is None else grad_centers.contiguous(), t.vec3),
+        ]
+        launch(means, project_kernels(real).backward, count, inputs, _arrays(real, (*grads, grad_viewmats)))
+        wanted = [x if need else None for x, need in zip(grads, ctx.needs_input_grad, strict=False)]
+        return (*wanted, None if grad_viewmats is None else grad_viewmats.sum(0))

@@ -12,11 +12,11 @@ from nexwarp.kernels.cpu.hashgrid import WIDTH, hashgrid_simd_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
+from nexwarp.ops import fused_texture
 from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point, uses_simd
 from nexwarp.ops.columns import parts_of, share_columns
+from nexwarp.ops.half_gradients import gradient_scale
 
-# Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
-HALF_GRADIENT = 64.0
 # Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
 POINT_MULTIPLE = 64
 # Not among torch's documented functions.
@@ -37,11 +37,18 @@ def texture(
     offset: float = 0.5,
     clamp: bool = False,
     half: bool = False,
+    table: torch.Tensor | None = None,
+    image: tuple[int, int] | None = None,
+    fused: bool = True,
 ) -> torch.Tensor:
     """Look points up in the hash grid, apply the MLP and, given directions, evaluate the colours.
 
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
     `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
+
+    On GPUs of compute capability 8.0 or more, colours in half precision are computed by one kernel forward and two
+    backward where L * F is 32, F is 2 or 4, there are two hidden layers of 64, directions need no gradient, and torch's
+    deterministic algorithms are off. All else is computed layer by layer.
 
     Args:
         positions: (n, 3) world.
@@ -55,14 +62,28 @@ def texture(
         clamp: limit colours to >= 0.
         half: keep features, activations and coefficients in half precision; gradients are scaled on the way
             and summed in float32.
+        table: (L, T, F) the grid in half precision, where the caller has it already.
+        image: (height, width), whose product is P, of the image that the directions belong to, row by row; neighbouring
+            pixels then work together. It changes no result but for the order of sums.
+        fused: False computes layer by layer in any case.
 
     Returns:
         (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours offset + SH(direction).
     """
     positions, depths = positions.contiguous(), depths.contiguous()
+    keep = torch.is_grad_enabled() and any(
+        x.requires_grad for x in (positions, depths, grid, *weights) + (() if directions is None else (directions,))
+    )
     if directions is not None:
         directions = directions.contiguous()
-    return _Texture.apply(positions, depths, directions, grid, resolutions, focal, offset, clamp, half, *weights)
+        if fused and half and fused_texture.usable(positions, directions, grid, weights):
+            height, width = image or (1, len(directions))
+            shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
+            copy = grid.detach().contiguous().half() if table is None else table
+            inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
+            return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
+    given = (positions, depths, directions, grid, table, resolutions, focal, offset, clamp, half, keep)
+    return _Texture.apply(*given, *weights)
 
 
 class _Texture(torch.autograd.Function):
@@ -73,15 +94,17 @@ class _Texture(torch.autograd.Function):
         depths: torch.Tensor,
         directions: torch.Tensor | None,
         grid: torch.Tensor,
+        table: torch.Tensor | None,
         resolutions: torch.Tensor,
         focal: torch.Tensor,
         offset: float,
         clamp: bool,
         half: bool,
+        keep: bool,
         *weights: torch.Tensor,
     ) -> torch.Tensor:
         dtype = torch.float16 if half else grid.dtype
-        table = grid.contiguous().to(dtype)
+        table = table if half and table is not None else grid.contiguous().to(dtype)
         matrices = [w.to(dtype) for w in weights]
         count = len(positions)
         encoded = torch.empty(grid.shape[0] * grid.shape[2], _padded(count, dtype), dtype=dtype, device=grid.device)
@@ -97,7 +120,7 @@ class _Texture(torch.autograd.Function):
             [array(encoded, STORAGES[dtype])],
         )
         with torch.autocast(grid.device.type, enabled=False):
-            *layers, coefficients = _mlp(encoded, matrices)
+            *layers, coefficients = _mlp(encoded, matrices, keep)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         ctx.save_for_backward(
@@ -122,7 +145,7 @@ class _Texture(torch.autograd.Function):
         positions, depths, directions, resolutions, focal, table, coefficients, *rest = ctx.saved_tensors
         layers, matrices = rest[: ctx.layers], rest[ctx.layers :]
         need_positions, need_depths, need_directions, need_grid = ctx.needs_input_grad[:4]
-        scale = _gradient_scale(grad, table.dtype)
+        scale = gradient_scale(grad, table.dtype)
         grad_directions = None
         if directions is None:
             signal = torch.zeros_like(coefficients)
@@ -143,7 +166,7 @@ class _Texture(torch.autograd.Function):
             grad_depths if need_depths else None,
             grad_directions,
             grad_grid if need_grid else None,
-            *(None,) * 5,
+            *(None,) * 7,
             *grad_matrices,
         )
 
@@ -158,22 +181,18 @@ def _padded(count: int, dtype: torch.dtype) -> int:
     return (-(-count // line) | 1) * line
 
 
-def _gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """(1,) power of two that brings the largest gradient near HALF_GRADIENT in half precision; 1 otherwise."""
-    if dtype != torch.float16 or grad.numel() == 0:
-        return grad.new_ones(1)
-    largest = torch.linalg.vector_norm(grad, float("inf")).clamp_min(1e-30)
-    return torch.exp2(torch.floor(torch.log2(HALF_GRADIENT / largest))).clamp(2.0**-24, 2.0**60).view(1)
-
-
-def _mlp(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """Return the input (in, n) of each layer, and the output of the last one."""
+def _mlp(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool) -> list[torch.Tensor]:
+    """Return the input (in, n) of each layer if `keep`, and the output of the last one."""
     if encoded.device.type != "cpu":
         layers = [encoded]
         for matrix in matrices[:-1]:
             layers.append(_product_relu(matrix, layers[-1]))
-        return [*layers, matrices[-1] @ layers[-1]]
+            if not keep:
+                del layers[0]
+        return [*layers[: len(layers) * keep], matrices[-1] @ layers[-1]]
     count = encoded.shape[1]
+    if not keep:
+        return [_mlp_on_cpu(encoded, matrices)]
     layers = [encoded, *(encoded.new_empty(len(matrix), count) for matrix in matrices)]
 
     def part(_: int, columns: slice) -> None:
@@ -184,6 +203,20 @@ def _mlp(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> list[torch.
 
     share_columns(count, part)
     return layers
+
+
+def _mlp_on_cpu(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Return the output of the last layer; the others exist for one part of the columns at a time."""
+    result = encoded.new_empty(len(matrices[-1]), encoded.shape[1])
+
+    def part(_: int, columns: slice) -> None:
+        layer = encoded[:, columns]
+        for matrix in matrices[:-1]:
+            layer = torch.mm(matrix, layer).relu_()
+        torch.mm(matrices[-1], layer, out=result[:, columns])
+
+    share_columns(encoded.shape[1], part)
+    return result
 
 
 def _product_relu(matrix: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:

@@ -25,7 +25,7 @@ from nexwarp.ops.project import Projection
 TILE_SIZE = 16
 # Threads that share a surfel's tile rows on a GPU.
 SHARING = 8
-# Of the arrays that `intersect_tiles` makes.
+# Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
 
@@ -52,7 +52,7 @@ class Tiles:
         order: (N,) int32, surfels by signed z-depth of their centres (as float32), ties by index.
         ends: (N,) int32, end of the entries of the surfel order[rank] in emission order.
         surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
-        entries: (M,) int32, emission index of each of those.
+        entries: (M,) int32, emission index of each of those; empty unless `exact`.
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
         reaches: (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed.
         tile_size: pixels along a tile's side.
@@ -129,16 +129,11 @@ def intersect_tiles(
     exact = means.device.type == "cpu" and room is None
     if room is None:
         room = _total(ends, columns * rows) if exact else _room(ends, kind)
-    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    entries, tile_ids = order.new_zeros(2 * room), order.new_full((2 * room,), columns * rows)
-    surfels, surfel_ids = order.new_zeros(room), order.new_empty(room)
-    emitted = [array(x, wp.int32) for x in (tile_ids[:room], entries[:room], surfels)]
-    launch(means, kernels.emit, count * sharing, [*arguments, array(counts, wp.int32)], emitted)
-    _sort(tile_ids, entries, room, (columns * rows).bit_length())
-    launch(means, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    emission = [*arguments, array(counts, wp.int32)]
+    surfel_ids, entries, tile_ids = _sorted_entries(order, kernels.emit, emission, room, columns * rows, sharing, exact)
     offsets = order.new_empty(columns * rows + 1)
-    launch(means, tile_offsets_kernel, len(offsets), [emitted[0], room], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries[:room], offsets, reaches, tile_size, columns, exact, kind)
+    launch(means, tile_offsets_kernel, len(offsets), [array(tile_ids, wp.int32), room], [array(offsets, wp.int32)])
+    return Tiles(order, ends, surfel_ids, entries, offsets, reaches, tile_size, columns, exact, kind)
 
 
 def _tile_polygons(
@@ -163,6 +158,32 @@ def _tile_polygons(
     kernel = tile_polygon_kernel(real, low_pass, tile_size)
     launch(like, kernel, count, arguments, [array(reaches, t.vec2), *polygons])
     return polygons, reaches
+
+
+def _sorted_entries(
+    order: torch.Tensor,
+    emit: wp.Kernel,
+    emission: list[Argument],
+    room: int,
+    tiles: int,
+    sharing: int,
+    exact: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Emit `room` entries and sort them by tile; return `Tiles.surfel_ids`, `Tiles.entries` and the sorted tiles."""
+    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
+    values, tile_ids = order.new_empty(2 * room), order.new_empty(2 * room)
+    values[:room] = 0
+    tile_ids[:room] = tiles
+    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
+    surfels = array(order.new_zeros(room) if exact else None, wp.int32)
+    emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
+    launch(order, emit, len(order) * sharing, emission, emitted)
+    _sort(tile_ids, values, room, tiles.bit_length())
+    if not exact:
+        return values[:room], values[:0], tile_ids[:room]
+    surfel_ids = order.new_empty(room)
+    launch(order, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    return surfel_ids, values[:room], tile_ids[:room]
 
 
 def _depth_order(centers: torch.Tensor) -> torch.Tensor:
@@ -215,14 +236,18 @@ def _total(ends: torch.Tensor, tiles: int) -> int:
 
 @dataclass
 class _Need:
-    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later."""
+    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later.
+
+    `room` is what was given to them, `most` the largest number that is known.
+    """
 
     room: int
     total: torch.Tensor
     copied: torch.cuda.Event
+    most: int = 0
 
 
-_needs: dict[tuple[object, ...], _Need] = {}
+_needs: dict[tuple[int | None, int, int, int, bool], _Need] = {}
 
 
 def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
@@ -234,8 +259,7 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     """
     if len(ends) == 0:
         return 0
-    bits = len(ends).bit_length()
-    key = (ends.device.index, bits, *kind)
+    key = _key(ends, kind)
     need = _needs.get(key)
     if torch.cuda.is_current_stream_capturing():
         if need is None:
@@ -249,13 +273,14 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     if need is None:
         room = _with_margin(_total(ends, kind[0] * kind[1]))
         # A scene that grew by splitting has at least the needs it had: one view may show little of it.
-        if fewer := _needs.get((ends.device.index, bits - 1, *kind)):
+        if fewer := _needs.get((key[0], key[1] - 1, *kind)):
             room = max(room, fewer.room)
         with torch.inference_mode(False):  # later renderings write to it in any mode
             total = torch.empty(1, dtype=torch.int32, pin_memory=True)
         need = _needs[key] = _Need(room, total, torch.cuda.Event())
     elif arrived:
-        need.room = max(need.room, _with_margin(int(need.total)))
+        need.most = max(need.most, int(need.total))
+        need.room = max(need.room, _with_margin(need.most))
     else:
         return need.room
     need.total.copy_(ends[-1:], non_blocking=True)
@@ -263,9 +288,25 @@ def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     return need.room
 
 
+def _key(ends: torch.Tensor, kind: tuple[int, int, bool]) -> tuple[int | None, int, int, int, bool]:
+    return (ends.device.index, len(ends).bit_length(), *kind)
+
+
 def fits(room: ListCapacity) -> bool:
     """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay."""
     return _room(room.ends, room.kind) <= room.entries
+
+
+def held(room: ListCapacity) -> bool:
+    """Whether lists that a CUDA graph fills have held all entries as far as is known now; call after each replay.
+
+    Unlike `fits` it asks for no margin: cameras that move would need a new graph whenever they see a little more.
+    """
+    if len(room.ends) == 0:
+        return True
+    _room(room.ends, room.kind)
+    need = _needs.get(_key(room.ends, room.kind))
+    return need is None or need.most <= room.entries
 
 
 def _with_margin(total: int) -> int:

@@ -4,8 +4,8 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.types import types
-from nexwarp.kernels.unproject import unproject_kernel
-from nexwarp.ops._interop import Context, array, grad_like, launch, real_of
+from nexwarp.kernels.unproject import unproject_kernels
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 from nexwarp.ops.pinhole import Pinhole
 
 
@@ -35,7 +35,8 @@ class _Unproject(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         positions = depths.new_empty(*depths.shape, 3)
         directions = depths.new_empty(*depths.shape[:2], 3)
-        _launch(depths, viewmat[None], 0, camera, (positions, directions))
+        kernel, pixels = unproject_kernels(real_of(depths)).forward, depths.shape[0] * depths.shape[1]
+        launch(depths, kernel, pixels, _inputs(depths, viewmat, camera), _outputs(depths, positions, directions))
         ctx.save_for_backward(depths, viewmat)
         ctx.camera = camera
         ctx.set_materialize_grads(False)
@@ -50,13 +51,17 @@ class _Unproject(torch.autograd.Function):
         ctx: _Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         depths, viewmat = ctx.saved_tensors
-        need_depths, step, _ = ctx.needs_input_grad
-        pixels = depths.shape[0] * depths.shape[1]
-        grad_depths = grad_like(depths, need_depths)
-        grad_viewmats = viewmat.new_zeros(pixels, 4, 4) if step else None
-        viewmats = viewmat.expand(pixels, 4, 4) if step else viewmat[None]
-        grads = (grad_positions, None if grad_directions is None else grad_directions.contiguous())
-        _launch(depths, viewmats, int(step), ctx.camera, grads, (grad_depths, grad_viewmats))
+        need_depths, need_viewmat, _ = ctx.needs_input_grad
+        if grad_positions is None and grad_directions is None:
+            return None, None, None
+        pixels, real = depths.shape[0] * depths.shape[1], real_of(depths)
+        grad_depths = torch.empty_like(depths) if need_depths else None
+        # A slot a pixel, then one sum: no contention, and a fixed order.
+        grad_viewmats = viewmat.new_empty(pixels, 4, 4) if need_viewmat else None
+        grads = (None if x is None else x.contiguous() for x in (grad_positions, grad_directions))
+        inputs = [*_inputs(depths, viewmat, ctx.camera), *_outputs(depths, *grads)]
+        outputs = [array(_rows(grad_depths), real), array(grad_viewmats, types(real).mat44)]
+        launch(depths, unproject_kernels(real).backward, pixels, inputs, outputs)
         return grad_depths, None if grad_viewmats is None else grad_viewmats.sum(0), None
 
 
@@ -64,24 +69,17 @@ def _rows(depths: torch.Tensor | None) -> torch.Tensor | None:
     return None if depths is None else depths.view(depths.shape[0] * depths.shape[1], depths.shape[2])
 
 
-def _launch(
-    depths: torch.Tensor,
-    viewmats: torch.Tensor,
-    step: int,
-    camera: Pinhole,
-    outputs: tuple[torch.Tensor | None, torch.Tensor | None],
-    grads: tuple[torch.Tensor | None, torch.Tensor | None] | None = None,
-) -> None:
-    """Launch forward into `outputs`, or, given `grads` to add to, backward from `outputs`' gradients."""
-    real = real_of(depths)
-    t = types(real)
-    pixels = depths.shape[0] * depths.shape[1]
+def _inputs(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> list[Argument]:
+    t = types(real_of(depths))
     K = array(camera.K.contiguous()[None], t.mat33)
-    inputs = [array(_rows(depths), real), array(viewmats, t.mat44), step, K, camera.width]
+    return [array(_rows(depths), t.real), array(viewmat[None], t.mat44), K, camera.width]
+
+
+def _outputs(depths: torch.Tensor, positions: torch.Tensor | None, directions: torch.Tensor | None) -> list[Argument]:
+    """View positions and directions, or their gradients, as the kernels do."""
+    vec3, pixels = types(real_of(depths)).vec3, depths.shape[0] * depths.shape[1]
     shapes = ((pixels, depths.shape[2], 3), (pixels, 3))
-    arrays = [array(None if x is None else x.view(s), t.vec3) for x, s in zip(outputs, shapes, strict=True)]
-    if grads is None:
-        launch(depths, unproject_kernel(real), pixels, inputs, arrays)
-        return
-    adjoint_inputs = [array(_rows(grads[0]), real), array(grads[1], t.mat44), None, None, None]
-    launch(depths, unproject_kernel(real), pixels, inputs, [None, None], adjoint=(adjoint_inputs, arrays))
+    return [
+        array(None if x is None else x.view(shape), vec3)
+        for x, shape in zip((positions, directions), shapes, strict=True)
+    ]

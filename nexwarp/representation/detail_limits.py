@@ -3,6 +3,7 @@
 import torch
 from torch import nn
 
+from nexwarp import ops
 from nexwarp.checks import check_tensors
 
 NEVER = 1e30  # depth / focal of a surfel that no training view saw: its texture gets no detail
@@ -50,8 +51,4 @@ def limited_depths(
     """
     if limits is None or not len(limits):
         return depths
-    indices = ids.clamp_min(0).long()
-    clamped = torch.minimum(depths, focal * limits.farthest[indices])
-    # `nearest` is applied last: where no training view saw the texture, it is NEVER and removes all detail.
-    clamped = torch.maximum(clamped, focal * limits.nearest[indices])
-    return torch.where(ids >= 0, clamped, depths)
+    return ops.limit_depths(ids, depths, limits.nearest, limits.farthest, focal)

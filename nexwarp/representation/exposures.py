@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from nexwarp.camera import Camera
+from nexwarp.camera import Camera, StagedCamera
 from nexwarp.checks import check_tensors
 from nexwarp.determinism import one_thread
 
@@ -89,8 +89,13 @@ class Exposures(nn.Module):
         a, b, largest = self.falloff.tolist()
         if not largest > 0:
             raise ValueError(f"falloff: expected a largest squared tangent > 0, got {largest:g}")
-        self._lens = (a, b, largest)
+        self._lens: tuple[float, float, float] = (a, b, largest)
         self._falloffs: dict[tuple[object, ...], torch.Tensor] = {}
+
+    @property
+    def lens(self) -> tuple[float, float, float]:
+        """The falloff as numbers."""
+        return self._lens
 
     @classmethod
     def of(
@@ -155,6 +160,8 @@ class Exposures(nn.Module):
         Returns:
             (H, W, 1), cached: callers must not write to it.
         """
+        if isinstance(camera, StagedCamera):
+            return camera.falloff
         a, b, largest = self._lens
         if a == b == 0:
             return None

@@ -8,6 +8,7 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.checks import check_range, check_tensors
+from nexwarp.ops import fused_texture
 
 GRID_INIT = 0.01
 
@@ -47,6 +48,8 @@ class NeuralTexture(nn.Module):
     """
 
     resolutions: torch.Tensor
+    # The grid in half precision, and which grid it was: address and version.
+    _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
 
     def __init__(
         self,
@@ -115,18 +118,45 @@ class NeuralTexture(nn.Module):
         return self.grid.device
 
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
-        """Return how many values an evaluation keeps for each point (features, hidden layers, output), and their dtype.
+        """Return how many values an evaluation keeps for each point, at least, and their dtype.
+
+        Features, hidden layers and output; without gradients no hidden layers; in one kernel the features alone.
 
         Args:
             sh_degree: SH degree of the evaluation.
         """
-        *hidden, _ = self.mlp.parameters()
-        features = self.grid.shape[0] * self.grid.shape[2]
+        *hidden, last = self.mlp.parameters()
+        features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
+        kept = torch.is_grad_enabled()
+        if self._in_half() and fused_texture.fits(self.grid, [*hidden, last[:outputs]], 0):
+            return features * kept, torch.float16
         dtype = torch.float16 if self._in_half() else self.grid.dtype
-        return features + sum(map(len, hidden)) + 3 * (min(sh_degree, self.sh_degree) + 1) ** 2, dtype
+        return features + outputs + sum(map(len, hidden)) * kept, dtype
 
     def _in_half(self) -> bool:
         return self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32
+
+    def half_copy(self) -> torch.Tensor:
+        """Return a half-precision copy (L, T, F) of the grid, which evaluations use from now on.
+
+        Torch's own changes of the grid are noticed. Whoever writes to the grid past torch, as a kernel or through
+        `grid.data` does, writes to the copy too, or calls `drop_half_copy`.
+        """
+        key = (self.grid.data_ptr(), self.grid._version)
+        if self._half_copy is None or self._half_copy[0].device != self.grid.device:
+            self._half_copy = (self.grid.detach().half(), key)
+        elif self._half_copy[1] != key:
+            self._half_copy[0].copy_(self.grid.detach())
+            self._half_copy = (self._half_copy[0], key)
+        return self._half_copy[0]
+
+    def drop_half_copy(self) -> None:
+        """Make each evaluation in half precision convert the grid again."""
+        self._half_copy = None
+
+    def half_copy_key(self) -> tuple[int, int, int] | None:
+        """Return what changes when `half_copy` would be made anew; None without a copy."""
+        return None if self._half_copy is None else (self._half_copy[0].data_ptr(), *self._half_copy[1])
 
     def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
         """Return the field's SH coefficients.
@@ -171,7 +201,8 @@ class NeuralTexture(nn.Module):
         """
         degree = min(sh_degree, self.sh_degree)
         flat = directions.reshape(-1, 3)
-        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp)
+        image = (directions.shape[0], directions.shape[1]) if directions.ndim == 3 else None
+        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp, image)
         return colors.view(positions.shape)
 
     def _evaluate(
@@ -182,6 +213,7 @@ class NeuralTexture(nn.Module):
         degree: int,
         directions: torch.Tensor | None = None,
         clamp: bool = False,
+        image: tuple[int, int] | None = None,
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if not self.down_weighting:
@@ -205,6 +237,8 @@ class NeuralTexture(nn.Module):
             offset=0.0 if self.residual else 0.5,
             clamp=clamp,
             half=self._in_half(),
+            table=self.half_copy() if self._in_half() and self._half_copy is not None else None,
+            image=image,
         )
 
 

@@ -24,7 +24,9 @@ TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
 EXPORT_FOLDER = "export"
 SURFELS_FILE, SPLATS_FILE = "surfels.ply", "splats.ply"
+COMPACT_FILE = "compact.safetensors"
 TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
+WEB_FILE, GLB_FILE, SPZ_FILE = "scene.html", "scene.glb", "splats.spz"
 
 RENDERS_FOLDER = "renders"
 TRAIN, TEST, COMPARE = "train", "test", "compare"
@@ -33,7 +35,16 @@ FILE_PATH = "path_{}"  # folder of the frames of a path from a file
 OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
 
 ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
-EXPORTS = (SURFELS_FILE, SPLATS_FILE, TRANSFORMS_FILE, CAMERA_PATH_FILE)
+EXPORTS = (
+    SURFELS_FILE,
+    SPLATS_FILE,
+    COMPACT_FILE,
+    TRANSFORMS_FILE,
+    CAMERA_PATH_FILE,
+    WEB_FILE,
+    GLB_FILE,
+    SPZ_FILE,
+)
 PATTERN = re.compile(
     "|".join(
         [

@@ -8,6 +8,7 @@ from typing import TypedDict, cast
 import torch
 
 from nexwarp.data import View
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.contents import COMPARE, TEST, picture_name
@@ -43,6 +44,7 @@ def evaluate(
     mask_mode: str = "ignore",
     metrics: Sequence[str] = ("psnr", "ssim"),
     progress: Callable[[str], None] | None = None,
+    ranks: Ranks | None = None,
 ) -> Evaluation:
     """Render views and compare them with their photos.
 
@@ -56,6 +58,7 @@ def evaluate(
         metrics: names among psnr, ssim, flip and lpips. FLIP and LPIPS need whole images: ignored pixels are copied
             from the photo.
         progress: called with each view's name after the view is evaluated.
+        ranks: share the views, and return the same on all of them; only rank 0 writes. None is this process alone.
 
     Raises:
         ValueError: there are no views, or a metric is unknown.
@@ -63,24 +66,17 @@ def evaluate(
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
     _check_names(metrics)
+    ranks = Ranks.alone(model.device) if ranks is None else ranks
     results: dict[str, dict[str, float | None]] = {}
-    for view in views:
-        out = model.render(view.camera)
-        picture = to_uint8(out.image).cpu()
-        photo, mask = to_uint8(view.image), view.mask
-        if mask is not None and mask_mode == "background":
-            background = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
-            photo, mask = torch.where(mask[..., None], photo, background), None
-        results[view.name] = {name: METRICS[name](picture, photo, mask) for name in metrics}
-        if renders is not None:
-            save_png(renders / TEST / picture_name(view.name), picture)
-            strip = side_by_side(
-                [photo, picture, error_map(picture, photo)],
-                captions=["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"],
-            )
-            save_png(renders / COMPARE / picture_name(view.name), strip)
-        if progress is not None:
-            progress(view.name)
+    for begin in range(0, len(views), ranks.size):
+        some = views[begin : begin + ranks.size]
+        mine = _judge(model, some[ranks.rank], mask_mode, metrics) if ranks.rank < len(some) else None
+        for view, (picture, values) in zip(some, _gathered(mine, some, ranks), strict=True):
+            results[view.name] = values
+            if renders is not None and ranks.first:
+                _write(renders, view, picture, *_compared(model, view, mask_mode))
+            if progress is not None:
+                progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
     return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
 
@@ -95,6 +91,50 @@ def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
 def _check_names(metrics: Sequence[str]) -> None:
     if unknown := [name for name in metrics if name not in METRICS]:
         raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
+
+
+def _judge(
+    model: Model, view: View, mask_mode: str, metrics: Sequence[str]
+) -> tuple[torch.Tensor, dict[str, float | None]]:
+    """Render a view; return the picture, (H, W, 3) uint8 on the CPU, and its metrics."""
+    picture = to_uint8(model.render(view.camera).image).cpu()
+    photo, mask = _compared(model, view, mask_mode)
+    return picture, {name: METRICS[name](picture, photo, mask) for name in metrics}
+
+
+def _compared(model: Model, view: View, mask_mode: str) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the photo that a rendering is compared with, (H, W, 3) uint8, and the mask of what counts."""
+    photo, mask = to_uint8(view.image), view.mask
+    if mask is None or mask_mode != "background":
+        return photo, mask
+    background = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
+    return torch.where(mask[..., None], photo, background), None
+
+
+def _gathered(
+    mine: tuple[torch.Tensor, dict[str, float | None]] | None, views: Sequence[View], ranks: Ranks
+) -> list[tuple[torch.Tensor, dict[str, float | None]]]:
+    """Return what each rank has made of its view; None is a rank without one."""
+    if ranks.size == 1:
+        assert mine is not None
+        return [mine]
+    values = ranks.gather(None if mine is None else mine[1])[: len(views)]
+    pictures = ranks.gather_bytes(b"" if mine is None else mine[0].contiguous().numpy().tobytes())
+    shapes = [(view.camera.height, view.camera.width, 3) for view in views]
+    return [
+        (torch.frombuffer(bytearray(pixels), dtype=torch.uint8).view(shape), cast(dict[str, float | None], value))
+        for pixels, shape, value in zip(pictures, shapes, values, strict=False)
+    ]
+
+
+def _write(renders: Path, view: View, picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> None:
+    """Write a rendering, and the strip that compares it with its photo."""
+    save_png(renders / TEST / picture_name(view.name), picture)
+    strip = side_by_side(
+        [photo, picture, error_map(picture, photo)],
+        captions=["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"],
+    )
+    save_png(renders / COMPARE / picture_name(view.name), strip)
 
 
 def _mean(values: list[float | None]) -> float | None:

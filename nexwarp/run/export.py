@@ -3,26 +3,53 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from nexwarp.camera import resized
+import torch
+
+from nexwarp.bake.fit import bake
+from nexwarp.bake.glb import save_glb
+from nexwarp.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
+from nexwarp.model.model_file import save_model
+from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
-from nexwarp.run.contents import CAMERA_PATH_FILE, SPLATS_FILE, SURFELS_FILE, TRANSFORMS_FILE
+from nexwarp.run.contents import (
+    CAMERA_PATH_FILE,
+    COMPACT_FILE,
+    EXPORT_FOLDER,
+    GLB_FILE,
+    SPLATS_FILE,
+    SPZ_FILE,
+    SURFELS_FILE,
+    TRANSFORMS_FILE,
+    WEB_FILE,
+)
 from nexwarp.run.folder import SceneSource
 from nexwarp.run.opened import OpenedModel
 
-FORMATS = ("ply", "cameras")
+FORMATS = ("ply", "compact", "cameras", "web", "glb", "spz")
 
 
-def export_run(opened: OpenedModel, kind: str, folder: Path, max_extent: float = MAX_EXTENT) -> Sequence[Path]:
+def export_run(
+    opened: OpenedModel,
+    kind: str,
+    folder: Path | None = None,
+    max_extent: float = MAX_EXTENT,
+    quality: str = "quantised",
+    device: torch.device | str = "cpu",
+) -> Sequence[Path]:
     """Export a run or a model to a folder; docs/outputs.md describes the files.
 
     Args:
         opened: the run or model.
-        kind: "ply" (surfels.ply, splats.ply) or "cameras" (transforms.json, camera_path.json).
-        folder: output folder, created if it does not exist.
-        max_extent: largest Gaussian in splats.ply, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        kind: "ply" (surfels.ply, splats.ply), "compact" (compact.safetensors), "cameras" (transforms.json,
+            camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
+        folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
+            in .html is one file with everything; None is `export/scene.html`.
+        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        quality: "quantised" or "full", of a web page.
+        device: renders what the texture is baked from, of "web" and "glb".
 
     Returns:
         The files that were written.
@@ -33,18 +60,41 @@ def export_run(opened: OpenedModel, kind: str, folder: Path, max_extent: float =
     if not max_extent > 0:
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
-        raise SettingError(f"--format: expected {' or '.join(FORMATS)}, got {kind!r}")
+        raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
+    if kind == "web":
+        from nexwarp.web.export import export_web
+
+        return export_web(
+            opened.model.to(device),
+            _all_cameras(opened),
+            folder or opened.folder / EXPORT_FOLDER / WEB_FILE,
+            quality=quality,
+            title=run_title(opened),
+        )
+    folder = folder or opened.folder / EXPORT_FOLDER
+    if kind == "cameras":
+        return _export_cameras(opened, folder)
+    if kind == "compact":
+        return [save_model(folder / COMPACT_FILE, opened.model, compact=True)]
+    model, cameras = opened.model, list(_all_cameras(opened).values())
+    if kind == "glb":
+        if not cameras:
+            raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        save_glb(folder / GLB_FILE, bake(model.to(device), cameras), cameras)
+        return [folder / GLB_FILE]
+    degree = model.options.sh_degree
+    if kind == "spz":
+        save_splats_spz(folder / SPZ_FILE, model.surfels, degree, cameras=cameras, max_extent=max_extent)
+        return [folder / SPZ_FILE]
+    files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
+    save_surfels_ply(files[0], model.surfels)
+    save_splats_ply(files[1], model.surfels, degree, cameras=cameras, max_extent=max_extent)
+    return files
+
+
+def _export_cameras(opened: OpenedModel, folder: Path) -> Sequence[Path]:
+    """Write the cameras of a run for nerfstudio."""
     cameras_file = opened.folder / CAMERAS_FILE
-    if kind == "ply":
-        model = opened.model
-        files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
-        save_surfels_ply(files[0], model.surfels)
-        # A training that stopped early leaves a model, but no cameras file.
-        groups = opened.cameras.values() if cameras_file.is_file() else ()
-        all_cameras = [camera for members in groups for camera in members.values()]
-        degree = model.options.sh_degree
-        save_splats_ply(files[1], model.surfels, degree, cameras=all_cameras, max_extent=max_extent)
-        return files
     images = SceneSource.images if opened.source is None else opened.source.images
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
@@ -59,3 +109,15 @@ def export_run(opened: OpenedModel, kind: str, folder: Path, max_extent: float =
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
     return files
+
+
+def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:
+    """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
+    if not (opened.folder / CAMERAS_FILE).is_file():
+        return {}
+    return {name: camera for members in opened.cameras.values() for name, camera in members.items()}
+
+
+def run_title(opened: OpenedModel) -> str:
+    """Return the name of a run's scene, or of a model, as a title."""
+    return opened.title if opened.source is None else Path(opened.source.path).name or "nexwarp"

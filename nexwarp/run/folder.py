@@ -129,11 +129,18 @@ def _check_replaceable(run: Path) -> None:
         ) from None
 
 
-def create_run(run: Path, source: SceneSource, config: Config, device: str) -> list[str]:
+def create_run(run: Path, source: SceneSource, config: Config, device: str, launch: str = "") -> list[str]:
     """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
 
     The new config is on the disk before anything is deleted, and replaces the old config last, when the disk has stored
     the deletions. An interruption at any point thus leaves a folder that is still a run.
+
+    Args:
+        run: run folder.
+        source: the scene.
+        config: settings.
+        device: type of the device.
+        launch: of several ranks, as `began` recognises it.
 
     Returns:
         Names of the files and folders that nexwarp did not write; they stay.
@@ -143,7 +150,7 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str) -> l
         scene["path"] = str(Path(source.path).resolve())
     if source.points is not None:
         scene["points"] = str(Path(source.points).resolve())
-    data = {"scene": scene, "device": device, "config": config.as_dict()}
+    data = {"scene": scene, "device": device, "config": config.as_dict()} | ({"launch": launch} if launch else {})
     with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(data, indent=2) + "\n").encode())
         sync(temporary)
@@ -155,6 +162,14 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str) -> l
 def rewrite_config(run: Path, config: Config) -> None:
     """Replace the settings in a run's config; the file's other entries stay."""
     write_json(run / CONFIG_FILE, {**read_run(run)[2], "config": config.as_dict()})
+
+
+def began(run: Path, launch: str) -> bool:
+    """Whether a folder holds a run that the ranks of this launch have created."""
+    try:
+        return read_run(run)[2].get("launch") == launch
+    except (FormatError, MissingError):
+        return False
 
 
 def check_room(run: Path, size: int) -> None:

@@ -121,8 +121,8 @@ class TrainingLog:
 
     def __call__(self, step: StepReport) -> None:
         """Write a line if one is due after this step."""
-        # Lines at 1, 1 + every, ...: steps at round numbers are often special, such as border steps.
-        if (step.iteration - 1) % self.every and step.iteration != self.trainer.config.iterations:
+        # Lines at 1, 1 + every, ...: steps at round numbers are often special, such as those of density control.
+        if (step.iteration - 1) % self.every >= step.views and step.iteration != self.trainer.config.iterations:
             return
         assert self.file is not None
         line = self._line(step)

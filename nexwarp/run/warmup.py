@@ -15,10 +15,11 @@ import warp as wp
 
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
-from nexwarp.kernels.catalogue import thread_kernels, walk_kernels
+from nexwarp.kernels.catalogue import fused_kernel_builds, thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
+from nexwarp.ops.fused_texture import supported, takes_shape
 from nexwarp.ops.startup import start_warp
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
@@ -54,7 +55,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         TILE_SIZE,
         degrees=range(config.sh_degree + 1),
         features=(config.texture.features,) * textured,
-        clamps=(config.clamp_texture,) * textured,
+        clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH if cpu else 1,),
         cpu=cpu,
@@ -65,7 +66,11 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     if config.densify.floaters or config.footprints:
         hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
-    return [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
+    builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
+    shape = config.texture
+    if textured and supported(device) and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
+        builds += (Build(*build) for build in fused_kernel_builds((shape.features,)))
+    return builds
 
 
 def compile_all(builds: Iterable[Build], device: torch.device, done: Callable[[], None] | None = None) -> None:

@@ -108,29 +108,18 @@ class Config:
     that no training view has. A larger strength changes the colours in the training views more; 0 keeps the SH as
     trained."""
     exposures: bool = True
-    """Estimate each photo's exposure and white balance before training, as gains of red, green and blue, and train at
-    the mean exposure. Rendered views get gains that are predicted from nearby photos. Photos of one exposure are left
-    alone."""
-    metering: bool = True
-    """Auto exposure, with `exposures`: if the photos' gains depend on the brightness of what they show, predict the
-    gains of rendered views from brightness, too."""
-    vignetting: bool = True
-    """With `exposures`: estimate the vignetting of the lens, and apply it to rendered views if the photos show it."""
+    """Estimate each photo's exposure and white balance, as gains of red, green and blue, and the vignetting of the lens
+    before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos and,
+    where those of the photos follow the brightness of what they show, from brightness (auto exposure). Each is left out
+    where the photos do not show it."""
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""
-    border: float = 0.08
-    """Largest shift of border steps, as a fraction of the frame; 0 does none. A border step renders a window that is
-    shifted beyond the photo's frame; there its target is the photo's repeated edge."""
-    border_every: int = 4
-    """One of this many steps is a border step."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
-    clamp_texture: bool = False
-    """Limit textured colours to >= 0."""
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
@@ -160,16 +149,12 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
-        check_range("border", self.border, 0.0, 0.5)
-        check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
-        if self.clamp_texture and self.texture.residual:
-            raise ValueError("clamp_texture: expected False with texture.residual, got True")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

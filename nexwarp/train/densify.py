@@ -55,10 +55,10 @@ class Densifier:
         """Whether errors seen in this iteration can still lead to a split."""
         return iteration < self.config.stop
 
-    def due(self, iteration: int) -> bool:
-        """Whether a round follows this iteration (counted from 1)."""
-        c = self.config
-        return c.start < iteration < c.stop and iteration % c.every == 0
+    def due(self, iteration: int, views: int = 1) -> bool:
+        """Whether a round follows a step that ends with this iteration (counted from 1) and has so many views."""
+        c, late = self.config, iteration % self.config.every
+        return c.start < iteration - late < c.stop and late < views
 
     def accumulate(self, errors: torch.Tensor) -> None:
         """Add the blended errors (N,) of one view."""

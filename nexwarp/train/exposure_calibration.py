@@ -149,7 +149,7 @@ def held_out_error(seen: Observations, fit: Fit) -> float:
     return float(np.log1p((left / NOISE) ** 2).mean())
 
 
-def choose_fit(seen: Observations, cameras: Sequence[Camera], *, vignetting: bool = True) -> Fit | None:
+def choose_fit(seen: Observations, cameras: Sequence[Camera]) -> Fit | None:
     """Choose between no exposures, gains, and gains with a falloff, by how they explain points not fitted to.
 
     Shading and drift along chains of matches also look like gains, but not like the same gains everywhere: the points
@@ -158,7 +158,6 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera], *, vignetting: boo
     Args:
         seen: all observations.
         cameras: cameras of the photos.
-        vignetting: whether a falloff may be chosen.
 
     Returns:
         The chosen fit to all points; None where gains do not lower the error of held-out points by `MARGIN`.
@@ -166,7 +165,7 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera], *, vignetting: boo
     if len(seen.view) == 0:
         return None
     none, gains, both = held_out_errors(seen, cameras)
-    with_lens = vignetting and both < (1 - MARGIN) * gains
+    with_lens = both < (1 - MARGIN) * gains
     if (both if with_lens else gains) >= (1 - MARGIN) * none:
         return None
     return fit_exposures(seen, cameras, vignetting=with_lens)
@@ -313,7 +312,7 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
     cameras = [view.camera for view in scene.train]
     photos, masks = [view.image for view in scene.train], [view.mask for view in scene.train]
     seen = observations(cameras, photos, points, masks)
-    fit = choose_fit(seen, cameras, vignetting=config.vignetting)
+    fit = choose_fit(seen, cameras)
     if fit is None:
         return None
     log_gains = torch.from_numpy(fit.gains)

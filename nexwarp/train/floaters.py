@@ -8,6 +8,7 @@ import torch
 from nexwarp.camera import Camera, reduced, visible_points
 from nexwarp.cameras.between import between
 from nexwarp.data import View
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.model.model import Model
 
@@ -28,6 +29,7 @@ def floaters(
     generator: torch.Generator,
     *,
     last: bool = False,
+    ranks: Ranks | None = None,
 ) -> torch.Tensor:
     """Return (N,) bool, True for floaters: surfels that cover 3 in 10,000 pixels of an image, or more, from too near.
 
@@ -43,6 +45,7 @@ def floaters(
         generator: CPU generator for the cameras between.
         last: the last search of a run, after which nothing behind a floater can be trained: return surfels that cover
             3 in 1,000 pixels, or more, and use four times as many cameras between.
+        ranks: share the cameras, and return the same on all of them; None is this process alone.
     """
     bare = model.bare(max_hits=max(model.options.max_hits, 1))
     least, count = (LAST_SHARE, LAST_PROBES) if last else (LEAST_SHARE, PROBES)
@@ -52,10 +55,10 @@ def floaters(
         for old, new, depth in zip(cameras, moved, nearest, strict=True):
             probes.append((new, depth - torch.dist(new.position, old.position).item()))
     found = torch.zeros(len(bare.surfels), dtype=torch.bool, device=bare.device)
-    for camera, depth in probes:
+    for camera, depth in probes if ranks is None else probes[ranks.rank :: ranks.size]:
         if depth > 0:
             found |= _shares(bare, camera, NEARER * depth) >= least
-    return found
+    return found if ranks is None else ranks.union(found)
 
 
 def nearest_depth(view: View, points: torch.Tensor) -> float:

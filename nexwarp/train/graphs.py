@@ -24,6 +24,18 @@ FORGOTTEN = 1000
 CHANCES = 3
 
 
+class Gradients(NamedTuple):
+    """What the ranks of a training sum after a graph, where the graph cannot.
+
+    Attributes:
+        of_parameters: their gradients, in the order of the optimizer's groups.
+        errors: (N,) sums of the surfels' errors; None outside of density control.
+    """
+
+    of_parameters: list[torch.Tensor | None]
+    errors: torch.Tensor | None
+
+
 class StepResult(NamedTuple):
     """What a step leaves behind, without a gradient.
 
@@ -31,11 +43,13 @@ class StepResult(NamedTuple):
         losses: terms of the loss, scalars.
         image: (H, W, 3) the rendering.
         room: capacity of its lists of surfels and tiles.
+        gradients: what is left to sum over the ranks; None where the step has updated the parameters.
     """
 
     losses: dict[str, torch.Tensor]
     image: torch.Tensor
     room: ops.ListCapacity
+    gradients: Gradients | None = None
 
 
 class CaptureError(Exception):

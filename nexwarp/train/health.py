@@ -93,6 +93,21 @@ def describe(name: str, tensor: torch.Tensor) -> str:
     return f"{name}: {len(bad):,} of {tensor.numel():,} values, the first {tensor[where].item()} at index {where}"
 
 
+def watched_tensors(
+    parameters: Mapping[str, torch.Tensor], optimizer: torch.optim.Optimizer
+) -> dict[str, torch.Tensor]:
+    """Return parameters and optimizer state, which must stay finite, by the names that a report gives them."""
+    watched: dict[str, torch.Tensor] = {}
+    moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
+    for name, parameter in parameters.items():
+        # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
+        for key, value in optimizer.state.get(parameter, {}).items():
+            if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
+                watched[f"{moments.get(key, key)} of {name}"] = value
+        watched[name] = parameter
+    return watched
+
+
 def check_health(losses: LossLog, tensors: Mapping[str, torch.Tensor], facts: StepFacts) -> None:
     """Raise DivergedError unless the noted losses and all tensors are finite; forget the noted losses.
 

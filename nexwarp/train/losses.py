@@ -11,9 +11,10 @@ import torch
 
 from nexwarp.checks import check_range, check_tensors
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
-from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
+
+ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,7 @@ class LossWeights:
     dssim: float = 0.2
     """Share of D-SSIM in the image loss; L1 has the rest."""
     alpha: float = 0.005
-    """Factor of the penalty on blending weight that is not textured."""
-    alpha_hits: int = 2
-    """Number of the heaviest textured hits whose weights `alpha` counts."""
+    """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
     texture: float = 0.5
     """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
     opacity: float = 0.01
@@ -36,13 +35,10 @@ class LossWeights:
     """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.1
     """Factor of the relative depth error at the points that were triangulated from the photo."""
-    border: float = 0.1
-    """Factor of the image loss beyond the frame in border steps, against the photo's repeated edge."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        check_range("alpha_hits", self.alpha_hits, 1, MAX_HITS)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "border"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -84,7 +80,7 @@ def training_losses(
     _check_masks(image, mask=mask, empty=empty)
     image, textured, weights = _counted(image, textured, weights, target, mask, empty)
     # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
-    all_count = weights.shape[-1] <= factors.alpha_hits
+    all_count = weights.shape[-1] <= ALPHA_HITS
     shares = {
         "l1": 1.0 - factors.dssim,
         "texture": factors.texture * has_slots,
@@ -94,7 +90,7 @@ def training_losses(
         image, textured, weights, target, **shares, saturation=saturation
     )
     if not all_count and factors.alpha > 0.0:
-        alpha_term = factors.alpha * alpha_loss(weights[..., : factors.alpha_hits].contiguous())
+        alpha_term = factors.alpha * alpha_loss(weights[..., :ALPHA_HITS].contiguous())
     terms = {
         "l1": l1_term,
         "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,
@@ -187,14 +183,6 @@ def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Te
 def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
     """L_alpha: mean over the pixels of 1 - sum_k W, for (H, W, K) weights."""
     return _computed(photometric_terms(None, None, weights, None, alpha=1.0)[2])
-
-
-def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor) -> torch.Tensor:
-    """Sum over the pixels `beyond` (H, W) the frame of the L1 of (H, W, 3) images, over the number of all pixels."""
-    shape = ("H", "W", 3)
-    check_tensors({"image": (image, shape), "target": (target, shape)})
-    check_tensors({"beyond": (beyond, image.shape[:2])}, dtype=torch.bool, device=image.device)
-    return ((image - target).abs().mean(-1) * beyond).mean()
 
 
 def depth_loss(

@@ -16,6 +16,8 @@ class StepReport:
         losses: terms of the loss by name, factors included, scalars; own losses have their own names.
         image: (H, W, 3) the rendering, not clamped, before the step changed anything.
         target: (H, W, 3) float, the photo that it was compared with.
+        views: number of views of the step, by which the iteration has risen: one for each rank. Losses, image and
+            target are those of this rank's view.
     """
 
     iteration: int
@@ -23,6 +25,11 @@ class StepReport:
     losses: dict[str, torch.Tensor]
     image: torch.Tensor
     target: torch.Tensor
+    views: int = 1
+
+    def passed(self, every: int) -> bool:
+        """Whether a multiple of `every` is among the iterations of the step."""
+        return self.iteration % every < self.views
 
     def loss(self) -> float:
         """Return the value of the loss: the sum of all terms."""

@@ -10,6 +10,7 @@ import torch
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
@@ -17,6 +18,7 @@ from nexwarp.train.densify import DensifyConfig
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid" and "mlp"; `lr`, the
 # learning rate of the first step.
 ParameterGroup = dict[str, Any]
+EPSILON = 1e-15
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 
@@ -26,6 +28,7 @@ def make_optimizer(
     config: Config,
     scale: float,
     make: OptimizerMaker | None = None,
+    cells_unit: float = 1.0,
 ) -> torch.optim.Optimizer:
     """Make the optimizer; each of its groups gets the ends of its schedule as `group["ends"]`.
 
@@ -34,7 +37,8 @@ def make_optimizer(
         texture: to train, unless K is 0.
         config: whose learning rates count.
         scale: of the scene, world units, which the means' rates follow.
-        make: makes an optimizer of one's own; None makes Adam.
+        make: makes an optimizer of one's own; None makes Adam, on CUDA a `FusedAdam` that regularises the grid.
+        cells_unit: world units in which the grid's loss counts its cells.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -54,15 +58,16 @@ def make_optimizer(
         raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {given}")
     for group in optimizer.param_groups:
         group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
+    if isinstance(optimizer, FusedAdam) and config.max_hits:
+        optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 
 
 def _make_adam(groups: list[ParameterGroup], device: torch.device) -> torch.optim.Adam:
     """Make Adam with the paper's epsilon; on CUDA, its rates are tensors, which a CUDA graph reads."""
-    on_gpu = device.type == "cuda"
-    if on_gpu:
-        groups = [group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups]
-    return torch.optim.Adam(groups, eps=1e-15, fused=True, capturable=on_gpu)
+    if device.type != "cuda":
+        return torch.optim.Adam(groups, eps=EPSILON, fused=True)
+    return FusedAdam([group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups], eps=EPSILON)
 
 
 def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:
@@ -130,7 +135,6 @@ def options_at(
         background=background,
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
         low_pass=config.low_pass,
-        clamp_texture=config.clamp_texture,
     )
 
 

@@ -5,7 +5,7 @@ import hashlib
 import math
 import random
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict
 
@@ -86,7 +87,7 @@ def gather_optimizer(
         {key: x for key, x in group.items() if key not in ("params", "lr", "ends") and _is_plain(x)}
         for group in optimizer.param_groups
     ]
-    return tensors, {"kind": type(optimizer).__name__, "values": plain, "groups": groups}
+    return tensors, {"kind": _kind(optimizer), "values": plain, "groups": groups}
 
 
 def restore_optimizer(
@@ -100,9 +101,9 @@ def restore_optimizer(
     Raises:
         ValueError: it was another kind of optimizer, or Adam's moments have other shapes than their parameters.
     """
-    kind = "Adam" if record is None else record["kind"]
-    if kind != type(optimizer).__name__ or (record is None) != _is_adam(optimizer):
-        raise ValueError(f"its optimizer is {kind}, expected {type(optimizer).__name__}")
+    kind, expected = "Adam" if record is None else record["kind"], _kind(optimizer)
+    if kind != expected or (record is None) != _is_adam(optimizer):
+        raise ValueError(f"its optimizer is {kind}, expected {expected}")
     for name, parameter in parameters.items():
         prefix = f"{_prefix(optimizer)}{name}."
         entries = part(tensors, prefix) if record is not None else known_part(tensors, prefix, ADAM_STATE)
@@ -123,7 +124,12 @@ def restore_optimizer(
 
 
 def _is_adam(optimizer: torch.optim.Optimizer) -> bool:
-    return type(optimizer) is torch.optim.Adam
+    return type(optimizer) in (torch.optim.Adam, FusedAdam)
+
+
+def _kind(optimizer: torch.optim.Optimizer) -> str:
+    """Name of an optimizer in a checkpoint; the two Adams have the same state."""
+    return torch.optim.Adam.__name__ if _is_adam(optimizer) else type(optimizer).__name__
 
 
 def _prefix(optimizer: torch.optim.Optimizer) -> str:
@@ -168,18 +174,17 @@ def restore_random(
     random.setstate((version, tuple(internal), gauss))
 
 
-def check_origin(
-    state: Mapping[str, Any], config: Config, views: Json, digest: Callable[[], str], *, extend: bool = False
-) -> None:
+def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str, *, extend: bool = False) -> None:
     """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
 
     Args:
-        state: of the snapshot.
-        config: the settings.
+        snapshot: as it was read.
+        config: settings.
         views: fingerprint of the training views.
-        digest: returns the digest of the scene.
+        scene: digest of the scene.
         extend: whether the run may have had fewer iterations.
     """
+    state = snapshot.state
     saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
     if extend and saved.iterations < config.iterations:
         saved = dataclasses.replace(saved, iterations=config.iterations)
@@ -187,7 +192,7 @@ def check_origin(
         raise ValueError("its settings are others")
     if state["views"] != views:
         raise ValueError("it has seen other training views than the scene has")
-    if state["scene"] != digest():
+    if state["scene"] != scene:
         raise ValueError("the scene's photos, masks or points have changed since")
 
 

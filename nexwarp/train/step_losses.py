@@ -9,13 +9,13 @@ from nexwarp.render import Rendering
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
-from nexwarp.train.losses import border_loss, depth_loss, training_losses
+from nexwarp.train.losses import depth_loss, training_losses
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "border", "empty", "depth")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -57,6 +57,7 @@ def step_losses(
     *,
     cells_unit: float = 1.0,
     own: Mapping[str, OwnLoss] | None = None,
+    grid_term: bool = True,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
@@ -68,6 +69,7 @@ def step_losses(
         config: settings.
         cells_unit: world units in which the grid's loss counts its cells.
         own: losses of one's own, added as they are.
+        grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
 
     Raises:
         TypeError, ValueError: an own loss returned no scalar; the message names it.
@@ -79,15 +81,13 @@ def step_losses(
         weights=out.weights,
         target=target.photo,
         opacities=surfels.opacities,
-        grid=texture.grid if textured else None,
-        resolutions=texture.resolutions * cells_unit if textured else None,
+        grid=texture.grid if textured and grid_term else None,
+        resolutions=texture.resolutions * cells_unit if textured and grid_term else None,
         loss_weights=factors,
         mask=target.counts,
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
-    if target.beyond is not None and factors.border > 0:
-        losses["border"] = factors.border * border_loss(out.image, target.photo, target.beyond)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

@@ -11,6 +11,7 @@ import torch
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
@@ -22,13 +23,14 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import floaters, nearest_depth
-from nexwarp.train.graphs import StepGraphs, StepResult, can_capture, graph_key, updating
-from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message
+from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_surfels, texture_shape
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
@@ -75,6 +77,8 @@ class Trainer:
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
         rate_factor: multiplies all learning rates; less than 1 after the run has gone back.
+        views_a_step: number of views of the last step: 1, or that of the ranks.
+        ranks: the processes that train together; here one.
     """
 
     def __init__(
@@ -111,7 +115,7 @@ class Trainer:
         self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
         self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
         self.cells_unit = cells_unit(scene, config)
-        self.optimizer = make_optimizer(self.surfels, self.texture, config, scene.scale, optimizer)
+        self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds = 0, 0.0
         self.order: list[int] = []
@@ -120,7 +124,8 @@ class Trainer:
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise)
-        self.rate_factor = 1.0
+        self.rate_factor, self.views_a_step = 1.0, 1
+        self.ranks = Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
@@ -150,12 +155,12 @@ class Trainer:
             try:
                 start = time.perf_counter()
                 report = self.step()
-                if self.iteration == last and self.device.type == "cuda":
+                if self.iteration >= last and self.device.type == "cuda":
                     torch.cuda.synchronize(self.device)
                 self.seconds += time.perf_counter() - start
                 self.loss_log.note(self.iteration, report.losses)
-                keep = self.iteration % max(total // SNAPSHOTS, 1) == 0
-                if keep or self.iteration % CHECK_EVERY == 0 or self.iteration == last:
+                keep = report.passed(max(total // SNAPSHOTS, 1))
+                if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
                     self.check()
                 if keep:
                     self.good = self.snapshot()
@@ -175,64 +180,81 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
-            self.iteration += 1
-            target = self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+            target = self._next_target()
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
-            if self.graphs is None:
-                result = self._optimize(target)
-            else:
-                result = self.graphs.run(target, self._optimize, self._graph_key())
-            if self.densifier.due(self.iteration):
+            result = self._run_step(target)
+            if self.densifier.due(self.iteration, self.views_a_step):
                 self.densifier.step(self.surfels, self.optimizer, self.generator)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
-            return StepReport(self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
+            return StepReport(*report, self.views_a_step)
+
+    def _next_target(self) -> Target:
+        self.iteration += 1
+        return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        return make_optimizer(
+            self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer, self.cells_unit
+        )
 
     def _next_view(self) -> int:
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
+    def _run_step(self, target: Target) -> StepResult:
+        if self.graphs is None:
+            return self._optimize(target)
+        return self.graphs.run(target, self._optimize, self._graph_key())
+
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
+        fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
-            losses = step_losses(
-                taken,
-                target,
-                self.surfels,
-                self.texture,
-                self.config,
-                cells_unit=self.cells_unit,
-                own=self.own_losses,
-            )
+            given = (taken, target, self.surfels, self.texture, self.config)
+            losses = step_losses(*given, cells_unit=self.cells_unit, own=self.own_losses, grid_term=fused is None)
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
-            reduce(torch.add, losses.values()).backward()
-            with updating():
-                self.optimizer.step()
-                if request is not None and request.sums_after_backward is not None:
-                    self.densifier.accumulate(request.sums_after_backward)
+            self._weighted(reduce(torch.add, losses.values())).backward()
+            kept = self._update(None if request is None else request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
         # Without the autograd graph, which would keep this step's lists and buffers until the next step has its own.
         losses = {name: value.detach() for name, value in losses.items()}
-        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room)
+        if kept is None and fused is not None and fused.grid_loss is not None:
+            losses["grid"], fused.grid_loss = fused.grid_loss, None
+        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room, kept)
+
+    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
+        return loss
+
+    def _update(self, errors: torch.Tensor | None) -> Gradients | None:
+        """Update the parameters by their gradients, and the densifier's sums by the errors (N,) of the step's view."""
+        with updating():
+            self.optimizer.step()
+            if errors is not None:
+                self.densifier.accumulate(errors)
+        return None
 
     def _graph_key(self) -> Hashable:
         state = [self.densifier.errors]
         for _, parameter in self._named_parameters():
             kept = self.optimizer.state.get(parameter, {}).values()
             state += [parameter, *(x for x in kept if isinstance(x, torch.Tensor))]
-        return graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        key = graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        return key, self.texture.half_copy_key()
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
         densify = self.densifier.config
-        due = self.iteration % (FLOATERS_EVERY * densify.every) == 0 or self.iteration == self.config.iterations
+        due = self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
+        due |= self.iteration == self.config.iterations
         return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
@@ -244,7 +266,7 @@ class Trainer:
         # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
         # A generator of its own: a search that finds no floaters changes nothing.
         generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last)
+        chosen = floaters(self.model(), self.views.cameras, self._nearest, generator, last=last, ranks=self.ranks)
         self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def model(self) -> Model:
@@ -256,12 +278,8 @@ class Trainer:
         return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
 
     def _meta(self) -> dict[str, Json]:
-        return {
-            "near": self.scene.train[0].camera.near,
-            "scene_scale": self.scene.scale,
-            "preset": self.config.preset,
-            "iteration": self.iteration,
-        }
+        facts: dict[str, Json] = {"near": self.scene.train[0].camera.near, "scene_scale": self.scene.scale}
+        return facts | {"preset": self.config.preset, "iteration": self.iteration}
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model, with surfels of its own: smooth SH, detail limits and exposures, as configured.
@@ -273,8 +291,9 @@ class Trainer:
         """
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
+        self.texture.drop_half_copy()
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.metering, config.deterministic)
+        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             return finish_model(self.model(), self.scene.train, self.views.cameras, self.exposures, settings, observe)
 
@@ -287,32 +306,15 @@ class Trainer:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        """Return all tensors that must stay finite, by the names that a report gives them."""
-        watched: dict[str, torch.Tensor] = {}
-        moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
-        for name, parameter in self._named_parameters():
-            # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
-                    watched[f"{moments.get(key, key)} of {name}"] = value
-            watched[name] = parameter
-        return watched | {"densify.errors": self.densifier.errors}
+        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
+        return state | {"densify.errors": self.densifier.errors}
 
     def save(self, folder: str | os.PathLike[str]) -> None:
-        """Write a checkpoint, the model as it is now, and the cameras, which `nexwarp view`, `render` and others open.
-
-        Args:
-            folder: created if it does not exist; `restore` continues from its checkpoint.
-
-        Raises:
-            DivergedError: something is not finite.
-            OSError: a file cannot be written; an older one is as it was.
-        """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        self.save_checkpoint(folder)
+        """Write a checkpoint, the model as it is, and the cameras into a folder, which `nexwarp view` and others open."""
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        self.save_checkpoint(Path(folder))
         save_model(folder, self.model())
-        save_cameras(folder / CAMERAS_FILE, self.scene.cameras)
+        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
 
     def save_checkpoint(self, run: Path) -> None:
         """Write a checkpoint into a folder: everything that shapes the future of the run.
@@ -324,7 +326,13 @@ class Trainer:
         self.check()
         if self.good is None or self.good.state["iteration"] != self.iteration:
             self.good = self.snapshot()
-        save_checkpoint(run, *self.good)
+        self._write(run, self.good)
+
+    def _write(self, run: Path, snapshot: Snapshot) -> None:
+        save_checkpoint(run, *snapshot)
+
+    def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
+        return Snapshot(*load_checkpoint(run, warn))
 
     def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
@@ -332,17 +340,15 @@ class Trainer:
         Args:
             run: run folder.
             warn: is told of a damaged checkpoint that is passed over.
-            extend: also accept a checkpoint of a run of fewer iterations. Training goes on as in a run of
-                `config.iterations`: learning rates and all other schedules are those of such a run at that iteration.
+            extend: also accept a checkpoint of a run of fewer iterations; schedules are those of `config.iterations`.
 
         Raises:
             FileNotFoundError: there is none.
             ValueError: they are damaged, or scene, settings or optimizer differ.
         """
-        snapshot = Snapshot(*load_checkpoint(run, warn))
+        snapshot = self._read(run, warn)
         try:
-            fingerprint = self.views.fingerprint()
-            check_origin(snapshot.state, self.config, fingerprint, lambda: self._scene_digest, extend=extend)
+            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
@@ -360,16 +366,9 @@ class Trainer:
         numbers, generators = gather_random(self.generator, self.noise, self.device)
         tensors = learned_tensors(self.surfels, self.texture) | moments
         tensors |= {"densify.errors": self.densifier.errors, **numbers}
-        state = {
-            "iteration": self.iteration,
-            "seconds": self.seconds,
-            "order": list(self.order),
-            "views": self.views.fingerprint(),
-            **generators,
-            "rate_factor": self.rate_factor,
-            "scene": self._scene_digest,
-            "config": self.config.as_dict(),
-        }
+        state = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order), **generators}
+        state |= {"views": self.views.fingerprint(), "scene": self._scene_digest}
+        state |= {"rate_factor": self.rate_factor, "config": self.config.as_dict()}
         if optimizer is not None:
             state["optimizer"] = optimizer
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
@@ -379,7 +378,7 @@ class Trainer:
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
-        self.optimizer = make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.own_optimizer)
+        self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:

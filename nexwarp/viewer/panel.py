@@ -40,6 +40,7 @@ class Actions(Protocol):
     """The session's actions that a panel calls."""
 
     settings: Settings
+    make_page: Callable[[], bytes] | None
 
     def change(self, **values: object) -> None:
         """Change display settings; ValueError for an invalid value."""
@@ -70,6 +71,9 @@ class Actions(Protocol):
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
         """Save the path as a file."""
+
+    def save_page(self) -> None:
+        """Send the scene as a web page."""
 
 
 class Panel:
@@ -200,6 +204,11 @@ class Panel:
         )
         self.saved = gui.add_markdown("")
         self.count_keyframes(0)
+        if self.actions.make_page is not None:
+            gui.add_divider()
+            gui.add_markdown("**Web page** of the scene: one file that any browser opens")
+            page = gui.add_button("Download as web page", icon=Icon.WORLD_DOWNLOAD, hint="Takes minutes on a CPU")
+            page.on_click(lambda _: self.actions.save_page())  # on a thread of viser's pool
 
     def count_keyframes(self, count: int) -> None:
         """Show the number of views of the path."""

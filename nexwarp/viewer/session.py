@@ -41,6 +41,7 @@ class Session:
         wake: Callable[[], None],
         waiting: Callable[[], int],
         save: Callable[[bytes], str] | None,
+        make_page: Callable[[], bytes] | None,
     ) -> None:
         """Add the panel and the frustums of a client.
 
@@ -53,9 +54,11 @@ class Session:
             wake: called when a new picture is needed.
             waiting: returns the number of messages that the client has not taken yet.
             save: writes a camera path into the run and returns the file's name; None only sends it to the browser.
+            make_page: returns the scene as a web page; None offers none.
         """
         self.client, self.world, self.cameras, self.home = client, world, cameras, home
         self.settings, self.wake, self.waiting, self.save = settings, wake, waiting, save
+        self.make_page = make_page
         self.viewpoint: Viewpoint | None = None
         self.version = 0
         self.changed_at = time.perf_counter()
@@ -305,6 +308,22 @@ class Session:
         self.has_download = True
         self.client.send_file_download("camera_path.json", content, save_immediately=True)
         self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
+
+    def save_page(self) -> None:
+        """Send the scene as a web page; ignored while another file is made or on its way."""
+        if self.make_page is None or self.saving or (self.has_download and self.waiting()):
+            return
+        self.saving = True
+        self.tell("The web page is being made", "The download starts when it is ready.")
+        try:
+            content = self.make_page()
+        except (OSError, ValueError, MemoryError) as error:
+            self.tell("There is no web page", str(error))
+            return
+        finally:
+            self.saving = False
+        self.has_download = True
+        self.client.send_file_download("scene.html", content, save_immediately=True)
 
     def tell(self, title: str, text: str) -> None:
         """Show a notification in the browser, unless it takes no messages."""

@@ -47,6 +47,7 @@ class Viewer:
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
         total: int | None = None,
         save_path: Callable[[bytes], str] | None = None,
+        make_page: Callable[[], bytes] | None = None,
     ) -> None:
         """Start the server.
 
@@ -61,6 +62,8 @@ class Viewer:
                 thumbnails.
             total: number of iterations of the training that is shown; None for a finished model.
             save_path: writes a camera path, JSON in UTF-8, into the run and returns the file's name.
+            make_page: returns the scene as a web page, one HTML file, which browsers may download; called once, on
+                another thread.
 
         Raises:
             ValueError: the package viser is missing, or the address cannot be used.
@@ -68,6 +71,7 @@ class Viewer:
         self.model, self.near, self.title = model, near, title
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos, self.save_path = photos, save_path
+        self._make_page, self._page, self._page_lock = make_page, b"", threading.Lock()
         self.world = World.around(list(self.cameras.values()), model().surfels.means)
         self.home = self._home()
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
@@ -310,7 +314,9 @@ class Viewer:
                 self.thumbnails = thumbnails.of_photos(self.photos)
         waiting = partial(self.web.waiting, client.client_id)
         save = None if self.save_path is None else self._save_path
-        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set, waiting, save)
+        page = None if self._make_page is None else self._web_page
+        started = (self._settings(), self.home, self._news.set, waiting, save, page)
+        session = Session(client, self.world, self.cameras, *started)
         with self._lock:
             if client.client_id not in self.server.get_clients():  # it has disconnected
                 return
@@ -327,6 +333,14 @@ class Viewer:
                 raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
             self._paths += 1
         return self.save_path(content)
+
+    def _web_page(self) -> bytes:
+        """Return the web page, which the first request makes and others wait for."""
+        assert self._make_page is not None
+        with self._page_lock:
+            if not self._page:
+                self._page = self._make_page()
+            return self._page
 
     def _settings(self) -> Settings:
         """Initial settings of a client: the model's own K."""

@@ -18,6 +18,7 @@ from tests.viewer.support import serving, wait_for
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
 
+PAGE = b"<!doctype html><title>scene</title>"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -43,6 +44,9 @@ def record_and_save(page: Any, session: Session, folder: Path) -> None:
     with Image.open(shot.value.path()) as png:
         assert png.format == "PNG" and png.height == 1080
         assert png.width == pytest.approx(1080 * session.viewpoint.width / session.viewpoint.height, abs=1)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download as web page").click()
+    assert Path(download.value.path()).read_bytes() == PAGE and download.value.suggested_filename == "scene.html"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
@@ -51,7 +55,7 @@ def test_in_a_browser(model, tmp_path):
     api = pytest.importorskip("playwright.sync_api")
     errors: list[str] = []
     with (
-        serving(model, save_path=lambda content: keep_camera_path(tmp_path, content)) as viewer,
+        serving(model, save_path=lambda content: keep_camera_path(tmp_path, content), make_page=lambda: PAGE) as viewer,
         api.sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)

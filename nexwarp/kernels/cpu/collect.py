@@ -264,7 +264,6 @@ def collect_simd_backward_kernel(
     intrinsics_of = frame_functions(real).intrinsics_of
     width = strip_width(tile_size)
     h = hit_functions(real, low_pass, width)
-    hit_dot = h.hit_dot
     f = simd_functions(real, width)
     reals, integers, integer, inner = f.reals, f.integers, f.integer, f.inner
     s = slot_functions(real, width, max(max_hits, 1))
@@ -436,8 +435,8 @@ def collect_simd_backward_kernel(
                 center = centers[i]
             if h.misses_block(ra, rb, rn, rc[3], reaches[i], limits[i], center, middle, half, focal):
                 continue
-            u, v, depth = h.plane(ra, rb, rn, rc[3], dx, y)
-            alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, dx, y, focal, near)
+            u, v, plane_depth = h.plane(ra, rb, rn, rc[3], dx, y)
+            alpha, depth = h.kernel(u, v, plane_depth, ra, rb, rn, center, dx, y, focal, near)
             seen = f.both(f.above(alpha, reals(ALPHA_MIN), True), f.above(depth, reals(near), False))
             seen = f.both(seen, f.less_integers(integers(integer(k)), stop))
             if not f.any_of(seen):
@@ -460,11 +459,13 @@ def collect_simd_backward_kernel(
             grad_alpha = f.times(transmittance, q) - f.over(rest, one - alpha)
             transmittance = f.times(transmittance, one - alpha)
             # Pixels without a hit are differentiated along, by 0.
-            g0, g1, g2, gm, gc, _x, _y, _f, _n, _a, _t = wp.grad(hit_dot)(
+            gu, gv, gp, gm, go, g1, g2, gx, gy, gz = h.hit_gradients(
+                u,
+                v,
+                plane_depth,
                 ra,
                 rb,
                 rn,
-                rc[3],
                 center,
                 dx,
                 y,
@@ -476,12 +477,16 @@ def collect_simd_backward_kernel(
             slot = int(i)
             if k < gradient_slots.shape[0]:
                 slot = gradient_slots[k]
-            wp.atomic_add(grad_records, slot, 0, g0)
-            wp.atomic_add(grad_records, slot, 1, g1)
-            wp.atomic_add(grad_records, slot, 2, g2)
-            colors = vec4(inner(red_, weight), inner(green_, weight), inner(blue_, weight), gm)
+            su = inner(gu, one)
+            sv = inner(gv, one)
+            sp = inner(gp, one)
+            wp.atomic_add(grad_records, slot, 0, vec4(inner(gu, dx), su * y, su, inner(go, one)))
+            wp.atomic_add(grad_records, slot, 1, vec4(inner(gv, dx), sv * y, sv, inner(g1, one)))
+            wp.atomic_add(grad_records, slot, 2, vec4(inner(gp, dx), sp * y, sp, inner(g2, one)))
+            colors = vec4(inner(red_, weight), inner(green_, weight), inner(blue_, weight), inner(gm, one))
             wp.atomic_add(grad_records, slot, 3, colors)
             if wp.static(low_pass):
+                gc = h.center_gradient(center, focal, inner(gx, one), inner(gy, one), inner(gz, one))
                 wp.atomic_add(grad_centers, slot, gc)
             if wp.static(with_errors):
                 wp.atomic_add(error_sums, slot, inner(weight, error))

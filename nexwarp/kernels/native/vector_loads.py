@@ -1,4 +1,4 @@
-"""Vector loads. Warp reads a vector one component at a time; one wide load is what a GPU's memory wants.
+"""Vector loads and stores. Warp moves a vector one component at a time; one wide access is what a GPU's memory wants.
 
 Rows must be aligned to their own size, as rows of whole arrays from an allocator are.
 """
@@ -51,6 +51,30 @@ _LOAD_HALF4 = """
 #endif
 """
 
+# Without the strides, which rows of whole arrays do not need: the address of a row serves all four.
+_RECORD_ROW = """
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(records.data) + (4u * (unsigned)i + j));
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
+#else
+    return records.data[4 * (size_t)i + j];
+#endif
+"""
+
+_STORE_RECORD_ROW = """
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float4*>(records.data)[4u * (unsigned)i + j] = make_float4(row.c[0], row.c[1], row.c[2], row.c[3]);
+#else
+    records.data[4 * (size_t)i + j] = row;
+#endif
+"""
+
+# Gradients of arrays are in the arrays themselves on a tape, and else in an array of their own.
+_ADJOINT_STORE = """
+    if (records.grad) adj_row += records.grad[4 * (size_t)i + j];
+    else if (adj_records.data) adj_row += adj_records.data[4 * (size_t)i + j];
+"""
+
 _SNIPPETS = {
     (4, wp.float32): _LOAD_FLOAT4,
     (2, wp.float32): _LOAD_FLOAT2,
@@ -69,3 +93,27 @@ def load_function(length: int, scalar: type) -> wp.Function:
     def load(rows: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
 
     return load
+
+
+@functools.cache
+def record_row_function(real: type) -> wp.Function:
+    """Make the function that returns row j of the record i (see `surfel`), records being contiguous, (N, 4) vec4."""
+    row = wp.types.vector(length=4, dtype=real)
+    exact = "    return records.data[4 * (size_t)i + j];"
+
+    @wp.func_native(_RECORD_ROW if real is wp.float32 else exact)
+    def record_row(records: wp.array2d(dtype=row), i: wp.int32, j: wp.int32) -> row: ...
+
+    return record_row
+
+
+@functools.cache
+def store_record_row_function(real: type) -> wp.Function:
+    """Make the function that writes row j of the record i; differentiable."""
+    row_type = wp.types.vector(length=4, dtype=real)
+    exact = "    records.data[4 * (size_t)i + j] = row;"
+
+    @wp.func_native(_STORE_RECORD_ROW if real is wp.float32 else exact, adj_snippet=_ADJOINT_STORE)
+    def store_record_row(records: wp.array2d(dtype=row_type), i: wp.int32, j: wp.int32, row: row_type): ...
+
+    return store_record_row

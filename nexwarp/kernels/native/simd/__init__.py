@@ -23,9 +23,10 @@ def simd_functions(real: type, width: int, for_gradients: bool = False) -> Simpl
 
     Returns:
         `reals`, the type of values (`real` itself for width 1), and the differentiable functions splat(x),
-        scaled(s, a), times(a, b), over(a, b), power_of_e(v), logarithm(v), inner(a, b) to a scalar, at_least(a, low),
-        at_most(a, high), below(a, b) to a mask, pick(mask, a, b). For widths over 1 also `integers`, the type of masks
-        and of whole numbers, `integer`, an element of it, as wide as `real`, and the rest of `mask_functions`.
+        scaled(s, a), times(a, b), over(a, b), power_of_e(v), power_of_2(v), binary_logarithm(v), inner(a, b) to a
+        scalar, at_least(a, low), at_most(a, high), below(a, b) to a mask, pick(mask, a, b). With width 1, powers of 2
+        and binary logarithms have no derivative. For widths over 1 also `integers`, the type of masks and of whole
+        numbers, `integer`, an element of it, as wide as `real`, and the rest of `mask_functions`.
     """
     if width == 1:
         return _scalar_functions(real)
@@ -41,7 +42,38 @@ def simd_functions(real: type, width: int, for_gradients: bool = False) -> Simpl
     )
 
 
+# Base 2 is what a GPU has instructions for: base e would multiply by ln 2 before or after each. Accurate to 2 units in
+# the last place, as Warp's `fast_math` makes of base e.
+_EXP2 = """
+#if defined(__CUDA_ARCH__)
+    float result;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(v));
+    return result;
+#else
+    return ::exp2f(v);
+#endif
+"""
+
+_LOG2 = """
+#if defined(__CUDA_ARCH__)
+    float result;
+    asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(v));
+    return result;
+#else
+    return ::log2f(v);
+#endif
+"""
+
+
 def _scalar_functions(real: type) -> SimpleNamespace:
+    exp2, log2 = ("    return ::exp2(v);", "    return ::log2(v);") if real is wp.float64 else (_EXP2, _LOG2)
+
+    @wp.func_native(exp2)
+    def power_of_2(v: real) -> real: ...
+
+    @wp.func_native(log2)
+    def binary_logarithm(v: real) -> real: ...
+
     @wp.func
     def splat(x: real):
         return x
@@ -61,10 +93,6 @@ def _scalar_functions(real: type) -> SimpleNamespace:
     @wp.func
     def power_of_e(v: real):
         return wp.exp(v)
-
-    @wp.func
-    def logarithm(v: real):
-        return wp.log(v)
 
     @wp.func
     def below(a: real, b: real):
@@ -90,7 +118,8 @@ def _scalar_functions(real: type) -> SimpleNamespace:
         over=over,
         inner=times,
         power_of_e=power_of_e,
-        logarithm=logarithm,
+        power_of_2=power_of_2,
+        binary_logarithm=binary_logarithm,
         below=below,
         pick=pick,
         at_least=at_least,

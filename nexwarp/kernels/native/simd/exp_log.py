@@ -3,11 +3,14 @@
 Clang knows no SIMD form of either. In float32 they are polynomials (Cephes), right to 2 units in the last place.
 """
 
+import math
 from types import SimpleNamespace
 
 import warp as wp
 
 from nexwarp.kernels.native.simd.snippets import TYPES, filled
+
+LN_2 = f"(REAL){math.log(2.0)!r}"
 
 # Without the instruction, a fused product and sum would be a call a lane.
 _MADD = """
@@ -16,6 +19,20 @@ _MADD = """
 #else
     #define MADD(a, b, c) ((a) * (b) + (c))
 #endif
+"""
+
+# Of r, |r| <= ln 2 / 2; then p * 2^n.
+_EXP_REDUCED = """
+        p = MADD(r, (reals_t)1.9875691500e-4f, (reals_t)1.3981999507e-3f);
+        p = MADD(p, r, (reals_t)8.3334519073e-3f);
+        p = MADD(p, r, (reals_t)4.1665795894e-2f);
+        p = MADD(p, r, (reals_t)1.6666665459e-1f);
+        p = MADD(p, r, (reals_t)5.0000001201e-1f);
+        p = MADD(p, r * r, r + 1.0f);
+        const integers_t power = (__builtin_convertvector(n, integers_t) + 127) << 23;
+        reals_t scale;
+        __builtin_memcpy(&scale, &power, sizeof(scale));
+        p = p * scale;
 """
 
 _EXP = (
@@ -28,22 +45,28 @@ _EXP = (
         x = x < (reals_t)-87.0f ? (reals_t)-87.0f : x;
         const reals_t n = __builtin_elementwise_floor(MADD(x, (reals_t)1.44269504088896341f, (reals_t)0.5f));
         const reals_t r = MADD(n, (reals_t)2.12194440e-4f, MADD(n, (reals_t)-0.693359375f, x));
-        p = MADD(r, (reals_t)1.9875691500e-4f, (reals_t)1.3981999507e-3f);
-        p = MADD(p, r, (reals_t)8.3334519073e-3f);
-        p = MADD(p, r, (reals_t)4.1665795894e-2f);
-        p = MADD(p, r, (reals_t)1.6666665459e-1f);
-        p = MADD(p, r, (reals_t)5.0000001201e-1f);
-        p = MADD(p, r * r, r + 1.0f);
-        const integers_t power = (__builtin_convertvector(n, integers_t) + 127) << 23;
-        reals_t scale;
-        __builtin_memcpy(&scale, &power, sizeof(scale));
-        p = p * scale;
-    }
 """
+    + _EXP_REDUCED
+    + "    }"
+)
+
+_EXP2 = (
+    _MADD
+    + """
+    reals_t x, p;
+    __builtin_memcpy(&x, &v, sizeof(x));
+    {
+        x = x > (reals_t)127.0f ? (reals_t)127.0f : x;
+        x = x < (reals_t)-126.0f ? (reals_t)-126.0f : x;
+        const reals_t n = __builtin_elementwise_floor(x + 0.5f);
+        const reals_t r = (x - n) * 0.693147180559945309f;
+"""
+    + _EXP_REDUCED
+    + "    }"
 )
 
 # x - x is 0, but NaN for infinities and NaN, which the bits alone would not show.
-_LOG = (
+_LOG2 = (
     _MADD
     + """
     reals_t x, p;
@@ -68,8 +91,8 @@ _LOG = (
         p = MADD(p, m, (reals_t)2.0000714765e-1f);
         p = MADD(p, m, (reals_t)-2.4999993993e-1f);
         p = MADD(p, m, (reals_t)3.3333331174e-1f);
-        p = MADD(p, m * z, MADD(e, (reals_t)-2.12194440e-4f, z * -0.5f));
-        p = MADD(e, (reals_t)0.693359375f, m + p) + (x - x);
+        p = MADD(p, m * z, z * -0.5f) + m;
+        p = MADD(p, (reals_t)1.44269504088896341f, e) + (x - x);
     }
 """
 )
@@ -96,10 +119,11 @@ _ADJOINT = """
 
 
 def exp_log_functions(real: type, width: int) -> SimpleNamespace:
-    """Make power_of_e(v) and logarithm(v)."""
+    """Make power_of_e(v), power_of_2(v) and binary_logarithm(v)."""
     reals = wp.types.vector(length=width, dtype=real)
-    wide = real is wp.float64
-    exp_body, log_body = (_EXACT.replace("FUNCTION", f"::{f}") for f in ("exp", "log")) if wide else (_EXP, _LOG)
+    exp_body, exp2_body, log2_body = _EXP, _EXP2, _LOG2
+    if real is wp.float64:
+        exp_body, exp2_body, log2_body = (_EXACT.replace("FUNCTION", f"::{f}") for f in ("exp", "exp2", "log2"))
 
     def snippet(*parts: str, **replaced: str) -> str:
         return filled("".join((TYPES, *parts)), real, width, **replaced)
@@ -107,7 +131,12 @@ def exp_log_functions(real: type, width: int) -> SimpleNamespace:
     @wp.func_native(snippet(exp_body, _RETURN), adj_snippet=snippet(exp_body, _ADJOINT, DERIVATIVE="g * p"))
     def power_of_e(v: reals) -> reals: ...
 
-    @wp.func_native(snippet(log_body, _RETURN), adj_snippet=snippet(log_body, _ADJOINT, DERIVATIVE="g / x"))
-    def logarithm(v: reals) -> reals: ...
+    @wp.func_native(snippet(exp2_body, _RETURN), adj_snippet=snippet(exp2_body, _ADJOINT, DERIVATIVE=f"g * p * {LN_2}"))
+    def power_of_2(v: reals) -> reals: ...
 
-    return SimpleNamespace(power_of_e=power_of_e, logarithm=logarithm)
+    @wp.func_native(
+        snippet(log2_body, _RETURN), adj_snippet=snippet(log2_body, _ADJOINT, DERIVATIVE=f"g / (x * {LN_2})")
+    )
+    def binary_logarithm(v: reals) -> reals: ...
+
+    return SimpleNamespace(power_of_e=power_of_e, power_of_2=power_of_2, binary_logarithm=binary_logarithm)

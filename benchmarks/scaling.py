@@ -1,0 +1,278 @@
+"""Training on several GPUs: time of a step, of its communication, and how much of that the backward pass hides.
+
+    python -m benchmarks.scaling --ranks 1 2 4 --scene SCENE --surfels 400000
+    python -m benchmarks.scaling --ranks 1 2 --scene SCENE --train 30000          # PSNR at equal views seen
+    python -m benchmarks.scaling --simulate --step-ms 6 --surfels 400000          # more GPUs than there are, on paper
+
+Each rank renders one view a step, so that weak scaling (as many views a step as ranks) and strong scaling (a run of
+equally many views) are the same measurement: the speed-up is the number of ranks times the efficiency, the time of a
+step of one rank divided by that of a step of all.
+"""
+
+import dataclasses
+import json
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+import warp as wp
+from torch import nn
+
+from benchmarks.timing import git_commit, synchronize
+from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.distributed.launch import launch
+from nexwarp.distributed.ranks import Ranks
+from nexwarp.distributed.reducer import GradientReducer
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train.config import Config
+from nexwarp.train.densify import split_surfels
+from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import parse_settings, with_settings
+from nexwarp.train.trainer import Trainer
+
+DEMO = "demo"
+LATE = 26_000  # an iteration of 30,000 after density control, with SH of degree 3
+CHUNKS = 5
+# Bytes a second that leave a GPU over NVLink 4: 450 GB/s in each direction (NVIDIA's data sheet of the H100), of which
+# an all-reduce is assumed to reach 80 %. Of the network's rate, 90 % are assumed.
+NVLINK, NVLINK_SHARE, NETWORK_SHARE = 450e9, 0.8, 0.9
+# Seconds that the two collectives of a step take beside their bytes; assumed.
+NVLINK_LATENCY, NETWORK_LATENCY = 20e-6, 50e-6
+NODE = 8  # GPUs of a node
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Measure training on several GPUs."""
+
+    ranks: tuple[int, ...] = (1, 2)
+    """Numbers of ranks; each is measured in turn."""
+    scene: str = DEMO
+    """Folder of a scene, or `demo`."""
+    surfels: int = 40_000
+    """Number of surfels of the timed steps; largest number of a training."""
+    steps: int = 100
+    """Timed steps."""
+    train: int = 0
+    """Train for so many views and evaluate, instead of timing steps."""
+    modes: tuple[str, ...] = ("captured", "beside", "eager")
+    """How steps run on CUDA: all-reduce inside the CUDA graph, after it, or no graph. A CPU has only `eager`."""
+    device: str = "cuda"
+    """Device: cuda or cpu."""
+    backend: str | None = None
+    """Backend of the gradients; default nccl on CUDA, gloo on a CPU or with --share-gpu."""
+    share_gpu: bool = False
+    """Let all ranks use the first GPU: a check of the program, not of its speed."""
+    settings: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = ()
+    """Further settings, KEY=VALUE."""
+    simulate: bool = False
+    """Print the time of a step on 1 to 64 GPUs by the formulas of docs/gpus.md."""
+    step_ms: float = 6.0
+    """With --simulate: milliseconds of a step on one GPU."""
+    hidden_ms: float = 2.0
+    """With --simulate: milliseconds of the backward pass after the grid's gradient is complete."""
+    table: int = 2**20
+    """With --simulate: entries of each of the grid's levels."""
+    gbits: float = 100.0
+    """With --simulate: Gbit/s of a node's network; 3200 is that of a DGX H100, 8 adapters of 400."""
+    worker: bool = False
+    """Internal: this process is a rank."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    given = sys.argv[1:] if arguments is None else arguments
+    options = tyro.cli(Scaling, args=given, description=__doc__)
+    wp.config.log_level = wp.LOG_ERROR
+    if options.simulate:
+        print(simulate(options.step_ms, options.hidden_ms, options.surfels, options.table, options.gbits))
+        return 0
+    if options.worker:
+        work(options)
+        return 0
+    codes = []
+    for count in options.ranks:
+        print(f"{count} ranks ...", file=sys.stderr, flush=True)
+        codes.append(launch(count, ["-m", "benchmarks.scaling", *given, "--worker"]))
+    return max(codes)
+
+
+def work(options: Scaling) -> None:
+    """Measure as one of several ranks; rank 0 prints a line of JSON for each mode."""
+    import os
+
+    local = 0 if options.share_gpu else int(os.environ["LOCAL_RANK"])
+    device = torch.device("cuda", local) if options.device == "cuda" else torch.device("cpu")
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        wp.set_device(f"cuda:{local}")
+    backend = options.backend or ("gloo" if options.share_gpu else None)
+    with Ranks.join(device, {}, backend=backend) as ranks:
+        scene = load_scene(demo_folder() if options.scene == DEMO else options.scene)
+        for mode in options.modes if device.type == "cuda" else ("eager",):
+            if mode == "captured" and ranks.backend != "nccl":
+                continue
+            found = trained(options, scene, mode, ranks) if options.train else timed(options, scene, mode, ranks)
+            facts = {
+                "ranks": ranks.size,
+                "mode": mode,
+                "backend": ranks.backend,
+                "scene": Path(options.scene).name,
+                "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+                "commit": git_commit(),
+            }
+            if ranks.first:
+                print(json.dumps(facts | found), flush=True)
+
+
+def make_trainer(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> Trainer:
+    """Return a trainer; a single rank has that of `nexwarp train`."""
+    config = with_settings(preset("default"), DEMO_SETTINGS) if options.scene == DEMO else preset("default")
+    config = dataclasses.replace(config, max_surfels=options.surfels, cuda_graphs=mode != "eager")
+    if options.train:
+        config = dataclasses.replace(config, iterations=options.train)
+    config = with_settings(config, parse_settings(options.settings))
+    if ranks.size == 1:
+        return Trainer(scene, config, ranks.device)
+    return ParallelTrainer(scene, config, ranks.device, ranks, beside=mode == "beside")
+
+
+def trained(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, object]:
+    """Train and evaluate."""
+    trainer = make_trainer(options, scene, mode, ranks)
+    trainer.run()
+    # All ranks finish, alike on a CPU; each uses its own result for its share of the test views.
+    results = evaluate(trainer.finish(), scene.test, ranks=ranks)
+    return {
+        "views": trainer.iteration,
+        "surfels": len(trainer.surfels),
+        "psnr": round(results["psnr"], 3),
+        "ssim": round(results["ssim"], 5),
+        "seconds": round(trainer.seconds, 2),
+        "views_per_second": round(trainer.iteration / trainer.seconds, 1),
+    }
+
+
+def timed(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, object]:
+    """Time steps, the same steps without communication, and the communication alone."""
+    trainer = make_trainer(options, scene, mode, ranks)
+    config: Config = trainer.config
+    while (count := len(trainer.surfels)) < options.surfels:
+        chosen = torch.arange(min(count, options.surfels - count), device=ranks.device)
+        split_surfels(trainer.surfels, trainer.optimizer, chosen)
+    trainer.densifier.errors = torch.zeros_like(trainer.surfels.logit_opacities.detach())
+    trainer.iteration = round(LATE / 30_000 * config.iterations)
+    found: dict[str, object] = {"surfels": len(trainer.surfels), "step_ms": step_ms(trainer, options.steps)}
+    if isinstance(trainer, ParallelTrainer):
+        found["bytes"] = trainer.reducer.bytes_sent
+        found["communication_ms"] = communication_ms(trainer, options.steps)
+        with silent(trainer):
+            found["step_without_communication_ms"] = step_ms(trainer, options.steps)
+        exposed = float(str(found["step_ms"])) - float(str(found["step_without_communication_ms"]))
+        found["hidden_share"] = round(1 - exposed / float(str(found["communication_ms"])), 3)
+    found["views_per_second"] = round(1000 * ranks.size / float(str(found["step_ms"])), 1)
+    return found
+
+
+def step_ms(trainer: Trainer, steps: int) -> float:
+    """Return the median over chunks of the mean time of a step."""
+    times = []
+    for chunk in range(CHUNKS + 1):  # the first one captures graphs
+        synchronize(trainer.device)
+        trainer.ranks.barrier()
+        start = time.perf_counter()
+        for _ in range(max(steps // CHUNKS, 1)):
+            trainer.step()
+        synchronize(trainer.device)
+        if chunk:
+            times.append((time.perf_counter() - start) / max(steps // CHUNKS, 1))
+    return round(1000 * statistics.median(times), 4)
+
+
+def communication_ms(trainer: ParallelTrainer, repeats: int) -> float:
+    """Return the median time of the all-reduce of a step's gradients, with nothing else running."""
+    parameters = [x for group in trainer.optimizer.param_groups for x in group["params"]]
+    times = []
+    for _ in range(3 + min(repeats, 30)):
+        for parameter in parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        synchronize(trainer.device)
+        trainer.ranks.barrier()
+        start = time.perf_counter()
+        trainer.reducer.finish(parameters, trainer.densifier.errors)
+        synchronize(trainer.device)
+        times.append(time.perf_counter() - start)
+    trainer.optimizer.zero_grad(set_to_none=True)
+    return round(1000 * statistics.median(times[3:]), 4)
+
+
+class SilentReducer(GradientReducer):
+    """Keeps each rank's gradients as they are."""
+
+    def __init__(self) -> None:
+        super().__init__(None)
+
+    def finish(self, parameters: Sequence[nn.Parameter], sums: torch.Tensor | None) -> torch.Tensor | None:
+        """Return the sums."""
+        return sums
+
+
+@contextmanager
+def silent(trainer: ParallelTrainer) -> Iterator[None]:
+    """Let a trainer's steps send nothing; its replicas are no longer the same."""
+    before, trainer.reducer = trainer.reducer, SilentReducer()
+    overlapped, before.overlapped = before.overlapped, False
+    if trainer.graphs is not None:
+        trainer.graphs.clear()
+    yield
+    trainer.reducer, before.overlapped = before, overlapped
+    if trainer.graphs is not None:
+        trainer.graphs.clear()
+
+
+def gradient_bytes(surfels: int, table: int, levels: int = 8, features: int = 4) -> tuple[int, int]:
+    """Return the bytes of the two buckets: the grid's, and those of surfels (60 numbers each) and MLP."""
+    return 4 * levels * table * features, 4 * (60 * surfels + 64 * 32 + 64 * 64 + 48 * 64)
+
+
+def simulate(step: float, hidden: float, surfels: int, table: int, gbits: float) -> str:
+    """Return a table of the time of a step on 1 to 64 GPUs.
+
+    A ring or tree all-reduce of B bytes over n ranks sends 2 B (n - 1) / n from each. Nodes first reduce inside, then
+    each of their GPUs exchanges its share with those of other nodes, over the node's network. The grid's bucket is
+    hidden behind at most `hidden` milliseconds of the backward pass; nothing hides the other.
+
+    Args:
+        step: milliseconds of a step on one GPU.
+        hidden: milliseconds of the backward pass after the grid's gradient is complete.
+        surfels: how many there are.
+        table: entries of each of the grid's 8 levels of 4 features.
+        gbits: Gbit/s of a node's network.
+    """
+    nvlink, network = NVLINK * NVLINK_SHARE, gbits * 1e9 / 8 * NETWORK_SHARE
+    lines = ["GPUs  nodes  communication ms  not hidden ms  step ms  efficiency  speed-up"]
+    for count in (1, 2, 4, 8, 16, 32, 64):
+        nodes, inside = max(count // NODE, 1), min(count, NODE)
+        early, late = (
+            1000 * (2 * size * (inside - 1) / inside / nvlink + 2 * size * (nodes - 1) / nodes / network)
+            for size in gradient_bytes(surfels, table)
+        )
+        fixed = 1000 * ((count > 1) * NVLINK_LATENCY + (nodes > 1) * NETWORK_LATENCY)
+        exposed = max(early - hidden, 0) + late + fixed
+        efficiency = step / (step + exposed)
+        lines.append(
+            f"{count:4d}  {nodes:5d}  {early + late + fixed:16.2f}  {exposed:13.2f}  {step + exposed:7.2f}"
+            f"  {efficiency:10.3f}  {count * efficiency:8.1f}"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

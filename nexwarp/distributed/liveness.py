@@ -1,0 +1,156 @@
+"""How ranks end: the death of one ends all within seconds, and one line in all is printed.
+
+Each rank waits, in a thread, for a farewell from rank 0, and rank 0 for one from each other rank. A rank that fails
+says so in it. The system closes the connections of a dead process at once, which ends the wait with an error.
+"""
+
+import os
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import torch
+import torch.distributed as dist
+
+from nexwarp.distributed.join import Place, first_present, is_rank, open_store
+from nexwarp.errors import NexwarpError
+
+EXIT_CODE = 3
+ORDERLY, FAILED = 0, 1  # farewells
+PARENT_SECONDS = 1.0
+# For the thread that waits for the other ranks to find which one has died, after a message to it has failed.
+GRACE_SECONDS = 3.0
+STORE_SECONDS = 3.0
+# What gloo and NCCL say when the process at the other end is gone.
+LOST = re.compile(r"gloo|nccl|connection (closed|reset|refused)|broken pipe|socket", re.I)
+
+_current: "Liveness | None" = None
+
+
+class Liveness:
+    """Watches the other ranks.
+
+    Attributes:
+        leaving: whether this rank is about to end, so that the end of others is no error.
+        speaks: whether it is for this rank to print why all end.
+    """
+
+    def __init__(self, place: Place, group: dist.ProcessGroup, names: list[str], hint: str) -> None:
+        """Begin to watch.
+
+        Args:
+            place: of this rank.
+            group: of all ranks, which nobody else uses.
+            names: of the ranks' processes.
+            hint: added to the message when a rank has died.
+        """
+        global _current
+        self.place, self.group, self.names, self.hint = place, group, names, hint
+        self.leaving = self.speaks = False
+        self.partners = list(range(1, place.size)) if place.rank == 0 else [0]
+        self.store = open_store(STORE_SECONDS, host=False)
+        self.ended = threading.Event()
+        self.threads = [_started(self._wait_for, partner) for partner in self.partners]
+        if "TORCHELASTIC_RUN_ID" in os.environ:
+            self.threads.append(_started(self._watch_parent, os.getppid()))
+        _current = self
+
+    def close(self) -> None:
+        """Say farewell and wait for the others'."""
+        global _current
+        self.leaving = True
+        for partner in self.partners:
+            dist.send(torch.tensor([ORDERLY]), partner, group=self.group)
+        self.ended.set()
+        for thread in self.threads:  # one that held the group at the interpreter's end would abort it
+            thread.join()
+        _current = None
+
+    def fail(self, error: BaseException) -> None:
+        """Note that this rank ends with an error; decide whether it is for this rank to print it.
+
+        An error that follows from the death of another rank is not: the thread that waits for that rank ends the
+        process meanwhile.
+        """
+        if isinstance(error, RuntimeError) and not isinstance(error, NexwarpError) and LOST.search(str(error)):
+            time.sleep(GRACE_SECONDS)
+        self.leaving = True
+        self.speaks = self._claim(default=True)
+        self._tell_failure()
+
+    def _tell_failure(self) -> None:
+        for partner in self.partners:
+            with suppress(RuntimeError):  # gone itself
+                dist.send(torch.tensor([FAILED]), partner, group=self.group)
+
+    def _wait_for(self, partner: int) -> None:
+        farewell = torch.tensor([ORDERLY])
+        try:
+            dist.recv(farewell, partner, group=self.group)
+        except RuntimeError:
+            self._end(f"rank {partner} ({self.names[partner]}) has ended unexpectedly, so all ranks end", partner)
+        if int(farewell) == FAILED:
+            self._end("", partner)
+
+    def _watch_parent(self, parent: int) -> None:
+        while not self.ended.wait(PARENT_SECONDS):
+            if os.getppid() != parent:
+                self._end("the process that started the ranks has ended, so all ranks end", 0)
+
+    def _end(self, why: str, lost: int) -> None:
+        """End this process because another one has ended, unless it is ending anyway.
+
+        Args:
+            why: to print; "" where another rank prints it.
+            lost: the rank that has ended.
+        """
+        if self.leaving:
+            return
+        if why and self._claim(default=self.place.rank == (0 if lost else 1)):
+            shown = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a progress bar hides the cursor
+            sys.stdout.write(shown)
+            sys.stderr.write(f"nexwarp: error: {why}{self.hint}\n")
+        if self.place.rank == 0:
+            self._tell_failure()
+        finish_process(EXIT_CODE)
+
+    def _claim(self, *, default: bool) -> bool:
+        """Return True on one rank only; `default` where the store is gone."""
+        try:
+            mine = str(self.place.rank).encode()
+            return self.store.compare_set("fault", "", mine.decode()) == mine
+        except RuntimeError:
+            return default
+
+
+def _started(work: Callable[[int], None], argument: int) -> threading.Thread:
+    thread = threading.Thread(target=work, args=(argument,), name="liveness", daemon=True)
+    thread.start()
+    return thread
+
+
+def may_speak() -> bool:
+    """Whether this process may print why it ends: always where it is alone, on one rank where it is not."""
+    if _current is not None:
+        return _current.speaks
+    return not is_rank() or os.environ["RANK"] == str(first_present())
+
+
+def end_process(code: int) -> int:
+    """Return an exit code, or end the process with it at once if it is a rank that has not parted from the others.
+
+    The threads that wait for other ranks would disturb an ordinary exit.
+    """
+    if _current is not None:
+        finish_process(code)
+    return code
+
+
+def finish_process(code: int) -> None:
+    """End the process at once, after its output."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(code)

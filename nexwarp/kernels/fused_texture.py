@@ -1,0 +1,231 @@
+"""Texturing on tensor cores: lookup in the hash grid (paper Eq. 2), MLP and SH in one kernel each way.
+
+For L * F = 32 features of F = 2 or 4, two hidden layers of 64, and half-precision tables, matrices and activations,
+summed in float32. A warp takes 16 neighbouring pixels, a tile, and one hit of each at a time: 16 points are the rows
+of every product. Tiles are 8 x 2 pixels of an image, or 16 x 1 where the height is 1. `unit` = tile * K + hit, and the
+place of a point in what the kernels hand to each other is unit * 16 + row.
+
+Columns of the first matrix are permuted so that a lane looks up whole levels of its two points and finds its features
+in its own fragments; rows of the last one, so that a lane has all channels of the SH coefficients q, q + 4, q + 8, ...
+of its two points. `logical_feature` and `logical_output` name what stands where. Lower SH degrees have zeros in the
+last matrix.
+
+    fused_forward    writes colours and, for the backward pass, the features as fragments (64 bytes a point)
+    fused_backward   repeats the hidden layers from the features. Written: gradients of the features (L, places, F),
+                     and of the matrices, in permuted order, a slot for each block. Four warps of a block share the
+                     sums of matrix gradients: each holds a fourth of them and reads all four's activations
+    fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is 8 x 4 pixels, a thread a
+                     point. On a CPU atomics are none: one thread launches it whole
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from nexwarp.kernels.native.fused_texture import WARPS, backward_text, forward_text
+
+FORWARD_THREADS, BACKWARD_THREADS = 256, 32 * WARPS  # of a block
+# Blocks that a multiprocessor holds at least, for which the compiler limits registers.
+FORWARD_BLOCKS, BACKWARD_BLOCKS = 3, 3
+
+Half, Word = wp.array(dtype=wp.float16), wp.array(dtype=wp.int32)
+Real, Vec3 = wp.array(dtype=wp.float32), wp.array(dtype=wp.vec3)
+
+
+@wp.func_native("""
+    union { int bits; float value; } power;
+    power.bits = (exponent + 127) << 23;
+    return power.value;
+""")
+def power_of_two(exponent: wp.int32) -> wp.float32:
+    """Return 2^exponent, exactly."""
+    ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def half_scale(
+    first: wp.int32,
+    largest: Real,
+    target: wp.float32,
+    # outputs
+    scale: Real,
+    unscale: Real,
+):
+    """Power of two that brings `largest` near `target`, and its inverse."""
+    exponent = wp.clamp(int(wp.floor(wp.log2(target / wp.max(largest[0], 1.0e-30)))), -24, 60)
+    scale[first + wp.tid()] = power_of_two(exponent)
+    unscale[first + wp.tid()] = power_of_two(-exponent)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def pack_matrices(
+    first: wp.int32,
+    matrix1: Real,
+    matrix2: Real,
+    matrix3: Real,
+    sources: Word,
+    # outputs
+    packed: wp.array(dtype=wp.float16),
+):
+    """Gather the matrices' values, one matrix after another; what lies after the last one is 0."""
+    i = first + wp.tid()
+    source = sources[i]
+    value = float(0.0)
+    if source < matrix1.shape[0]:
+        value = matrix1[source]
+    else:
+        source -= matrix1.shape[0]
+        if source < matrix2.shape[0]:
+            value = matrix2[source]
+        else:
+            source -= matrix2.shape[0]
+            if source < matrix3.shape[0]:
+                value = matrix3[source]
+    packed[i] = wp.float16(value)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def order_gradients(
+    first: wp.int32,
+    sums: Real,
+    order: Word,
+    unscale: Real,
+    # outputs
+    gradients: Real,
+):
+    """Put the matrices' gradients into the order of the matrices' values."""
+    i = first + wp.tid()
+    gradients[i] = sums[order[i]] * unscale[0]
+
+
+@functools.cache
+def fused_kernels(features: int) -> SimpleNamespace:
+    """Make the kernels of the forward pass and of the backward pass down to the features, for F = 2 or 4.
+
+    Both take threads = 32 times a number of warps, on a CPU the number of warps, which share out the tiles.
+    """
+
+    @wp.func_native(forward_text(features))
+    def forward(
+        thread: wp.int32,
+        threads: wp.int32,
+        table: Half,
+        mask: wp.uint32,
+        positions: Vec3,
+        depths: Real,
+        directions: Vec3,
+        resolutions: Real,
+        focal: Real,
+        packed: Word,
+        width: wp.int32,
+        height: wp.int32,
+        hits: wp.int32,
+        shift: wp.int32,
+        offset: wp.float32,
+        clamp: wp.int32,
+        encoded: Word,
+        colors: Vec3,
+    ): ...
+
+    @wp.func_native(backward_text(features))
+    def backward(
+        thread: wp.int32,
+        threads: wp.int32,
+        encoded: Word,
+        directions: Vec3,
+        packed: Word,
+        width: wp.int32,
+        height: wp.int32,
+        hits: wp.int32,
+        shift: wp.int32,
+        scale: Real,
+        colors: Vec3,
+        grad_colors: Vec3,
+        grad_encoded: Word,
+        grad_matrices: Real,
+    ): ...
+
+    @wp.kernel(
+        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
+    )
+    def fused_forward(
+        first: wp.int32,
+        threads: wp.int32,
+        table: Half,
+        mask: wp.uint32,
+        positions: Vec3,
+        depths: Real,
+        directions: Vec3,
+        resolutions: Real,
+        focal: Real,
+        packed: Word,
+        width: wp.int32,
+        height: wp.int32,
+        hits: wp.int32,
+        shift: wp.int32,
+        offset: wp.float32,
+        clamp: wp.int32,
+        # outputs
+        encoded: Word,
+        colors: Vec3,
+    ):
+        forward(
+            first + wp.tid(),
+            threads,
+            table,
+            mask,
+            positions,
+            depths,
+            directions,
+            resolutions,
+            focal,
+            packed,
+            width,
+            height,
+            hits,
+            shift,
+            offset,
+            clamp,
+            encoded,
+            colors,
+        )
+
+    @wp.kernel(
+        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
+    )
+    def fused_backward(
+        first: wp.int32,
+        threads: wp.int32,
+        encoded: Word,
+        directions: Vec3,
+        packed: Word,
+        width: wp.int32,
+        height: wp.int32,
+        hits: wp.int32,
+        shift: wp.int32,
+        scale: Real,
+        colors: Vec3,
+        grad_colors: Vec3,
+        # outputs
+        grad_encoded: Word,
+        grad_matrices: Real,
+    ):
+        backward(
+            first + wp.tid(),
+            threads,
+            encoded,
+            directions,
+            packed,
+            width,
+            height,
+            hits,
+            shift,
+            scale,
+            colors,
+            grad_colors,
+            grad_encoded,
+            grad_matrices,
+        )
+
+    return SimpleNamespace(forward=fused_forward, backward=fused_backward)

@@ -1,0 +1,383 @@
+"""Frames as CUDA graphs: a frame's launches are captured once and replayed for any camera of the same image size.
+
+A frame launches about a hundred small kernels, which keeps a slow host busy for longer than the GPU. What differs from
+one frame to the next, the camera and the background, is copied into tensors that the graph reads. The graph also reads
+the model's own parameters, so that changes in place show at once. Whatever else changes, such as the options, the
+number of surfels or a parameter that is replaced, needs another graph: the first frame after it is launched kernel by
+kernel, the next one is captured. Both do the same arithmetic on the same numbers.
+
+Where a frame cannot be captured, it is launched kernel by kernel: on a CPU, with gradients, in float64, with a depth
+jitter, of very large images (which keep the GPU busy anyway), and where memory does not suffice.
+"""
+
+import dataclasses
+import logging
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from nexwarp import ops
+from nexwarp.camera import Camera, StagedCamera
+from nexwarp.errors import OutOfMemoryError
+from nexwarp.memory import needed_memory
+from nexwarp.model.options import RenderOptions
+from nexwarp.render import Color, Rendering, background_numbers
+from nexwarp.representation.detail_limits import DetailLimits
+from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.surfels import Surfels
+from nexwarp.representation.texture import NeuralTexture
+
+log = logging.getLogger(__name__)
+
+# Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room.
+MOST_GRAPHS = 4
+# Kinds of frames that are remembered to have been launched once.
+MOST_SEEN = 16
+# Of one frame, pixels times max(K, 1).
+MOST_POINTS = 2**23
+# How often to start again without any graph when memory does not suffice.
+CHANCES = 3
+
+FIELDS = frozenset(field.name for field in dataclasses.fields(Rendering))
+_RELEASABLE = FIELDS - {"image"}
+
+Work = Callable[[Camera, torch.Tensor], Rendering]
+
+_enabled = True
+
+
+@contextmanager
+def without_graphs() -> Iterator[None]:
+    """Launch all frames, inside the context and for all threads, kernel by kernel."""
+    global _enabled
+    before, _enabled = _enabled, False
+    try:
+        yield
+    finally:
+        _enabled = before
+
+
+class FrameGraphs:
+    """The captured frames of one model on one GPU. Threads take turns."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.lock = threading.RLock()
+        self.stream = torch.cuda.Stream(device)
+        self.pool: tuple[int, int] | None = None
+        self.frames: OrderedDict[Hashable, _Frame] = OrderedDict()
+        self.seen: OrderedDict[Hashable, Hashable] = OrderedDict()
+        self.chances = CHANCES
+        # When the memory that all graphs share was last used, and on which stream.
+        self.used = torch.cuda.Event()
+        self.user: torch.cuda.Stream | None = None
+
+    def render(
+        self,
+        camera: Camera,
+        background: Color,
+        work: Work,
+        options: Hashable,
+        state: Hashable,
+        exposures: Exposures | None,
+    ) -> Rendering | None:
+        """Render by a graph.
+
+        Args:
+            camera: on the GPU or the CPU, its pose in float32.
+            background: of the frame.
+            work: renders for a camera and a background (3,); called to capture.
+            options: whatever the frame's kind depends on beside the camera's size and near depth.
+            state: whatever the launches of `work` depend on beside its kind.
+            exposures: those that `work` multiplies the image by.
+
+        Returns:
+            The rendering; None if it is to be launched kernel by kernel.
+        """
+        kind = (options, camera.width, camera.height, camera.near)
+        with self.lock:
+            frame = self.frames.get(kind)
+            if frame is None or frame.state != state or not self.chances:
+                self.frames.pop(kind, None)
+                if self.seen.get(kind) != state or not self.chances:
+                    self.seen[kind] = state
+                    self.seen.move_to_end(kind)
+                    while len(self.seen) > MOST_SEEN:
+                        self.seen.popitem(last=False)
+                    return None
+                while len(self.frames) >= MOST_GRAPHS:
+                    self.frames.popitem(last=False)
+                frame = self._capture(camera, work, exposures, state)
+                if frame is None:
+                    return None
+                self.frames[kind] = frame
+            self.frames.move_to_end(kind)
+            rendering, held = frame.replay(camera, background, exposures)
+            if not held:
+                # This rendering is right, but slow, as the next one by this graph would be.
+                del self.frames[kind]
+            return rendering
+
+    def _capture(self, camera: Camera, work: Work, exposures: Exposures | None, state: Hashable) -> "_Frame | None":
+        """Return the captured frame; None if that is not possible."""
+        try:
+            return _Frame(self, camera, work, exposures, state)
+        except Exception as error:
+            memory = isinstance(error, OutOfMemoryError) or needed_memory(error) is not None
+            log.debug("frames are launched kernel by kernel: %s", error)
+        # Outside of the handler: the error's traceback would keep alive what has been allocated.
+        self.clear()
+        self.chances = self.chances - 1 if memory else 0
+        return None
+
+    def clear(self) -> bool:
+        """Drop all graphs and free their memory; return whether there were any."""
+        with self.lock:
+            had = bool(self.frames)
+            self.frames.clear()
+            self.pool = None
+            if had:
+                torch.cuda.empty_cache()
+            return had
+
+    @contextmanager
+    def using(self) -> Iterator[None]:
+        """Use the graphs' memory on the current stream, after all earlier uses."""
+        stream = torch.cuda.current_stream(self.stream.device)
+        if self.user is not None and self.user != stream:
+            stream.wait_event(self.used)
+            for frame in self.frames.values():
+                # Their memory is for other use only when this stream is done with it, too.
+                for x in frame.staged:
+                    x.record_stream(stream)
+        yield
+        self.user = stream
+        self.used.record(stream)
+
+
+class _Frame:
+    """One captured frame: the tensors that it reads, the graph, and the results that each replay overwrites."""
+
+    @torch.inference_mode(False)  # later frames write to its tensors in any mode
+    @torch.no_grad()
+    def __init__(
+        self, graphs: FrameGraphs, camera: Camera, work: Work, exposures: Exposures | None, state: Hashable
+    ) -> None:
+        self.graphs, self.state = graphs, state
+        device = graphs.stream.device
+        # Pose (4, 4), intrinsics (3, 3), two focal lengths and the background, so that one copy brings them all.
+        self.numbers = torch.zeros(32, device=device)
+        self.matrices, self.scalars, self.background = self.numbers[:25], self.numbers[25:30], self.numbers[27:30]
+        falloff = None if exposures is None else exposures.falloff_of(camera)
+        self.lens: Hashable = None
+        self.camera = StagedCamera(
+            self.numbers[:16].view(4, 4),
+            self.numbers[16:25].view(3, 3),
+            camera.width,
+            camera.height,
+            camera.near,
+            checked=(camera.fx, camera.fy, camera.cx, camera.cy),
+            focals=self.numbers[25:27],
+            falloff=None if falloff is None else falloff.clone(),
+        )
+        self.staged = [x for x in (self.numbers, self.camera.falloff) if x is not None]
+        if graphs.pool is None:
+            graphs.pool = torch.cuda.graph_pool_handle()
+        self.graph = torch.cuda.CUDAGraph()
+        with graphs.using(), ops.captured(self.graph, graphs.stream, graphs.pool):
+            self.result = work(self.camera, self.background)
+        self.room = self.result.intermediates.tiles.room
+        self.latest: weakref.ref[CapturedRendering] | None = None
+
+    def replay(
+        self, camera: Camera, background: Color, exposures: Exposures | None
+    ) -> "tuple[CapturedRendering, bool]":
+        """Render another camera; what the rendering before still holds is copied for it first.
+
+        Returns:
+            The rendering, and whether the lists of surfels have held all entries, as far as is known.
+        """
+        if self.latest is not None and (latest := self.latest()) is not None:
+            latest.take_buffers()
+        with self.graphs.using():
+            self._stage(camera, background, exposures)
+            self.graph.replay()
+            rendering = CapturedRendering.of(self)
+            held = ops.held(self.room)
+        self.latest = weakref.ref(rendering)
+        return rendering, held
+
+    def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
+        """Copy what differs from one frame to the next into the tensors that the graph reads."""
+        color = [0.0] * 3
+        if not isinstance(background, torch.Tensor):
+            color = background_numbers(background, self.numbers.dtype)
+        # From pageable memory, which is read before the copy returns.
+        scalars = torch.tensor([camera.focal, camera.pixel_focal, *color])
+        matrices = [camera.viewmat.detach().reshape(-1), camera.K.detach().to(self.numbers.dtype).reshape(-1)]
+        if camera.device.type == "cpu":
+            self.numbers[:30].copy_(torch.cat([*matrices, scalars]), non_blocking=True)
+        else:
+            torch.cat(matrices, out=self.matrices)
+            self.scalars.copy_(scalars, non_blocking=True)
+        if isinstance(background, torch.Tensor):
+            self.background.copy_(background.detach().expand(3))
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if self.camera.falloff is not None and self.lens != lens:
+            assert exposures is not None
+            falloff = exposures.falloff_of(camera)
+            assert falloff is not None
+            self.camera.falloff.copy_(falloff)
+            self.lens = lens
+
+
+class CapturedRendering(Rendering):
+    """A rendering by a graph. All but the image is copied from the graph's memory when it is first asked for.
+
+    A rendering that is still there when the graph is replayed gets its copies before.
+    """
+
+    frame: "_Frame | None"
+
+    @classmethod
+    def of(cls, frame: _Frame) -> "CapturedRendering":
+        """Return the rendering that the graph was last replayed for."""
+        rendering = cls.__new__(cls)
+        rendering.__dict__.update(image=frame.result.image.clone(), frame=frame)
+        return rendering
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _RELEASABLE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self.take_buffers()
+        return self.__dict__[name]
+
+    def take_buffers(self) -> None:
+        """Copy all buffers from the graph's memory, unless that has been done."""
+        frame = self.__dict__["frame"]
+        if frame is None:
+            return
+        with frame.graphs.lock:
+            if self.__dict__["frame"] is None:  # another thread was faster
+                return
+            with frame.graphs.using(), torch.inference_mode(False), torch.no_grad():
+                copies: dict[int, torch.Tensor] = {}
+                for name in _RELEASABLE:
+                    self.__dict__[name] = _copied(getattr(frame.result, name), copies)
+            self.__dict__["frame"] = None
+
+    def __reduce__(self) -> Any:
+        return Rendering, tuple(getattr(self, field.name) for field in dataclasses.fields(Rendering))
+
+
+def _copied(value: Any, copies: dict[int, torch.Tensor]) -> Any:
+    """Copy a tensor, or a dataclass with all tensors in it; a tensor that occurs twice is copied once."""
+    if isinstance(value, torch.Tensor):
+        if id(value) not in copies:
+            copies[id(value)] = value.clone()
+        return copies[id(value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+        return type(value)(**{name: _copied(part, copies) for name, part in fields.items()})
+    return value
+
+
+class Parts(NamedTuple):
+    """What a frame reads beside its camera and background."""
+
+    surfels: Surfels
+    texture: NeuralTexture | None
+    exposures: Exposures | None
+    detail_limits: DetailLimits | None
+
+    def tensors(self) -> list[torch.Tensor]:
+        """Return parameters and buffers of all parts."""
+        return [x for part in self if part is not None for x in _tensors_of(part)]
+
+    def state(self, tensors: list[torch.Tensor]) -> Hashable:
+        """What the launches of a frame depend on beside its kind; changes of values in place do not count."""
+        texture, exposures, products = self.texture, self.exposures, torch.backends.cuda.matmul
+        return (
+            *((x.data_ptr(), x.shape) for x in tensors),
+            texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
+            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
+            exposures and exposures.lens,
+            self.detail_limits is None,
+            torch.are_deterministic_algorithms_enabled(),
+            products.allow_tf32,
+            products.allow_fp16_reduced_precision_reduction,
+        )
+
+
+# By their surfels, which several models may share; released with them.
+_graphs: "weakref.WeakKeyDictionary[nn.Module, FrameGraphs]" = weakref.WeakKeyDictionary()
+_graphs_lock = threading.Lock()
+
+
+def render_by_graph(
+    work: Work, parts: Parts, options: RenderOptions, camera: Camera, background: Color
+) -> Rendering | None:
+    """Return a rendering without gradients and without depth jitter; None if it is to be launched kernel by kernel.
+
+    Args:
+        work: renders for a camera and a background, with the parts and options.
+        parts: of the model.
+        options: of the rendering; the background counts instead of theirs.
+        camera: on the GPU or the CPU.
+        background: of the frame.
+    """
+    device = parts.surfels.device
+    if not _enabled or device.type != "cuda":
+        return None
+    tensors = parts.tensors()
+    if not _can_capture(device, tensors, options, camera, background):
+        return None
+    with _graphs_lock:
+        graphs = _graphs.get(parts.surfels)
+        if graphs is None or graphs.stream.device != device:
+            graphs = _graphs[parts.surfels] = FrameGraphs(device)
+    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture)
+    return graphs.render(camera, background, work, kind, parts.state(tensors), parts.exposures)
+
+
+def release_graphs() -> bool:
+    """Drop the graphs of all models and free their memory; return whether there were any."""
+    with _graphs_lock:
+        everything = list(_graphs.values())
+    return any([graphs.clear() for graphs in everything])
+
+
+def _can_capture(
+    device: torch.device, tensors: list[torch.Tensor], options: RenderOptions, camera: Camera, background: Color
+) -> bool:
+    """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
+    if camera.width * camera.height * max(options.max_hits, 1) > MOST_POINTS or isinstance(camera, StagedCamera):
+        return False
+    if camera.viewmat.dtype != torch.float32 or camera.device not in (device, torch.device("cpu")):
+        return False
+    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in tensors):
+        return False
+    differentiated = [*tensors, camera.viewmat]
+    if isinstance(background, torch.Tensor):
+        given = (background.dtype, background.device, *background.shape)
+        if given not in ((torch.float32, device), (torch.float32, device, 3)):
+            return False
+        differentiated.append(background)
+    if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
+        return False
+    return not torch.cuda.is_current_stream_capturing()
+
+
+def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
+    """Return parameters and buffers; torch's own iterators take a tenth of a small frame's time."""
+    found = [x for x in (*module._parameters.values(), *module._buffers.values()) if x is not None]
+    for child in module._modules.values():
+        if child is not None:
+            found += _tensors_of(child)
+    return found

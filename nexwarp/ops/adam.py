@@ -1,0 +1,76 @@
+"""One step of Adam on one parameter, in place, with a regulariser and a half-precision copy."""
+
+import math
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from nexwarp.kernels.adam import VALUES, adam_kernel
+from nexwarp.ops._interop import array, launch
+
+
+class Moments(NamedTuple):
+    """What Adam keeps of a parameter.
+
+    Attributes:
+        step: () float32, number of steps.
+        mean: of the parameter's shape, exponential average of gradients.
+        square: likewise of squared gradients.
+    """
+
+    step: torch.Tensor
+    mean: torch.Tensor
+    square: torch.Tensor
+
+
+def adam_step(
+    parameter: torch.Tensor,
+    grad: torch.Tensor | None,
+    moments: Moments,
+    rate: torch.Tensor,
+    *,
+    betas: tuple[float, float],
+    epsilon: float,
+    factors: torch.Tensor | None = None,
+    half: torch.Tensor | None = None,
+) -> torch.Tensor | None:
+    """Update a parameter and its averages in place, as `torch.optim.Adam` does, to float32 rounding.
+
+    Args:
+        parameter: float32, contiguous.
+        grad: of its shape; None is zero.
+        moments: of the parameter; their `step` is the number of this step, from 1.
+        rate: () float32, learning rate.
+        betas: decay of the two averages.
+        epsilon: added to the denominator.
+        factors: (L,) adds the gradient of sum_l factors[l] sum(H_l^2); the parameter is then a grid H (L, T, F) whose
+            T * F is a power of two.
+        half: of its shape, float16, becomes the new values.
+
+    Returns:
+        With `factors`, that sum before the step, a scalar; None without.
+    """
+    count = parameter.numel()
+    threads = -(-count // VALUES)
+    level_bits, losses = 0, parameter.new_empty(0)
+    if factors is not None:
+        level_bits = (count // len(parameter)).bit_length() - 1
+        if parameter.is_cuda:
+            threads = -(-threads // 32) * 32  # whole warps, which add up what their lanes have
+        losses = parameter.new_empty(threads // 32 if parameter.is_cuda else threads)
+    given = [None if grad is None else _aligned(grad).view(-1), factors]
+    nothing = parameter.new_empty(0)
+    inputs = [*(array(nothing if x is None else x, wp.float32) for x in given), level_bits]
+    inputs += [array(x.view(1), wp.float32) for x in (moments.step, rate)]
+    inputs += [*betas, *(1.0 - beta for beta in betas), *(math.log(beta) for beta in betas), epsilon]
+    outputs = [array(x.view(-1), wp.float32) for x in (parameter, moments.mean, moments.square)]
+    outputs += [array(nothing.half() if half is None else half.view(-1), wp.float16), array(losses, wp.float32)]
+    launch(parameter, adam_kernel(), threads, inputs, outputs)
+    return None if factors is None else losses.sum()
+
+
+def _aligned(tensor: torch.Tensor) -> torch.Tensor:
+    """Return a contiguous tensor whose address is a multiple of 16 bytes, which loads of four values need."""
+    tensor = tensor.contiguous()
+    return tensor.clone() if tensor.data_ptr() % 16 else tensor

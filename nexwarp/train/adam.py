@@ -1,0 +1,89 @@
+"""Adam in one kernel for each parameter, which regularises the hash grid and keeps its half-precision copy."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from nexwarp.ops.adam import Moments, adam_step
+from nexwarp.representation.texture import NeuralTexture
+from nexwarp.train.losses import LossWeights
+
+
+class FusedAdam(torch.optim.Adam):
+    """Adam whose step is one kernel a parameter; state, groups and checkpoints are those of `torch.optim.Adam`.
+
+    Weight decay, AMSGrad and maximisation are not among its options. Parameters are float32.
+
+    Attributes:
+        grid_loss: the regulariser's value before the last step; None without one.
+    """
+
+    def __init__(self, groups: list[dict[str, Any]], *, eps: float) -> None:
+        """Make an optimizer.
+
+        Args:
+            groups: parameter groups; their learning rates are tensors on the parameters' device.
+            eps: added to the denominator.
+        """
+        capturable = all(group["lr"].is_cuda for group in groups)
+        super().__init__(groups, eps=eps, fused=True, capturable=capturable)
+        self.grid_loss: torch.Tensor | None = None
+        self._texture: NeuralTexture | None = None
+        self._factors: torch.Tensor | None = None
+
+    def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:
+        """Take over a texture's grid: keep its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
+
+        Args:
+            texture: whose grid is among the parameters.
+            factors: (L,) factors; None adds nothing.
+        """
+        self._texture, self._factors = texture, factors
+        texture.half_copy()  # before any step is captured
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        """Do one step; gradients stay as they are."""
+        if closure is not None:
+            raise TypeError("closure: expected None; a loss is evaluated once a step")
+        grid = None if self._texture is None else self._texture.grid
+        steps: list[torch.Tensor] = []
+        work = []
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                factors = self._factors if parameter is grid else None
+                if parameter.grad is None and factors is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+                    state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter) for _ in range(2))
+                steps.append(state["step"])
+                work.append((group, parameter, state, factors))
+        if steps:
+            torch._foreach_add_(steps, 1)
+        self.grid_loss = None
+        for group, parameter, state, factors in work:
+            loss = adam_step(
+                parameter.detach(),
+                parameter.grad,
+                Moments(state["step"], state["exp_avg"], state["exp_avg_sq"]),
+                group["lr"],
+                betas=group["betas"],
+                epsilon=group["eps"],
+                factors=factors,
+                half=self._texture.half_copy() if self._texture is not None and parameter is grid else None,
+            )
+            self.grid_loss = self.grid_loss if loss is None else loss
+
+
+def grid_factors(texture: NeuralTexture, weights: LossWeights, cells_unit: float) -> torch.Tensor | None:
+    """Return the factors (L,) of the grid's loss, of which `losses.grid_loss` has 1 / s^3; None where it is not used.
+
+    Args:
+        texture: whose resolutions count.
+        weights: whose `grid` counts.
+        cells_unit: world units in which the loss counts its cells.
+    """
+    return weights.grid / (texture.resolutions * cells_unit) ** 3 if weights.grid > 0 else None

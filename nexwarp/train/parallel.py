@@ -1,0 +1,207 @@
+"""Training on several ranks: each renders another view, and all keep the same bits.
+
+A step has one view for each rank. Gradients are averaged, and the surfels' error sums added, before the parameters
+change, so that all ranks change them alike. `Config.iterations` and all schedules count views, not steps.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from nexwarp.data import Scene
+from nexwarp.distributed.ranks import Ranks
+from nexwarp.distributed.reducer import GradientReducer
+from nexwarp.errors import DivergedError, RankError, SceneError
+from nexwarp.train.adam import FusedAdam
+from nexwarp.train.config import Config
+from nexwarp.train.graphs import Gradients, StepResult
+from nexwarp.train.schedules import OptimizerMaker
+from nexwarp.train.state import Snapshot
+from nexwarp.train.step_losses import OwnLoss
+from nexwarp.train.target import Target
+from nexwarp.train.trainer import Trainer
+
+
+class ParallelTrainer(Trainer):
+    """A training run on several ranks, each of which has one of these; all methods of `Trainer` are collective.
+
+    Views are drawn in one order, which all ranks know, so that each epoch sees each view once. The random numbers of a
+    view follow from the seed and its place in the training, whatever rank renders it. All other choices, such as which
+    surfels split, come from generators that are alike on all ranks. Rank 0 writes and reads checkpoints; a checkpoint
+    can be resumed on any number of ranks.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        device: torch.device | str,
+        ranks: Ranks,
+        *,
+        losses: Mapping[str, OwnLoss] | None = None,
+        optimizer: OptimizerMaker | None = None,
+        beside: bool | None = None,
+    ) -> None:
+        """Make the same initial surfels and texture on all ranks.
+
+        Args:
+            scene: what to learn from, the same on all ranks.
+            config: settings, the same on all ranks.
+            device: of this rank.
+            ranks: all ranks.
+            losses: see `Trainer`.
+            optimizer: see `Trainer`.
+            beside: sum gradients after a CUDA graph instead of inside; None does where the backend cannot be captured.
+
+        Raises:
+            SceneError: there are fewer training views than ranks.
+            RankError: scene or settings differ between ranks.
+        """
+        if len(scene.train) < ranks.size:
+            raise SceneError(
+                f"{scene.path}: expected at most as many ranks as training views, {len(scene.train)}, got {ranks.size}"
+            )
+        super().__init__(scene, config, device, losses=losses, optimizer=optimizer)
+        self.ranks = ranks
+        ranks.check_same(
+            {
+                "settings": hashlib.sha256(json.dumps(config.as_dict(), sort_keys=True).encode()).hexdigest()[:12],
+                "training cameras": self.views.fingerprint()[:12],
+                "scene": self._scene_digest[:12],
+                "background": str(self.background),
+            }
+        )
+        # The same already, unless the ranks' processors round differently.
+        ranks.share_tensors(x for _, x in self._named_parameters())
+        self.texture.drop_half_copy()
+        self.beside = self.graphs is not None and (ranks.backend != "nccl" if beside is None else beside)
+        self.reducer = GradientReducer(self.texture.grid if config.max_hits else None)
+        self.reducer.overlapped = not self.beside
+        self.targets.generator, self.targets.noise = torch.Generator(), torch.Generator(self.device)
+        self.share = 1.0 / ranks.size
+        scale_for_batch(self.optimizer, ranks.size)
+
+    def _next_target(self) -> Target:
+        ranks, first = self.ranks, self.iteration
+        self.views_a_step = max(1, min(ranks.size, self.config.iterations - first))
+        chosen = [self._next_view() for _ in range(self.views_a_step)]
+        # Where views of the last step are fewer than ranks, the others repeat one with weight 0.
+        self.share = 1.0 / self.views_a_step if ranks.rank < self.views_a_step else 0.0
+        mine = ranks.rank % self.views_a_step
+        self.iteration += self.views_a_step
+        for offset, generator in enumerate((self.targets.generator, self.targets.noise)):
+            generator.manual_seed(view_seed(self.config.seed, first + mine + 1, offset))
+        upcoming = self.order[-1 - ranks.rank :: -ranks.size][:2]
+        return self.targets.make(chosen[mine], self.iteration, upcoming)
+
+    def _run_step(self, target: Target) -> StepResult:
+        result = super()._run_step(target)
+        if result.gradients is not None:
+            gradients, errors = result.gradients
+            for parameter, gradient in zip(self._trained(), gradients, strict=True):
+                parameter.grad = gradient  # summed in place: the next replay overwrites it
+            try:
+                self._reduce(errors)
+            finally:
+                self.optimizer.zero_grad(set_to_none=True)
+            if isinstance(self.optimizer, FusedAdam) and self.optimizer.grid_loss is not None:
+                result = result._replace(losses=result.losses | {"grid": self.optimizer.grid_loss})
+        return result
+
+    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
+        return loss * self.share
+
+    def _update(self, errors: torch.Tensor | None) -> Gradients | None:
+        if self.beside:
+            return Gradients([x.grad for x in self._trained()], errors)
+        self._reduce(errors)
+        return None
+
+    def _reduce(self, errors: torch.Tensor | None) -> None:
+        if errors is not None and self.share == 0:
+            errors = torch.zeros_like(errors)
+        super()._update(self.reducer.finish(self._trained(), errors))
+
+    def _trained(self) -> list[nn.Parameter]:
+        return [x for group in self.optimizer.param_groups for x in group["params"]]
+
+    def _graph_key(self) -> Hashable:
+        return super()._graph_key(), self.share
+
+    def check(self) -> None:
+        """Raise DivergedError, the same one on all ranks, unless all numbers are finite.
+
+        Raises:
+            RankError: parameters differ between ranks.
+        """
+        fault: DivergedError | None = None
+        try:
+            super().check()
+        except DivergedError as error:
+            fault = error
+        sums = [x.detach().view(torch.int32).sum(dtype=torch.int64) for _, x in self._named_parameters()]
+        mine = {"fault": None if fault is None else [str(fault), fault.report], "sums": torch.stack(sums).tolist()}
+        told = self.ranks.gather(mine)
+        sums_of_first: object = None
+        for rank, theirs in enumerate(told):
+            assert isinstance(theirs, dict)
+            sums_of_first = theirs["sums"] if rank == 0 else sums_of_first
+            if theirs["fault"] is not None:
+                raise DivergedError(*theirs["fault"])
+            if theirs["sums"] != sums_of_first:
+                raise RankError(
+                    f"rank {rank}: its parameters at iteration {self.iteration:,} differ from those of rank 0"
+                )
+
+    def _write(self, run: Path, snapshot: Snapshot) -> None:
+        if self.ranks.first:
+            super()._write(run, snapshot)
+
+    def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
+        from safetensors.torch import load, save
+
+        snapshot = super()._read(run, warn) if self.ranks.first else None
+        content = None if snapshot is None else save(snapshot.tensors)
+        state = self.ranks.share(None if snapshot is None else snapshot.state)
+        assert isinstance(state, dict)
+        return Snapshot(load(self.ranks.share_bytes(content)), state)
+
+    def load_snapshot(self, snapshot: Snapshot) -> None:
+        """Return to a snapshot of this run, on whatever number of ranks it was taken."""
+        super().load_snapshot(snapshot)
+        scale_for_batch(self.optimizer, self.ranks.size)
+
+
+def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
+    """Change the rates of a fresh optimizer from those for single views to those for a mean over several.
+
+    The square-root rule for Adam (Malladi et al. 2022, On the SDEs and scaling rules for adaptive gradient algorithms):
+    rates are multiplied by the square root of the number of views, and moments forget as much in a step as in that
+    many steps of one view. Other optimizers keep their other settings.
+
+    Args:
+        optimizer: as `make_optimizer` makes it.
+        views: of a step.
+    """
+    for group in optimizer.param_groups:
+        first, last = group["ends"]
+        group["ends"] = first * math.sqrt(views), last * math.sqrt(views)
+        if isinstance(optimizer, torch.optim.Adam):
+            group["betas"] = tuple(beta**views for beta in group["betas"])
+
+
+def view_seed(seed: int, number: int, stream: int) -> int:
+    """Return the seed of a view's random numbers.
+
+    Args:
+        seed: of the training.
+        number: of the view among all that the training sees, from 1.
+        stream: number of the generator.
+    """
+    digest = hashlib.blake2b(f"{seed} {number} {stream}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 1  # manual_seed takes 63 bits

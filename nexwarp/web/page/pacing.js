@@ -1,0 +1,41 @@
+// The resolution of the picture follows the time that frames take: coarse while moving, full at rest.
+
+const MOVING_MILLISECONDS = 28; // wanted time of a frame while moving
+const COARSEST = 0.2;
+const REST_MILLISECONDS = 180; // without a change, before the picture is refined
+const REDUCED = 0.7; // below this resolution, the texture is evaluated more coarsely first
+
+export class Pacing {
+  constructor() {
+    this.scale = 0.5; // until frames have been timed
+    this.fixed = null; // a resolution that the user has chosen
+    this.milliseconds = null;
+    this.changed = -Infinity;
+  }
+
+  // Note that the camera or the mode has changed.
+  touch() {
+    this.changed = performance.now();
+  }
+
+  get moving() {
+    return performance.now() - this.changed < REST_MILLISECONDS;
+  }
+
+  // What renderers take for the next frame.
+  get options() {
+    if (this.fixed !== null) return {resolutionScale: this.fixed};
+    if (!this.moving) return {resolutionScale: 1};
+    const slow = this.scale < REDUCED;
+    return {resolutionScale: this.scale, textureScale: slow ? 0.5 : 1, leastWeight: slow ? 1 / 64 : 0};
+  }
+
+  // Learn from a frame. The time is about proportional to the number of pixels, with a part that is not.
+  took(milliseconds, {resolutionScale}) {
+    this.milliseconds = this.milliseconds === null ? milliseconds : 0.7 * this.milliseconds + 0.3 * milliseconds;
+    if (this.fixed !== null) return;
+    const wanted = resolutionScale * Math.sqrt(MOVING_MILLISECONDS / Math.max(milliseconds, 1));
+    const step = Math.min(Math.max(wanted / this.scale, 0.6), 1.25);
+    this.scale = Math.min(Math.max(this.scale * step ** 0.5, COARSEST), 1);
+  }
+}

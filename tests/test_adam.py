@@ -1,0 +1,144 @@
+"""Our Adam takes torch's steps, regularises the grid as the loss does, and shares its checkpoints."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.train.adam import FusedAdam, grid_factors
+from nexwarp.train.config import TextureConfig
+from nexwarp.train.losses import LossWeights, grid_loss
+from nexwarp.train.state import gather_optimizer, restore_optimizer
+from nexwarp.train.trainer import Trainer
+from tests.tolerances import assert_close
+
+WEIGHTS = LossWeights(grid=0.01)
+RATES = {"small": 1e-2, "odd": 3e-3, "grid": 1e-1}
+
+
+def make_parameters(device: torch.device) -> tuple[nw.NeuralTexture, dict[str, torch.nn.Parameter]]:
+    texture = nw.NeuralTexture(4, 2**6, 2, 4.0, 64.0).to(device)
+    with torch.no_grad():
+        texture.grid.uniform_(-1, 1)
+    others = {"small": torch.nn.Parameter(torch.randn(3, device=device))}
+    others["odd"] = torch.nn.Parameter(torch.randn(37, 7, device=device))
+    return texture, {**others, "grid": texture.grid}
+
+
+def make_optimizer(kind: type[torch.optim.Adam], parameters: dict[str, torch.nn.Parameter]) -> torch.optim.Adam:
+    groups: list[dict[str, Any]] = [
+        {"params": [x], "lr": torch.tensor(RATES[name], device=x.device)} for name, x in parameters.items()
+    ]
+    if kind is FusedAdam:
+        return FusedAdam(groups, eps=1e-15)
+    groups = [group | {"lr": float(group["lr"])} for group in groups]
+    return torch.optim.Adam(groups, eps=1e-15)
+
+
+def test_steps_are_those_of_torch(device: torch.device) -> None:
+    torch.manual_seed(0)
+    texture, ours = make_parameters(device)
+    torch.manual_seed(0)
+    twin, theirs = make_parameters(device)
+    theirs = {name: torch.nn.Parameter(x.detach().double()) for name, x in theirs.items()}
+    optimizer, reference = make_optimizer(FusedAdam, ours), make_optimizer(torch.optim.Adam, theirs)
+    assert isinstance(optimizer, FusedAdam)
+    optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 2.0))
+    for step in range(30):
+        for name, parameter in ours.items():
+            scale = 10.0 ** (-step if name == "odd" else 0)  # gradients that fade far below the epsilon's square root
+            parameter.grad = scale * torch.randn_like(parameter)
+            theirs[name].grad = parameter.grad.double()
+        loss = WEIGHTS.grid * grid_loss(theirs["grid"], twin.resolutions.double() * 2.0)
+        loss.backward()
+        optimizer.step()
+        reference.step()
+        assert optimizer.grid_loss is not None
+        assert_close(optimizer.grid_loss, loss, kind="value", name="grid loss")
+    for name, parameter in ours.items():
+        assert_close(parameter, theirs[name], kind="value", name=name)
+        for key in ("exp_avg", "exp_avg_sq"):
+            expected = reference.state[theirs[name]][key]
+            assert_close(optimizer.state[parameter][key], expected, kind="value", name=f"{key} of {name}")
+        assert optimizer.state[parameter]["step"] == 30
+
+
+def test_half_copy_is_the_grid(device: torch.device) -> None:
+    texture, parameters = make_parameters(device)
+    optimizer = make_optimizer(FusedAdam, parameters)
+    assert isinstance(optimizer, FusedAdam)
+    optimizer.regularise(texture, None)
+    for _ in range(2):
+        texture.grid.grad = torch.randn_like(texture.grid)
+        optimizer.step()
+        assert torch.equal(texture.half_copy(), texture.grid.detach().half())
+    assert optimizer.grid_loss is None
+    with torch.no_grad():
+        texture.grid.neg_()
+    assert torch.equal(texture.half_copy(), texture.grid.detach().half())
+    texture.load_state_dict({**texture.state_dict(), "grid": torch.ones_like(texture.grid)})
+    assert (texture.half_copy() == 1).all()
+
+
+def test_parameters_without_a_gradient_stay(device: torch.device) -> None:
+    """But for the regularised grid, which has the regulariser's."""
+    texture, parameters = make_parameters(device)
+    before = {name: x.detach().clone() for name, x in parameters.items()}
+    optimizer = make_optimizer(FusedAdam, parameters)
+    assert isinstance(optimizer, FusedAdam)
+    optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 1.0))
+    optimizer.step()
+    assert torch.equal(parameters["small"], before["small"]) and parameters["small"] not in optimizer.state
+    assert (
+        parameters["grid"].abs() < before["grid"].abs()
+    ).float().mean() > 0.9  # Adam's first step has the rate's size
+    with pytest.raises(TypeError, match=r"^closure: expected None"):
+        optimizer.step(lambda: 0.0)
+
+
+@pytest.mark.parametrize("kinds", [(FusedAdam, torch.optim.Adam), (torch.optim.Adam, FusedAdam)], ids=["new", "old"])
+def test_checkpoints_are_those_of_torch(kinds: tuple[type[torch.optim.Adam], ...], device: torch.device) -> None:
+    """Each continues what the other has begun."""
+    _, parameters = make_parameters(device)
+    optimizer = make_optimizer(kinds[0], parameters)
+    gradients = [{name: torch.randn_like(x) for name, x in parameters.items()} for _ in range(6)]
+
+    def run(optimizer: torch.optim.Adam, parameters: dict[str, torch.nn.Parameter], steps: slice) -> None:
+        for values in gradients[steps]:
+            for name, parameter in parameters.items():
+                parameter.grad = values[name].clone()
+            optimizer.step()
+
+    run(optimizer, parameters, slice(0, 3))
+    tensors, record = gather_optimizer(optimizer, parameters)
+    assert record is None
+    assert set(tensors) == {f"adam.{name}.{key}" for name in RATES for key in ("step", "exp_avg", "exp_avg_sq")}
+    copies = {name: torch.nn.Parameter(x.detach().clone()) for name, x in parameters.items()}
+    other = make_optimizer(kinds[1], copies)
+    restore_optimizer(other, copies, {name: x.clone() for name, x in tensors.items()}, record)
+    for made, values in ((optimizer, parameters), (other, copies)):
+        run(made, values, slice(3, 6))
+    for name, parameter in parameters.items():
+        assert_close(copies[name], parameter, kind="value", name=name)
+
+
+@pytest.mark.cuda
+def test_trainings_resume_from_torchs_adam(tmp_path: Path, tiny_scene: nw.Scene) -> None:
+    """A checkpoint written with torch's Adam and the grid's loss continues as if ours had written it."""
+    texture = TextureConfig(table_size=2**10)
+    config = nw.Config(iterations=20, max_surfels=300, texture=texture, deterministic=True)
+
+    def theirs(groups: list[dict[str, Any]]) -> torch.optim.Adam:
+        groups = [group | {"lr": torch.tensor(group["lr"], device="cuda")} for group in groups]
+        return torch.optim.Adam(groups, eps=1e-15, fused=True, capturable=True)
+
+    trainers = [Trainer(tiny_scene, config, "cuda", optimizer=make) for make in (None, theirs)]
+    trainers[1].run(until=10)
+    trainers[1].save(tmp_path)
+    trainers[0].restore(tmp_path)
+    reports = [trainer.step() for trainer in trainers]
+    assert_close(reports[0].losses["grid"], reports[1].losses["grid"], kind="value", name="grid")
+    for (name, ours), (_, torchs) in zip(*(t._named_parameters() for t in trainers), strict=True):
+        assert_close(ours, torchs, kind="value", name=name)
