@@ -310,7 +310,7 @@ class Trainer:
         return state | {"densify.errors": self.densifier.errors}
 
     def save(self, folder: str | os.PathLike[str]) -> None:
-        """Write a checkpoint, the model as it is, and the cameras into a folder, which `nexwarp view` and others open."""
+        """Write a checkpoint, the model as it is, and the cameras into a folder, which the commands open."""
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.save_checkpoint(Path(folder))
         save_model(folder, self.model())
