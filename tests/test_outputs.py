@@ -340,7 +340,7 @@ def test_targets_that_cannot_be_written(refuses: Callable[..., None], run: Path)
 
 
 def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:
-    refuses(["export", "--format", "obj"], "--format: expected one of ply, compact, cameras, got 'obj'")
+    refuses(["export", "--format", "obj"], "--format: expected one of ply, compact, cameras, web, glb, spz, got 'obj'")
     (run / "cameras.json").write_text("{}")
     refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")
     refuses(["render", "--set", "test"], "cameras.json: expected test views to render, found none")
