@@ -130,9 +130,8 @@ def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
 def test_missing_photos_are_all_named_at_once(tmp_path, kind):
     path = make_scene(tmp_path)
     if kind == "nerfstudio":
-        frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": np.eye(4).tolist()} for i in range(10)]
-        for index, frame in enumerate(frames):
-            frame["transform_matrix"][0][3] = index
+        poses = [np.eye(4) + np.outer([i, 0, 0, 0], [0, 0, 0, 1]) for i in range(10)]
+        frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": poses[i].tolist()} for i in range(10)]
         (path / "transforms.json").write_text(json.dumps({"fl_x": 40.0, "w": WIDTH, "h": HEIGHT, "frames": frames}))
         shutil.rmtree(path / "sparse")
     for name in ("03.png", "07.png"):

@@ -144,7 +144,7 @@ class Info:
     def __call__(self, console: Console) -> None:
         """Print the summary."""
         opened = open_model(self.run)
-        rows = {}
+        rows: dict[str, str] = {}
         if opened.source is not None and opened.config is not None:
             config = opened.config
             rows |= {"scene": opened.source.path, "preset": config.preset, "iterations": f"{config.iterations:,}"}

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -131,8 +132,8 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
     try:
         if detail < 1.0 and header.texture is not None:
             resolutions = tensors["texture.resolutions"]
-            shape = coarse_shape(header.texture, resolutions, len(resolutions))
-            header = dataclasses.replace(header, texture=shape)
+            shape = coarse_shape(cast(TextureShape, header.texture), resolutions, len(resolutions))
+            header = dataclasses.replace(header, texture=cast(dict[str, Json], shape))
         return _make_model(header, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         raise _no_model(path, error) from None
