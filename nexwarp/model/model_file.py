@@ -25,7 +25,7 @@ from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import BUFFERS, Exposures
 from nexwarp.representation.merged_texture import MergedTexture, make_texture
 from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.representation.texture import NeuralTexture, TextureShape
 
 FORMAT_VERSION = 1
 COMPACT_VERSION = 2  # of compact files, which older readers cannot read
