@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "requirements"
 # torch and CUDA are on their own, since many users have another build of torch, with other hashes.
 TORCH = re.compile(r"torch==|triton==|nvidia-|cuda-")
-USERS = ("--extra=viewer", "--extra=video", "--extra=tensorboard", "--extra=flip")
+USERS = ("--extra=viewer", "--extra=video", "--extra=tensorboard", "--extra=wandb", "--extra=flip")
 HEADERS = {
     "torch": "torch and its CUDA libraries.",
-    "run": "What nexwarp and its extras viewer, video, tensorboard and flip need beside torch.txt.",
+    "run": "What nexwarp and its extras viewer, video, tensorboard, wandb and flip need beside torch.txt.",
     "dev": "What the other extras need beside torch.txt and run.txt: tests, documentation, releases.",
 }
 

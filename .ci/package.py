@@ -7,6 +7,7 @@ setuptools and the other tools are those of this environment, which `constraints
 import gzip
 import io
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -14,6 +15,22 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+
+
+REPOSITORY = "nexwarp/nexwarp"
+
+
+def absolute_links(text: str) -> str:
+    """Return the README with links to the repository's files that work on PyPI, too; pictures link to their content."""
+
+    def absolute(found: re.Match[str]) -> str:
+        picture, words, target = found.groups()
+        if re.match(r"[a-z]+:|#", target):
+            return found[0]
+        base = f"raw.githubusercontent.com/{REPOSITORY}/main" if picture else f"github.com/{REPOSITORY}/blob/main"
+        return f"{picture}[{words}](https://{base}/{target})"
+
+    return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", absolute, text)
 
 
 def run(*command: str | Path, stdin: bytes = b"") -> bytes:
@@ -60,6 +77,8 @@ def main(folder: Path) -> None:
         source, unpacked = Path(work, "source"), Path(work, "unpacked")
         with tarfile.open(fileobj=io.BytesIO(run("git", "archive", "HEAD"))) as archive:
             archive.extractall(source, filter="data")
+        readme = source / "README.md"
+        readme.write_text(absolute_links(readme.read_text(encoding="utf-8")), encoding="utf-8")
         sdist = build("sdist", source, folder)
         normalise(sdist, time)
         with tarfile.open(sdist) as archive:

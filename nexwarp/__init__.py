@@ -14,6 +14,7 @@ if "RANK" in os.environ:
 from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.ray_camera import RayCamera
+from nexwarp.cli.version import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
@@ -29,8 +30,6 @@ from nexwarp.train.presets import preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
-
-__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

@@ -3,6 +3,7 @@
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from nexwarp.checks import check_range
@@ -21,8 +22,10 @@ class Camera:
     camera-frame direction ((x - cx) / fx, (y - cy) / fy, 1): distances along it, in units of that vector, are z-depths.
 
     Attributes:
-        viewmat: (4, 4) float, world to camera, a rigid motion. Rendering is differentiable with respect to it.
-        K: (3, 3) float, intrinsics in pixels, without skew; the principal point may lie outside the image.
+        viewmat: (4, 4) float, world to camera, a rigid motion. Rendering is differentiable with respect to it. A NumPy
+            array or nested lists become a float32 tensor on the CPU.
+        K: (3, 3) float, intrinsics in pixels, without skew; the principal point may lie outside the image. Arrays and
+            lists become a tensor as above, on the device of `viewmat`.
         width: image width in pixels.
         height: image height in pixels.
         near: hits with a z-depth of at most this are ignored, world units.
@@ -33,7 +36,7 @@ class Camera:
             wait for a GPU. None checks `viewmat` and `K` and takes the numbers from `K`.
 
     Raises:
-        TypeError: `viewmat` or `K` is not a floating tensor, or a number has the wrong type.
+        TypeError: `viewmat` or `K` is neither a floating tensor nor numbers, or a number has the wrong type.
         ValueError: a shape or device is wrong; a value is not finite; the translation of `viewmat` is beyond 1e16; its
             rotation is a reflection, or differs from orthonormal by more than 1e-3; `K` has skew or a focal length
             below 1e-16; a size is < 1; `near` is < 0 or beyond 1e16.
@@ -51,6 +54,9 @@ class Camera:
     cy: float = field(init=False)
 
     def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
+        if checked is None:
+            object.__setattr__(self, "viewmat", _as_tensor("viewmat", self.viewmat, None))
+            object.__setattr__(self, "K", _as_tensor("K", self.K, self.viewmat.device))
         numbers = self._check() if checked is None else checked
         for name, value in zip(("fx", "fy", "cx", "cy"), numbers, strict=True):
             object.__setattr__(self, name, value)
@@ -159,10 +165,21 @@ class StagedCamera(Camera):
         self.focals.copy_(focals.to(self.focals.dtype), non_blocking=True)
 
 
+def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.Tensor:
+    """Return a tensor as it is; an array or lists of numbers as a new float32 tensor on a device."""
+    if isinstance(value, torch.Tensor):
+        return value
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.ndim != 2:
+        raise TypeError(f"{name}: expected a torch.Tensor, an array or lists of numbers, got {type(value).__name__}")
+    return torch.tensor(numbers, dtype=torch.float32, device=device)
+
+
 def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
     """Check a finite floating (size, size) tensor and return it as float64 on the CPU."""
-    if not isinstance(tensor, torch.Tensor):
-        raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
     if tensor.shape != (size, size):

@@ -89,7 +89,12 @@ def show(panels: Sequence[ImagePanel], columns: int | None = None, width: float 
 
 def plots(count: int, height: float = 2.6, width: float = WIDTH) -> list[Axes]:
     """Axes of `count` plots side by side, with a faint grid."""
-    _, axes = plt.subplots(1, count, figsize=(width, height), squeeze=False)
+    _, axes = plt.subplots(1, count, figsize=(width, height), squeeze=False, layout="constrained")
     for axis in axes.flat:
         axis.grid(alpha=0.25)
     return list(axes.flat)
+
+
+def legend(axis: Axes) -> None:
+    """Add a legend beside a plot, where it covers no curve."""
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.3, fontsize=7)

@@ -50,7 +50,9 @@ BAD_CAMERAS = [
     ("viewmat", ValueError, torch.eye(3)),
     ("viewmat", ValueError, torch.eye(4)[None]),
     ("viewmat", TypeError, torch.eye(4).int()),
-    ("viewmat", TypeError, torch.eye(4).numpy()),
+    ("viewmat", TypeError, "eye"),
+    ("viewmat", ValueError, torch.eye(3).tolist()),
+    ("viewmat", TypeError, [[1.0, 0.0], [1.0]]),
     ("viewmat", TypeError, None),
     ("K", ValueError, changed(K, (0, 1), 0.5)),
     ("K", ValueError, changed(K, (0, 0), -20.0)),
@@ -58,7 +60,8 @@ BAD_CAMERAS = [
     ("K", ValueError, changed(K, (0, 2), float("nan"))),
     ("K", ValueError, changed(K, (2, 2), 2.0)),
     ("K", ValueError, torch.eye(4)),
-    ("K", TypeError, K.tolist()),
+    ("K", TypeError, 20.0),
+    ("K", ValueError, changed(K, (0, 2), float("nan")).numpy()),
     ("width", ValueError, 0),
     ("width", TypeError, 16.0),
     ("height", ValueError, -1),
@@ -81,6 +84,18 @@ def test_camera_accepts_rounding() -> None:
     viewmat = rigid((0.5, 0.1, -0.4, 0.2), (1.0, 2.0, 3.0)).float()
     nw.Camera(changed(viewmat, (0, 0), viewmat[0, 0].item() + 1e-4), K, 16, 16)
     nw.Camera(viewmat, changed(K, (0, 2), -100.0), 16, 16, near=0.0)
+
+
+@pytest.mark.parametrize("convert", [torch.Tensor.tolist, torch.Tensor.numpy, lambda x: x.double().numpy()])
+def test_cameras_take_arrays_and_lists(convert: Callable[[torch.Tensor], Any]) -> None:
+    viewmat = rigid((0.5, 0.1, -0.4, 0.2), (1.0, 2.0, 3.0)).float()
+    camera, expected = nw.Camera(convert(viewmat), convert(K), 16, 16), nw.Camera(viewmat, K, 16, 16)
+    for name in ("viewmat", "K"):
+        made = getattr(camera, name)
+        assert made.dtype == torch.float32 and torch.equal(made, getattr(expected, name))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (expected.fx, expected.fy, expected.cx, expected.cy)
+    made.fill_(0.0)  # a copy: the array of the caller stays
+    assert expected.K[0, 0] == 20.0
 
 
 # Surfels

@@ -1,6 +1,7 @@
 """What a stranger's files may ask for: nothing is allocated or followed before it is known to be honest."""
 
 import json
+import shutil
 import struct
 import subprocess
 import sys
@@ -92,7 +93,9 @@ def test_links_stay_in_the_scene(tmp_path):
     path = make_scene(tmp_path / "scene")
     (path / "images/03.png").unlink()
     (path / "images/03.png").symlink_to(outside)
-    refused(path, r"image name '03\.png': a link leaves .*images, expected a file in it")
+    refused(path, r"image name '03\.png': a link leaves .*images, expected a file in it; --follow-links allows it")
+    followed = load_scene(path, follow_links=True)
+    assert "03.png" in {view.name for view in followed.train}
     (path / "images/03.png").unlink()
     (path / "images/03.png").symlink_to("04.png")
     load_scene(path)
@@ -118,7 +121,32 @@ def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
     (path / "link.png").symlink_to(tmp_path / "private")
     (data if key == "ply_file_path" else frames[1])[key] = "link.png"
     (path / "transforms.json").write_text(json.dumps(data))
-    refused(path, rf"{key}.* 'link.png': a link leaves .*, expected a file in it")
+    refused(path, rf"{key}.* 'link.png': a link leaves .*, expected a file in it; --follow-links allows it")
+    if key == "file_path":  # the link leads to a picture
+        assert len(load_scene(path, follow_links=True).train) == 2
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_missing_photos_are_all_named_at_once(tmp_path, kind):
+    path = make_scene(tmp_path)
+    if kind == "nerfstudio":
+        poses = [np.eye(4) + np.outer([i, 0, 0, 0], [0, 0, 0, 1]) for i in range(10)]
+        frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": poses[i].tolist()} for i in range(10)]
+        (path / "transforms.json").write_text(json.dumps({"fl_x": 40.0, "w": WIDTH, "h": HEIGHT, "frames": frames}))
+        shutil.rmtree(path / "sparse")
+    for name in ("03.png", "07.png"):
+        (path / "images" / name).unlink()
+    named = r"2 of 10 photos: image not found: (images/)?03\.png, (images/)?07\.png"
+    with pytest.raises(FileNotFoundError, match=rf"{named}; --skip-missing goes on without them$"):
+        load_scene(path)
+    with pytest.warns(UserWarning, match=rf"{named}; going on without them$"):
+        scene = load_scene(path, skip_missing=True)
+    names = {view.name for view in scene.train + scene.test}
+    assert names == {f"{index:02d}.png" for index in range(10)} - {"03.png", "07.png"}
+    for file in sorted((path / "images").iterdir())[1:]:
+        file.unlink()
+    with pytest.raises(FileNotFoundError, match="9 of 10 photos"):
+        load_scene(path, skip_missing=True)
 
 
 def test_a_huge_photo_of_a_small_camera_is_not_decoded(tmp_path, monkeypatch):

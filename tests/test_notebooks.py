@@ -61,6 +61,16 @@ def test_outputs_are_kept(name: str) -> None:
         assert not HERE.search(text), f"a path of one machine: {text}"
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_cell_finds_the_helper_from_any_folder(name: str, tmp_path: Path) -> None:
+    setup = code_cells(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4))[0].source
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for folder in (tmp_path, ROOT, FOLDER):
+        command = [sys.executable, "-c", f"{setup}\nimport figures\nprint(figures.__file__)"]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == (f"{FOLDER / 'figures.py'}\n", ""), folder
+
+
 def test_folder_is_small() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.ipynb")) < LARGEST
 

@@ -24,6 +24,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels_ply import load_surfels_ply
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.opened import open_model
 from nexwarp.run.render_job import RenderOrder
 from nexwarp.train.config import Config
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -112,7 +113,7 @@ def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.Ca
         torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
     # The model of the caller is as it was.
     order = RenderOrder(path=None, views="test", exposure="mean")
-    order.prepare(run).render(model)
+    order.prepare(open_model(run)).render(model)
     assert model.exposures is not None
     assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))
 
@@ -339,7 +340,9 @@ def test_targets_that_cannot_be_written(refuses: Callable[..., None], run: Path)
 
 
 def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:
-    refuses(["export", "--format", "obj"], "--format: expected one of ply, mesh, compact, cameras, web, glb, spz, got 'obj'")
+    refuses(
+        ["export", "--format", "obj"], "--format: expected one of ply, mesh, compact, cameras, web, glb, spz, got 'obj'"
+    )
     (run / "cameras.json").write_text("{}")
     refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")
     refuses(["render", "--set", "test"], "cameras.json: expected test views to render, found none")
@@ -348,7 +351,7 @@ def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) ->
     (run / "model.safetensors").unlink()
     refuses(["export"], "model.safetensors")
     (run / "config.json").unlink()
-    refuses(["export"], "expected a run folder, found no config.json")
+    refuses(["export"], "expected a run folder or a model, found no config.json")
 
 
 @pytest.mark.parametrize("words", [["render"], ["export"]])

@@ -40,6 +40,7 @@ from nexwarp.model.model_file import load
 from nexwarp.run.contents import LOCK_FILE
 from nexwarp.run.export import export_run
 from nexwarp.run.folder import read_run
+from nexwarp.run.opened import open_model
 from nexwarp.train import presets
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
@@ -242,7 +243,7 @@ class RunFolders(RuleBasedStateMachine):
     def export(self, name: str, kind: str) -> None:
         slot = self.slots[name]
         try:
-            for file in export_run(self.root / name, kind, self.root / name / "export"):
+            for file in export_run(open_model(self.root / name), kind, self.root / name / "export"):
                 assert file.stat().st_size > 0
         except NexwarpError:
             assert not slot.finished or slot.damaged

@@ -246,7 +246,7 @@ BAD_SCENES = {
         r"expected image names in UTF-8, got b'\\xff3.png'",
     ),
     "name of two lines": (built(names=["a\nb.png", "a.png"]), r"image name 'a\\nb.png' leaves the images folder"),
-    "absent photo": (lacking("images/03.png"), "03.png: image not found, but the COLMAP model names it"),
+    "absent photo": (lacking("images/03.png"), "sparse/0: 1 of 10 photos: image not found: 03.png; --skip-missing"),
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
     "photos of another shape": (built(size=(36, 48)), "00.png: expected an image of 48x36 .* got 36x48"),

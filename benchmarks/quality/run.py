@@ -77,7 +77,7 @@ def train_shared_start(jobs: Sequence[TrainingJob], data: Path, row: Row, iterat
     trainer = Trainer(scene_of(jobs[0], data), config_of(jobs[0], row), _device())
     trainer.run(until=iterations)
     folder.mkdir()
-    trainer.save(folder)
+    trainer.save_checkpoint(folder)
     return SharedStart(tuple(job.row for job in jobs), iterations, folder)
 
 

@@ -15,15 +15,13 @@ from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
 from nexwarp.errors import SettingError
-from nexwarp.model.model_file import MODEL_FILE, load
+from nexwarp.model.detail import check_detail
 from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
 from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
 from nexwarp.run.export import export_mesh, export_run
-from nexwarp.run.folder import (
-    read_metrics,
-    read_run,
-)
+from nexwarp.run.folder import read_metrics
+from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.run.optics import Kind, Optics
 from nexwarp.run.render_job import RenderOrder
 from nexwarp.sfm import SfmOptions, reconstruct
@@ -39,7 +37,7 @@ class Render:
     """
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
     path: Annotated[str | None, option("{ellipse,spiral,interpolate,FILE.json}", "ellipse")] = None
     """Camera path; FILE.json is a nerfstudio camera path or a transforms.json."""
     video: Annotated[Path | None, option("FILE", "none")] = None
@@ -69,6 +67,9 @@ class Render:
     """Share of a frame's time in which the shutter is open, for motion blur along a path; 0 to 1."""
     samples: Annotated[int | None, option("N", "16")] = None
     """Renderings that are averaged for each picture, with --aperture or --shutter."""
+    detail: Annotated[float, option("SHARE")] = 1.0
+    """Share of the surfels to render with, above 0 to 1: those that make up most of the training pictures; the texture
+    is coarser below 0.5 (docs/detail.md)."""
     exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
@@ -92,11 +93,13 @@ class Render:
             optics=Optics(cast(Kind, self.camera), self.fov, self.aperture, self.focus, self.shutter, self.samples),
         )
         device = pick_device(self.device)
-        model = load(self.run).to(device)
-        job = order.prepare(self.run)
+        check_detail("--detail", self.detail)
+        opened = open_model(self.run)
+        model = opened.model_at(self.detail, device)
+        job = order.prepare(opened)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
-        console.print(f"{len(job)} pictures in {self.run / RENDERS_FOLDER}", soft_wrap=True)
+        console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}", soft_wrap=True)
         if self.video is not None:
             console.print(f"{job.seconds:.2f} s of video in {self.video}", soft_wrap=True)
 
@@ -124,7 +127,7 @@ class Export:
     """
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
     format: Annotated[str, option("{ply,mesh,compact,cameras,web,glb,spz}")] = "ply"
     """Files to write."""
     out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
@@ -144,48 +147,59 @@ class Export:
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        device, folder = pick_device(self.device), self.out or self.run / EXPORT_FOLDER
+        device = pick_device(self.device)
+        opened = open_model(self.run)
         if self.format == "mesh":
+            folder = self.out or opened.folder / EXPORT_FOLDER
             with display.stages(console) as observe:
-                files = export_mesh(self.run, folder, device, voxel=self.voxel, far=self.far, observe=observe)
+                files = export_mesh(opened, folder, device, voxel=self.voxel, far=self.far, observe=observe)
         elif self.voxel is not None or self.far is not None:
             raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
         else:
             with console.status("exporting"):
-                files = export_run(self.run, self.format, self.out, self.max_extent, self.quality, device)
+                files = export_run(opened, self.format, self.out, self.max_extent, self.quality, device)
         for file in files:
             console.print(str(file), soft_wrap=True)
 
 
 @dataclass
 class Info:
-    """Print a summary of a run."""
+    """Print a summary of a run or a model."""
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
 
     def __call__(self, console: Console) -> None:
         """Print the summary."""
-        source, config, _ = read_run(self.run)
-        rows = {"scene": source.path, "preset": config.preset, "iterations": f"{config.iterations:,}"}
-        if (self.run / MODEL_FILE).is_file():
-            model = load(self.run)
-            texture = None if model.texture is None else model.texture.config
-            rows |= {
-                "surfels": f"{len(model.surfels):,} (budget {config.max_surfels:,})",
-                "K": str(model.options.max_hits),
-                "texture": "not used"
-                if texture is None or model.options.max_hits == 0
-                else f"{texture['levels']} levels of {texture['table_size']:,}, "
-                f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
-                "exposures": describe_exposures(model),
-                "model file": f"{(self.run / MODEL_FILE).stat().st_size / 1e6:.1f} MB",
-            }
+        opened = open_model(self.run)
+        rows: dict[str, str] = {}
+        if opened.source is not None and opened.config is not None:
+            config = opened.config
+            rows |= {"scene": opened.source.path, "preset": config.preset, "iterations": f"{config.iterations:,}"}
+        if opened.file.is_file():
+            rows |= _describe_model(opened)
         else:
             rows["model"] = "none yet: the training has not finished"
-        if metrics := read_metrics(self.run):
+        if metrics := read_metrics(opened.folder):
             rows |= figures(metrics, [name for name in ("psnr", "ssim") if name in metrics])
         console.print(display.results_table(rows, str(self.run)))
+
+
+def _describe_model(opened: OpenedModel) -> dict[str, str]:
+    """Summarise a model as rows of a table."""
+    model = opened.model
+    texture = None if model.texture is None else model.texture.config
+    budget = "" if opened.config is None else f" (budget {opened.config.max_surfels:,})"
+    return {
+        "surfels": f"{len(model.surfels):,}{budget}",
+        "K": str(model.options.max_hits),
+        "texture": "not used"
+        if texture is None or model.options.max_hits == 0
+        else f"{texture['levels']} levels of {texture['table_size']:,}, "
+        f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
+        "exposures": describe_exposures(model),
+        "model file": f"{opened.file.stat().st_size / 1e6:.1f} MB",
+    }
 
 
 @dataclass

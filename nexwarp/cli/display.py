@@ -1,6 +1,7 @@
 """Display of progress and results: live lines in a terminal, occasional lines in a log file."""
 
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -23,6 +24,8 @@ from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
+SKIPPED_STEPS, TIMED_STEPS, TIMED_SECONDS = 3, 5, 2.0  # at the start of a training on a CPU
+LONG_SECONDS = 600.0  # from which a training on a CPU is announced
 
 
 def describe_exposures(model: Model) -> str:
@@ -45,6 +48,56 @@ def warn(console: Console, text: str) -> None:
     console.print(f"warning: {text}", soft_wrap=True, markup=False, highlight=False)
 
 
+@contextmanager
+def plain_warnings(console: Console) -> Iterator[None]:
+    """Print Python's warnings as `warn` does, without the place in the source."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        warn(console, str(message))
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+class CpuEstimate:
+    """Says once, after the first steps of a long training on a CPU, how long the training takes."""
+
+    def __init__(self, total: int, clock: Callable[[], float] = time.perf_counter) -> None:
+        """Prepare the estimate of a training of `total` iterations; `clock` returns seconds."""
+        self.total, self.clock = total, clock
+        self.begin: tuple[int, float] | None = None
+        self.seen, self.told = 0, False
+
+    def __call__(self, iteration: int) -> str | None:
+        """Take note of a finished iteration; return the text once it is known and the training is long."""
+        if self.told:
+            return None
+        now = self.clock()
+        self.seen += 1
+        if self.seen == SKIPPED_STEPS:  # these compile kernels
+            self.begin = (iteration, now)
+        if self.begin is None or self.seen < SKIPPED_STEPS + TIMED_STEPS or now - self.begin[1] < TIMED_SECONDS:
+            return None
+        self.told = True
+        steps, seconds = iteration - self.begin[0], now - self.begin[1]
+        left = (self.total - iteration) * seconds / steps
+        if left < LONG_SECONDS:
+            return None
+        return (
+            f"on this CPU, the training takes about {duration(left)} ({steps} steps took {seconds:.1f} s), longer as "
+            "surfels are added; a GPU, a larger --downscale or fewer --iterations are faster"
+        )
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as text, in minutes, hours or days."""
+    for unit, size in (("days", 86400.0), ("hours", 3600.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 60:.0f} minutes"
+
+
 class TrainingDisplay:
     """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
 
@@ -59,6 +112,7 @@ class TrainingDisplay:
         """
         self.console, self.total, self.done, self.device = console, total, done, device
         self.start = self.shown = time.perf_counter()
+        self.estimate = CpuEstimate(total) if device.type == "cpu" else None
         self.progress = Progress(
             TextColumn("training"),
             BarColumn(),
@@ -81,6 +135,8 @@ class TrainingDisplay:
     def __call__(self, step: StepReport) -> None:
         """Show a step; its numbers are fetched from the device only when they are shown."""
         now = time.perf_counter()
+        if self.estimate is not None and (text := self.estimate(step.iteration)) is not None:
+            self.console.print(text, soft_wrap=True, highlight=False)
         if self.console.is_terminal:
             due = now - self.shown >= REFRESH_SECONDS
         else:

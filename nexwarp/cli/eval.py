@@ -14,25 +14,26 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Run_, option
 from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
-from nexwarp.errors import SceneError
+from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import load
 from nexwarp.run.contents import METRICS_FILE, RENDERS_FOLDER
-from nexwarp.run.evaluate import evaluate
+from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.run.folder import read_metrics, read_run
+from nexwarp.run.folder import SceneSource, read_metrics
 from nexwarp.run.lock import locked_run
+from nexwarp.run.opened import OpenedModel, open_model
+from nexwarp.train.config import MASK_MODES
 
 
 @dataclass
 class Eval:
-    """Evaluate a run on the test views of its scene."""
+    """Evaluate a run on the test views of its scene, or a model on those of --scene."""
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
     scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
-    """Folder of the scene, if it has moved."""
+    """Folder of the scene, if it has moved; required for a model alone."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
     """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
     refine_poses: bool = False
@@ -43,26 +44,37 @@ class Eval:
     def __call__(self, console: Console) -> None:
         """Evaluate."""
         device = pick_device(self.device)
-        read_run(self.run)  # before a lock is written to a foreign folder
-        with locked_run(self.run, partial(display.warn, console)):
-            source, config, _ = read_run(self.run)
-            model = load(self.run).to(device)
-            if self.scene is not None:
-                source = dataclasses.replace(source, path=self.scene)
+        check_metrics(self.metrics, device)
+        opened = open_model(self.run)  # before a lock is written to a foreign folder
+        source = self._source(opened)
+        opened.folder.mkdir(exist_ok=True)
+        with locked_run(opened.folder, partial(display.warn, console)):
+            opened = open_model(self.run)  # another process may have changed it
+            model = opened.model.to(device)
             with display.loading(console) as progress:
                 scene = source.load(progress)
             results = evaluate_run(
                 model,
                 scene,
-                self.run,
+                opened.folder,
                 console,
-                mask_mode=config.mask_mode,
+                mask_mode=MASK_MODES[0] if opened.config is None else opened.config.mask_mode,
                 metrics=self.metrics,
                 refine_poses=self.refine_poses,
             )
         rows = figures(results, self.metrics)
         fitted = ", poses fitted to their photos" if self.refine_poses else ""
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views{fitted}"))
+
+    def _source(self, opened: OpenedModel) -> SceneSource:
+        """Return the scene to evaluate on."""
+        if opened.source is not None:
+            return opened.source if self.scene is None else dataclasses.replace(opened.source, path=self.scene)
+        if self.scene is None:
+            raise MissingError(
+                f"{self.run}: expected the photos to compare with, got a model alone; give --scene SCENE"
+            )
+        return SceneSource(self.scene)
 
 
 def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:

@@ -1,20 +1,26 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `sfm`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `process`, `sfm`, `warmup`."""
 
 import io
+import os
 import re
 import signal
 import sys
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stderr
+from difflib import get_close_matches
+from typing import NoReturn
 
 import tyro
 from rich.console import Console
 
+from nexwarp.cli import display
 from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
+from nexwarp.cli.process import Process
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
+from nexwarp.cli.version import __version__
 from nexwarp.cli.view import ViewCommand
 from nexwarp.distributed.launch import launch
 from nexwarp.distributed.liveness import end_process, may_speak
@@ -29,21 +35,38 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "export": Export,
     "view": ViewCommand,
     "info": Info,
+    "process": Process,
     "sfm": Sfm,
     "warmup": Warmup,
 }
 
 
+CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have
+
+
+class OutputConsole(Console):
+    """A console that raises BrokenPipeError when nobody reads its output any more; rich's own exits with 1."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        """Raise the error that is being handled."""
+        raise BrokenPipeError
+
+
 def _parse(arguments: list[str]) -> Callable[[Console], None]:
     """Return the command of the arguments; invalid ones print one line on stderr and exit with 2."""
     message = io.StringIO()
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        close = get_close_matches(arguments[0], COMMANDS, n=1, cutoff=0.5)
+        meant = f"; perhaps you meant nexwarp {close[0]}" if close else ""
+        _complain(f"error: no command {arguments[0]!r:.60}, expected one of {', '.join(COMMANDS)}{meant}", None)
+        raise SystemExit(2)
     try:
         with redirect_stderr(message):
             return tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="nexwarp",
                 description="Nexels: neurally textured surfels. Each command has its own --help. "
-                "--debug shows the full traceback of an error.",
+                "--debug shows the full traceback of an error, --version the version.",
                 args=arguments,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
@@ -77,25 +100,45 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
     0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error, or a fault of the GPU. 128
-    plus the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129). Every failure prints one line on
-    stderr.
+    plus the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129), or because nobody reads its output
+    any more (141, as of SIGPIPE). Every failure but the last prints one line on stderr.
 
     Args:
         arguments: command line without the program's name; None takes that of the process.
     """
     import warp as wp
 
-    # Hide Warp's messages about a missing CUDA driver and about the kernels that it compiles.
+    # Hide Warp's warnings, which users cannot act on.
     wp.config.log_level = wp.LOG_ERROR
     given = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in given
-    command = _parse([argument for argument in given if argument != "--debug"])
-    console = Console()
+    try:
+        return _run(given)
+    except BrokenPipeError:
+        # Otherwise Python would try to write the rest when it ends, and report that it cannot.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLOSED_PIPE
+
+
+def _run(given: list[str]) -> int:
+    """Run a command and return its exit code; BrokenPipeError if nobody reads its output any more."""
+    debug, arguments = "--debug" in given, [argument for argument in given if argument != "--debug"]
+    if arguments == ["--version"]:
+        print(f"nexwarp {__version__}", flush=True)
+        return 0
+    try:
+        command = _parse(arguments)
+    except SystemExit:
+        sys.stdout.flush()  # the text of --help
+        raise
+    console = OutputConsole()
     try:
         if isinstance(command, Train) and (count := command.starts()):
             return launch(count, [*PROGRAM, *given])
-        with stopped_by_signals():
+        with stopped_by_signals(), display.plain_warnings(console):
             command(console)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signal.SIGINT)
         hint = "; continue with --resume" if isinstance(command, Train) else ""

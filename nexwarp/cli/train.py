@@ -14,6 +14,7 @@ from nexwarp.cli import display
 from nexwarp.cli.device import joined_ranks
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
+from nexwarp.cli.process import SCENES, is_video, scene_of_video
 from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
@@ -22,8 +23,18 @@ from nexwarp.distributed.launch import check_count
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
-from nexwarp.run.folder import DEMO, SceneSource, began, claimed_run, create_run, keep_camera_path, read_run
-from nexwarp.run.log import check_tensorboard
+from nexwarp.run.folder import (
+    DEMO,
+    SceneSource,
+    began,
+    claimed_run,
+    create_run,
+    keep_camera_path,
+    prepare_run,
+    read_run,
+    rewrite_config,
+)
+from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
@@ -39,7 +50,8 @@ class Train:
     """Train a scene, evaluate it on its test views, and write everything to a run folder."""
 
     scene: Scene_
-    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
+    """Folder of a COLMAP, nerfstudio or Blender scene, `demo` for the built-in one (docs/scenes.md), or a video, which
+    first becomes the scene scenes/NAME as with `nexwarp process`."""
     run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
     """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
@@ -62,6 +74,10 @@ class Train:
     """PLY file of the initial points."""
     format: Annotated[str | None, option("{colmap,nerfstudio,blender}", "detected")] = None
     """Format of the scene, for a folder that holds several."""
+    follow_links: bool = False
+    """Allow photos that symbolic links lead to outside of SCENE, as with DVC, git-annex and caches of hubs."""
+    skip_missing: bool = False
+    """Train without photos that do not exist; they are named."""
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     refine_poses: bool = False
@@ -84,7 +100,8 @@ class Train:
     """Number of GPUs of this machine to train on, each in a process of its own; with --device cpu, of processes.
     `torchrun` starts the same on several machines (docs/gpus.md)."""
     resume: bool = False
-    """Continue the run in --run with its settings; other options must agree with them."""
+    """Continue the run in --run with its settings; other options must agree with them. Only --iterations may be larger:
+    schedules are then those of the longer run (docs/resume.md)."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of the run")] = None
     """Iterations between checkpoints; the last two are kept."""
     overwrite: bool = False
@@ -97,6 +114,8 @@ class Train:
     """Port of --view; 0 picks a free one."""
     tensorboard: bool = False
     """Also log to RUN/tensorboard, for `tensorboard --logdir runs` (extra `tensorboard`)."""
+    wandb: bool = False
+    """Also log to Weights & Biases, by the same names (extra `wandb`); WANDB_MODE=offline needs no account."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -112,13 +131,18 @@ class Train:
         return self.gpus
 
     def _train(self, ranks: Ranks, console: Console) -> None:
+        if is_video(self.scene):
+            # Rank 0 makes the scene; the others find it.
+            made = str(self._scene_of_video(console)) if ranks.first else None
+            self.scene = str(ranks.share(made)) if ranks.size > 1 else str(made)
         run = self.run or Path("runs") / self._source().name
         with ExitStack() as claim:
             source, config, resume = self._plan(run, ranks, claim, console)
             trainer = self._trainer(source, config, ranks, resume, console)
-            session = TrainingSession(trainer, run, console, tensorboard=self.tensorboard, every=self.checkpoint_every)
+            session = TrainingSession(trainer, run, console, sinks=self._sinks(), every=self.checkpoint_every)
             if resume:
                 session.resume()
+                self._extend(run, trainer, console)
             else:
                 session.check_room()
                 if self.resume:
@@ -134,6 +158,19 @@ class Train:
                 if viewer is not None:
                     viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
+
+    def _extend(self, run: Path, trainer: Trainer, console: Console) -> None:
+        """Write a larger --iterations into the run to resume, and say what it does."""
+        if not trainer.ranks.first:
+            return
+        before = read_run(run)[1].iterations
+        if trainer.config.iterations > before:
+            rewrite_config(run, trainer.config)
+            console.print(
+                f"extended from {before:,} to {trainer.config.iterations:,} iterations: from here on, learning rates, "
+                "density control and all other schedules are those of a run of that length",
+                soft_wrap=True,
+            )
 
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[SceneSource, Config, bool]:
         """Claim the run folder, on rank 0; return scene, settings and whether to resume, the same on all ranks."""
@@ -170,14 +207,18 @@ class Train:
         config = self._with_background(config, scene, resume)
         return Trainer(scene, config, device) if ranks.size == 1 else ParallelTrainer(scene, config, device, ranks)
 
+    def _sinks(self) -> list[str]:
+        """Return where to log beside the run's file."""
+        return [name for name in PACKAGES if getattr(self, name)]
+
     def _check(self) -> None:
         """Raise SettingError for invalid options, before the photos are read."""
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.downscale < 1:
             raise SettingError(f"--downscale: expected at least 1, got {self.downscale}")
-        if self.tensorboard:
-            check_tensorboard()
+        for name in self._sinks():
+            check_package(name)
         if self.view:
             from nexwarp.viewer import check_server
 
@@ -214,10 +255,26 @@ class Train:
         print_url(viewer, console)
         return viewer
 
+    def _scene_of_video(self, console: Console) -> Path:
+        """Return the scene of a video; what would stop the training later stops it before the scene is made."""
+        video = Path(self.scene)
+        self._check()
+        run, scene = self.run or Path("runs") / video.stem, SceneSource(str(SCENES / video.stem))
+        prepare_run(run, scene, resume=self.resume, overwrite=self.overwrite)
+        return scene_of_video(video, console)
+
     def _source(self) -> SceneSource:
         """Return the scene of the options."""
         return SceneSource(
-            self.scene, self.images, self.downscale, self.masks, self.background, self.points, self.format
+            self.scene,
+            self.images,
+            self.downscale,
+            self.masks,
+            self.background,
+            self.points,
+            self.format,
+            self.follow_links,
+            self.skip_missing,
         )
 
     def _resumed_source(self, source: SceneSource, run: Path) -> SceneSource:
@@ -230,6 +287,8 @@ class Train:
             ("--background", None, self.background, old.background),
             ("--points", None, self.points and str(Path(self.points).resolve()), old.points),
             ("--format", None, self.format, old.format),
+            ("--follow-links", False, self.follow_links, old.follow_links),
+            ("--skip-missing", False, self.skip_missing, old.skip_missing),
             ("--preset", "default", self.preset, config.preset),
         ):
             if given not in (default, expected):
@@ -261,7 +320,9 @@ class Train:
         """Return the settings of the run to resume; a SettingError names an option that differs."""
         config = read_run(run)[1]
         for name, value in given.items():
-            if getattr(config, name) != value:
+            if name == "iterations" and isinstance(value, int) and value > config.iterations:
+                config = dataclasses.replace(config, iterations=value)
+            elif getattr(config, name) != value:
                 flag = f"--{name.replace('_', '-')}"
                 raise SettingError(f"{flag}: expected {getattr(config, name)} as in the run to resume, got {value}")
         changed = with_flag_settings(config, settings)

@@ -1,6 +1,6 @@
 """A training session: the training loop with display, log and checkpoints, and the files of a finished run."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from nexwarp.io.json_files import Json, write_json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TEST, TRAIN, picture_name, remove_leftovers
+from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, picture_name, remove_leftovers
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
@@ -39,7 +39,7 @@ class TrainingSession:
     """One training in a run folder, from its first or resumed iteration to the evaluated model."""
 
     def __init__(
-        self, trainer: Trainer, run: Path, console: Console, *, tensorboard: bool = False, every: int | None = None
+        self, trainer: Trainer, run: Path, console: Console, *, sinks: Collection[str] = (), every: int | None = None
     ) -> None:
         """Prepare the session; nothing runs yet.
 
@@ -47,10 +47,10 @@ class TrainingSession:
             trainer: the trainer, before its first iteration.
             run: run folder.
             console: where to print.
-            tensorboard: whether to log for TensorBoard, too.
+            sinks: where to log beside the run's file: names of `nexwarp.run.log_sinks.PACKAGES`.
             every: iterations between checkpoints; None is a tenth of the run.
         """
-        self.trainer, self.run, self.console, self.tensorboard = trainer, run, console, tensorboard
+        self.trainer, self.run, self.console, self.sinks = trainer, run, console, sinks
         self.ranks = trainer.ranks
         self.total = trainer.config.iterations
         self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
@@ -72,7 +72,8 @@ class TrainingSession:
             remove_leftovers(self.run)
             found = has_checkpoint(self.run)
         if self.ranks.share(found):
-            self.trainer.restore(self.run, partial(display.warn, self.console))
+            # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
+            self.trainer.restore(self.run, partial(display.warn, self.console), extend=True)
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
         else:
             self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
@@ -92,7 +93,7 @@ class TrainingSession:
         """
         trainer, ranks = self.trainer, self.ranks
         progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
-        log = TrainingLog(self.run, trainer, tensorboard=self.tensorboard)
+        log = TrainingLog(self.run, trainer, tensorboard="tensorboard" in self.sinks, wandb="wandb" in self.sinks)
         with ExitStack() as stack:
             if ranks.first:
                 stack.enter_context(progress_display)
@@ -109,7 +110,7 @@ class TrainingSession:
                 number = ranks.agree(stop_signal(), now=step.iteration == self.total)
                 if step.passed(self.every) or step.iteration == self.total or number is not None:
                     with self._model_kept():
-                        trainer.save(self.run)
+                        trainer.save_checkpoint(self.run)
                 if ranks.size == 1:
                     number = stop_signal()  # also one that came during the save
                 if number is not None:
@@ -184,7 +185,7 @@ class TrainingSession:
         file = save_model(run, finished)
         if self.ranks.size > 1:
             self.ranks.share_bytes(file.read_bytes())
-        given = {name: {v.name: v.camera for v in views} for name, views in ((TRAIN, scene.train), (TEST, scene.test))}
+        given = scene.cameras
         cameras = trainer.views.refined_cameras(trainer.poses)
         refined = {TRAIN: dict(zip(given[TRAIN], cameras, strict=True))}
         save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given=given)

@@ -3,32 +3,38 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cli.device import pick_device
-from nexwarp.cli.options import Device_, Host_, Port_, Run_
+from nexwarp.cli.options import Device_, Host_, Port_, Run_, option
+from nexwarp.errors import FormatError
+from nexwarp.model.detail import check_detail
 from nexwarp.model.model_file import load
-from nexwarp.run.export import run_title
-from nexwarp.run.folder import keep_camera_path, read_run
+from nexwarp.run.folder import keep_camera_path
+from nexwarp.run.opened import OpenedModel, near_depth, open_model
 from nexwarp.web.export import web_page
 
 if TYPE_CHECKING:
-    from nexwarp.viewer import Viewer
+    from nexwarp.viewer import GradualModel, Viewer
+
+FIRST_DETAIL = 0.05  # share of the surfels of the first pictures of a large model
+LARGE = 20_000_000  # bytes of a model's file
 
 
 @dataclass
 class ViewCommand:
-    """Show a run in the browser, with all buffers and an editor of camera paths for render (extra `viewer`)."""
+    """Show a run or a model in the browser, with all buffers and an editor of camera paths (extra `viewer`)."""
 
     run: Run_
-    """Run folder."""
+    """Run folder, or a model's folder or .safetensors file."""
     host: Host_ = "127.0.0.1"
     """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
     """Port to listen on; 0 picks a free one."""
+    detail: Annotated[float, option("SHARE")] = 1.0
+    """Share of the surfels to show, above 0 to 1, as of nexwarp render; a large model first appears at 0.05."""
     device: Device_ = None
     """Device to render on."""
 
@@ -36,21 +42,32 @@ class ViewCommand:
         """Serve the viewer until Ctrl-C."""
         from nexwarp.viewer import Viewer
 
-        source, _, _ = read_run(self.run)
-        model = load(self.run).to(pick_device(self.device))
-        cameras = load_cameras(self.run / CAMERAS_FILE)
-        named = {name: camera for views in cameras.values() for name, camera in views.items()}
+        check_detail("--detail", self.detail)
+        opened = open_model(self.run)
+        model = self._model(opened)
+        named = {name: camera for views in opened.cameras.values() for name, camera in views.items()}
         with Viewer(
-            lambda: model,
-            cameras,
-            near=near if isinstance(near := model.meta.get("near"), float) else 0.01,
-            title=source.name,
+            model,
+            opened.cameras,
+            near=near_depth(model()),
+            title=opened.title,
             host=self.host,
             port=self.port,
-            save_path=partial(keep_camera_path, self.run),
-            make_page=partial(web_page, model, named, run_title(source)),
+            save_path=partial(keep_camera_path, opened.folder, opened=self.run),
+            make_page=lambda: web_page(model(), named, opened.title),
         ) as viewer:
+            model.read_rest(viewer.redraw)
             show_until_interrupted(viewer, console)
+
+    def _model(self, opened: OpenedModel) -> "GradualModel":
+        """Return the model to show; of a large file with ordered surfels, the coarse part first."""
+        from nexwarp.viewer import GradualModel
+
+        device = pick_device(self.device)
+        if self.detail == 1.0 and opened.file.is_file() and opened.file.stat().st_size > LARGE:
+            with suppress(FormatError):  # surfels in no order, or a damaged file, which the last line names
+                return GradualModel(load(opened.file, detail=FIRST_DETAIL).to(device), lambda: opened.model.to(device))
+        return GradualModel(opened.model_at(self.detail, device))
 
 
 def print_url(viewer: "Viewer", console: Console, more: str = "") -> None:

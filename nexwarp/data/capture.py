@@ -1,6 +1,7 @@
 """The content of a scene's files without pixels: photos with their cameras, and points."""
 
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -9,6 +10,7 @@ import numpy as np
 from nexwarp.data.lens import Lens
 
 MAX_PART, MAX_PATH = 240, 1024  # bytes of a part of a file's path, and of the path
+MOST_NAMED = 100  # missing photos in a message
 LARGEST_COORDINATE = 1e15  # its square is finite in single precision
 
 
@@ -106,24 +108,49 @@ def safe_name(where: str, name: str, folder: str) -> str:
     return str(path)
 
 
-def inside_folder(where: str, path: Path, folder: Path) -> Path:
+def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> Path:
     """Return `path` after a check that symbolic links do not lead out of `folder`; `folder` itself may be a link.
 
     Args:
         where: place of the path, for messages.
         path: a path below `folder`.
         folder: a folder of the scene.
+        follow_links: allow links that lead out of the folder.
 
     Raises:
         ValueError: a link leads out of the folder.
     """
+    if follow_links:
+        return path
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # circular links
         inside = False
     if not inside:
-        raise ValueError(f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it")
+        found = f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it"
+        raise ValueError(f"{found}; --follow-links allows it, for scenes that you trust")
     return path
+
+
+def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -> None:
+    """Name the photos that do not exist.
+
+    Args:
+        source: the file or folder that names them.
+        names: of the missing photos.
+        count: number of all photos.
+        skip: warn instead of raising, as long as two photos are left.
+
+    Raises:
+        FileNotFoundError: photos are missing.
+    """
+    if not names:
+        return
+    listed = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" * (len(names) > MOST_NAMED))
+    found = f"{source}: {len(names)} of {count} photos: image not found: {listed}"
+    if not skip or count - len(names) < 2:
+        raise FileNotFoundError(f"{found}; --skip-missing goes on without them" if not skip else found)
+    warnings.warn(f"{found}; going on without them", stacklevel=2)
 
 
 def distinct_photos(source: Path, photos: Iterable[Photo]) -> list[Photo]:

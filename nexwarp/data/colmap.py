@@ -51,12 +51,13 @@ def find_model(path: Path) -> tuple[Path, str]:
     )
 
 
-def read_model(path: Path, images: Path) -> Capture:
+def read_model(path: Path, images: Path, follow_links: bool = False) -> Capture:
     """Read the COLMAP model of a scene.
 
     Args:
         path: folder of the scene.
         images: folder of its photos.
+        follow_links: see `load_scene`.
 
     Raises:
         FileNotFoundError: there is no model.
@@ -68,7 +69,7 @@ def read_model(path: Path, images: Path) -> Capture:
     if not records.images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
-    each = (_photo(image, records.cameras, lenses, folder, images) for image in records.images.values())
+    each = (_photo(image, records.cameras, lenses, folder, images, follow_links) for image in records.images.values())
     photos = distinct_photos(folder, each)
     if not len(records.points.ids):
         return Capture(folder, sorted(photos, key=lambda photo: photo.name), None)
@@ -80,11 +81,16 @@ def read_model(path: Path, images: Path) -> Capture:
 
 
 def _photo(
-    image: ImageRecord, cameras: dict[int, CameraRecord], lenses: dict[int, Lens], folder: Path, images: Path
+    image: ImageRecord,
+    cameras: dict[int, CameraRecord],
+    lenses: dict[int, Lens],
+    folder: Path,
+    images: Path,
+    follow_links: bool,
 ) -> Photo:
     name = safe_name(f"{folder}: image name", image.name, "images folder")
     where = f"{folder}: {name}"
-    file = inside_folder(f"{folder}: image name", images / name, images)
+    file = inside_folder(f"{folder}: image name", images / name, images, follow_links)
     if image.camera not in cameras:
         raise ValueError(f"{where}: expected a camera of the model, got id {image.camera}")
     if image.camera not in lenses:

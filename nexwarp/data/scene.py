@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.data.background import parse_color
 from nexwarp.data.cache import PhotoCache, cache_folder
-from nexwarp.data.capture import Capture, Cloud, Photo
+from nexwarp.data.capture import Capture, Cloud, Photo, report_missing
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import Array, make_cloud, split_views
@@ -31,7 +32,6 @@ MAX_POINTS = 4_000_000  # to start from: more than any budget of surfels
 READERS = {"colmap": "a COLMAP model", "nerfstudio": NERFSTUDIO_FILE, "blender": BLENDER_FILES["train"]}
 MASKS, ALPHA, NONE = "masks", "alpha", "none"
 RANDOM = "random"
-COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 # Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
 READ_BYTES, UNDISTORT_BYTES = 24, 64
 MAX_READERS = 32
@@ -73,6 +73,11 @@ class Scene:
     path: Path
     background: tuple[float, float, float] | None = None
     random_background: bool = False
+
+    @property
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """The cameras by set ("train", "test") and name of the photo."""
+        return {name: {v.name: v.camera for v in views} for name, views in (("train", self.train), ("test", self.test))}
 
     @classmethod
     def from_tensors(
@@ -121,6 +126,8 @@ def load_scene(
     background: str | Sequence[float] | None = None,
     points: str | os.PathLike[str] | None = None,
     format: str | None = None,
+    follow_links: bool = False,
+    skip_missing: bool = False,
     progress: ProgressCallback | None = None,
 ) -> Scene:
     """Read a scene: a COLMAP folder, nerfstudio's transforms.json, or Blender's transforms_train.json.
@@ -144,6 +151,8 @@ def load_scene(
             and marks the scene for training on random colours.
         points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
         format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
+        follow_links: allow symbolic links out of the scene's folder; a scene of others can then show any picture.
+        skip_missing: warn of photos that do not exist, and go on without them.
         progress: called with the number of photos read and their total, from one thread at a time.
 
     Returns:
@@ -153,23 +162,30 @@ def load_scene(
         NotADirectoryError: a file, not a folder.
         FileNotFoundError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
             scene names are absent.
-        TypeError: an argument has the wrong type.
-        ValueError: an argument out of range, more than one kind of scene, damaged or malformed files, cameras that
-            are not usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than
-            2 photos, no points in a COLMAP model, points that are not finite, photos too many for the memory.
+        TypeError, ValueError: an argument of the wrong type or out of range, more than one kind of scene, damaged or
+            malformed files, cameras that are not usable, a photo or mask whose shape is not its camera's, names that
+            leave the folder, fewer than 2 photos, a COLMAP model without points, photos too many for the memory.
     """
     _check_paths(path, images, masks, points)
     _check_downscale(downscale)
-    path = Path(path)
+    path = _scene_folder(path)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
+    with quiet_pillow():
+        kind = find_format(path, format)
+        capture = _read_capture(path, images, kind, follow_links, skip_missing)
+        scene = _load(path, kind, capture, images, downscale, masks, color, points, progress)
+    return dataclasses.replace(scene, random_background=random)
+
+
+def _scene_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a scene after a check that it is a folder."""
+    path = Path(path)
     if path.is_file():
         raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
-    with quiet_pillow():
-        scene = _load(path, images, downscale, masks, color, points, format, progress)
-    return dataclasses.replace(scene, random_background=random)
+    return path
 
 
 def _check_paths(path: object, images: object, masks: object, points: object) -> None:
@@ -181,25 +197,6 @@ def _check_paths(path: object, images: object, masks: object, points: object) ->
             raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
     if points is not None and not isinstance(points, (str, os.PathLike)):
         raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
-
-
-def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
-    """Three numbers in [0, 1] of a colour's name, of "R,G,B" or of three numbers; None stays None.
-
-    Raises:
-        ValueError: anything else.
-    """
-    if color is None:
-        return None
-    if isinstance(color, str) and color in COLORS:
-        return COLORS[color]
-    try:
-        values = tuple(float(x) for x in (color.split(",") if isinstance(color, str) else color))
-    except (TypeError, ValueError):
-        values = ()
-    if len(values) != 3 or not all(0 <= x <= 1 for x in values):
-        raise ValueError(f"background: expected white, black, random or three numbers in [0, 1], got {color!r}")
-    return values
 
 
 def find_format(path: Path, format: str | None = None) -> str:
@@ -232,16 +229,15 @@ def find_format(path: Path, format: str | None = None) -> str:
 
 def _load(
     path: Path,
+    kind: str,
+    capture: Capture,
     images: str,
     downscale: int,
     masks: str | None,
     background: tuple[float, float, float] | None,
     points: str | os.PathLike[str] | None,
-    format: str | None,
     progress: ProgressCallback | None,
 ) -> Scene:
-    kind = find_format(path, format)
-    capture = _read_capture(path, images, kind)
     if len(capture.photos) < 2:
         raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
     cloud = read_ply(Path(points)) if points is not None else capture.cloud
@@ -303,14 +299,20 @@ def _check_downscale(downscale: int) -> None:
         raise ValueError(f"downscale: expected at least 1, got {downscale}")
 
 
-def _read_capture(path: Path, images: str, kind: str) -> Capture:
+def _read_capture(
+    path: Path, images: str, kind: str, follow_links: bool = False, skip_missing: bool = False
+) -> Capture:
     if kind == "colmap":
-        capture = read_model(path, path / images)
+        capture = read_model(path, path / images, follow_links)
         _check_folder("images", path, images)
-        return capture
+        photos = [photo for photo in capture.photos if photo.file.is_file()]
+        missing = [photo.name for photo in capture.photos if not photo.file.is_file()]
+        report_missing(capture.source, missing, len(capture.photos), skip_missing)
+        return dataclasses.replace(capture, photos=photos)
     if images != "images":
         _check_folder("images", path, images)
-    return (read_nerfstudio if kind == "nerfstudio" else read_blender)(path, images)
+    read = read_nerfstudio if kind == "nerfstudio" else read_blender
+    return read(path, images, follow_links, skip_missing)
 
 
 def _check_folder(argument: str, path: Path, name: str) -> None:

@@ -18,6 +18,7 @@ from nexwarp.data.capture import (
     check_points,
     distinct_photos,
     inside_folder,
+    report_missing,
     safe_name,
     short,
 )
@@ -35,26 +36,28 @@ AGREEMENT = 2.0  # ratio of colour errors from which points count as being in th
 JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
 
 
-def read_nerfstudio(path: Path, images: str) -> Capture:
+def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
     """Read `transforms.json` of a scene.
 
     Args:
         path: folder of the scene.
         images: folder of the photos that replaces "images" in the file.
+        follow_links: see `load_scene`.
+        skip_missing: see `load_scene`.
 
     Raises:
         FileNotFoundError: a photo, a mask or the points that the file names do not exist.
         ValueError: the file has invalid content; the message names the place.
     """
     file = path / NERFSTUDIO_FILE
-    data = _read_data(file)
-    frames = _frames(file, data, images)
-    cloud = _points(file, data, frames)
-    photos, test = _split(file, data, _sorted(file, data, frames, cloud))
+    data, missing = _read_data(file, images, skip_missing)
+    frames = _frames(file, data, images, follow_links)
+    cloud = _points(file, data, frames, follow_links)
+    photos, test = _split(file, data, _sorted(file, data, frames, cloud), missing)
     return Capture(file, photos, cloud, test)
 
 
-def read_blender(path: Path, images: str) -> Capture:
+def read_blender(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
     """Read transforms_train.json and transforms_test.json of a Blender scene; without the latter, transforms_val.json.
 
     Points are those of `ply_file_path`, or those of `points3d.ply` beside the JSON file if it exists.
@@ -62,6 +65,8 @@ def read_blender(path: Path, images: str) -> Capture:
     Args:
         path: folder of the scene.
         images: folder of the photos that replaces "images" in the files.
+        follow_links: see `load_scene`.
+        skip_missing: see `load_scene`.
 
     Raises:
         FileNotFoundError: transforms_train.json or a photo that a file names does not exist.
@@ -70,27 +75,41 @@ def read_blender(path: Path, images: str) -> Capture:
     train = path / BLENDER_FILES["train"]
     if not train.is_file():
         raise FileNotFoundError(f"{path}: expected {train.name} of a Blender scene, found none")
-    data = _read_data(train)
-    frames = _frames(train, data, images)
-    cloud = _points(train, data, frames, BLENDER_POINTS)
+    data, _ = _read_data(train, images, skip_missing)
+    frames = _frames(train, data, images, follow_links)
+    cloud = _points(train, data, frames, follow_links, BLENDER_POINTS)
     photos = _sorted(train, data, frames, cloud)
     for split in ("test", "val"):
         other = path / BLENDER_FILES[split]
         if other.is_file():
-            held_out = _frames(other, _read_data(other), images)
+            other_data, _ = _read_data(other, images, skip_missing)
+            held_out = _frames(other, other_data, images, follow_links)
             names = {photo.name for photo in photos}
             again = [photo.name for photo in held_out if photo.name in names]
             if again:
                 raise ValueError(f"{other}: {again[0]} is in {train.name} too, expected other photos to judge by")
             merged = sorted(photos + held_out, key=lambda photo: photo.name)
-            return Capture(train, merged, cloud, frozenset(photo.name for photo in held_out), WHITE)
+            test = frozenset(photo.name for photo in held_out)
+            return Capture(train, merged, cloud, test, WHITE)
     return Capture(train, photos, cloud, None, WHITE)
 
 
-def _read_data(file: Path) -> JsonObject:
+def _read_data(file: Path, images: str, skip_missing: bool) -> tuple[JsonObject, tuple[str, ...]]:
+    """Return the file's content with those frames only whose photos exist, and the names of the missing photos."""
     data = read_object(file, finite=True)
-    _frame_list(file, data)
-    return data
+    frames: list[Json] = []
+    missing: list[str] = []
+    for index, frame in enumerate(_frame_list(file, data)):
+        where = f"{file}: frame {index}"
+        if not isinstance(frame, dict):
+            raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
+        named = _file_name(where, "file_path", frame.get("file_path"))
+        if _find(f"{where} ({named})", file.parent, named, images) is None:
+            missing.append(named)
+        else:
+            frames.append(frame)
+    report_missing(file, missing, len(missing) + len(frames), skip_missing)
+    return {**data, "frames": frames}, tuple(missing)
 
 
 def _frame_list(file: Path, data: JsonObject) -> list[Json]:
@@ -102,32 +121,41 @@ def _frame_list(file: Path, data: JsonObject) -> list[Json]:
     return frames
 
 
-def _frames(file: Path, data: JsonObject, images: str) -> list[Photo]:
+def _frames(file: Path, data: JsonObject, images: str, follow_links: bool) -> list[Photo]:
     """The photos in the order of the file."""
     to_original = inverse_applied(file, data)
+    frames: Json = data["frames"]
+    assert isinstance(frames, list)  # as `_read_data` returns it
 
     def photo(index: int, frame: Json) -> Photo:
-        where = f"{file}: frame {index}"
-        if not isinstance(frame, dict):
-            raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
-        return _photo(where, file.parent, data, frame, images, to_original)
+        assert isinstance(frame, dict)
+        return _photo(f"{file}: frame {index}", file.parent, data, frame, images, to_original, follow_links)
 
-    return distinct_photos(file, (photo(index, frame) for index, frame in enumerate(_frame_list(file, data))))
+    return distinct_photos(file, (photo(index, frame) for index, frame in enumerate(frames)))
 
 
 def _photo(
-    where: str, folder: Path, data: JsonObject, frame: JsonObject, images: str, to_original: np.ndarray
+    where: str,
+    folder: Path,
+    data: JsonObject,
+    frame: JsonObject,
+    images: str,
+    to_original: np.ndarray,
+    follow_links: bool,
 ) -> Photo:
     named = _file_name(where, "file_path", frame.get("file_path"))
     where = f"{where} ({named})"
     file = _find(where, folder, named, images)
+    assert file is not None  # `_read_data` keeps no other frames
+    inside = folder / images if PurePosixPath(named).is_relative_to("images") else folder
+    inside_folder(f"{where}: file_path", file, inside, follow_links)
     name = _view_name(str(PurePosixPath(named).with_name(file.name)))
     mask = None
     if frame.get("mask_path") is not None:
         mask = folder / _file_name(where, "mask_path", frame["mask_path"])
         if not mask.is_file():
             raise FileNotFoundError(f"{where}: mask not found: {mask}")
-        inside_folder(f"{where}: mask_path", mask, folder)
+        inside_folder(f"{where}: mask_path", mask, folder, follow_links)
     lens = frame_lens(where, {**data, **frame}, file)
     return Photo(name, file, frame_viewmat(where, frame.get("transform_matrix"), to_original), lens, mask)
 
@@ -143,22 +171,20 @@ def _view_name(named: str) -> str:
     return named[7:] if named.startswith("images/") else named
 
 
-def _find(where: str, folder: Path, named: str, images: str) -> Path:
-    """Find an image file, in the folder `images` and with an extension if the name has none."""
+def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
+    """Find an image file, in the folder `images` and with an extension if the name has none; None if there is none."""
     if images != "images":
         if not named.startswith("images/"):
             raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
         named = f"{images}/{named[7:]}"
     path = folder / named
-    top = folder / images if PurePosixPath(named).is_relative_to(images) else folder
     candidates = [path, *(path.with_name(path.name + extension) for extension in EXTENSIONS)]
-    for candidate in candidates:
-        if candidate.is_file():
-            return inside_folder(f"{where}: file_path", candidate, top)
-    raise FileNotFoundError(f"{where}: image not found: {path}")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _split(file: Path, data: JsonObject, photos: list[Photo]) -> tuple[list[Photo], frozenset[str] | None]:
+def _split(
+    file: Path, data: JsonObject, photos: list[Photo], absent: tuple[str, ...]
+) -> tuple[list[Photo], frozenset[str] | None]:
     """Return the photos in use and the names of the test photos; None if the file has no split."""
     lists: dict[str, set[str]] = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
@@ -168,7 +194,7 @@ def _split(file: Path, data: JsonObject, photos: list[Photo]) -> tuple[list[Phot
         if not isinstance(names, list):
             raise ValueError(f"{file}: {key}: expected a list of file names, got {short(names)}")
         lists[key] = {_view_name(_file_name(str(file), key, name)) for name in names}
-        known = {photo.name for photo in photos}
+        known = {photo.name for photo in photos} | {_view_name(name) for name in absent}
         known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
         missing = sorted(lists[key] - known)
         if missing:
@@ -196,7 +222,9 @@ def _split(file: Path, data: JsonObject, photos: list[Photo]) -> tuple[list[Phot
     return sorted(train + test, key=lambda photo: photo.name), frozenset(photo.name for photo in test)
 
 
-def _points(file: Path, data: JsonObject, frames: list[Photo], beside: str | None = None) -> Cloud | None:
+def _points(
+    file: Path, data: JsonObject, frames: list[Photo], follow_links: bool, beside: str | None = None
+) -> Cloud | None:
     """Read the points that the file names, or those of the file `beside` it if it exists, in the original world."""
     key = "ply_file_path"
     if data.get(key) is not None:
@@ -207,7 +235,7 @@ def _points(file: Path, data: JsonObject, frames: list[Photo], beside: str | Non
         key, path = "points", file.parent / beside
     else:
         return None
-    cloud = read_ply(inside_folder(f"{file}: {key}", path, file.parent))
+    cloud = read_ply(inside_folder(f"{file}: {key}", path, file.parent, follow_links))
     to_original = inverse_applied(file, data)
     moved = cloud.positions @ to_original[:3, :3].T + to_original[:3, 3]
     check_points(path, moved, "points in the original world", lambda index: f"vertex {index}")

@@ -11,6 +11,7 @@ from nexwarp.data import View
 from nexwarp.determinism import deterministic
 from nexwarp.finish.auto_exposure import with_auto_exposure
 from nexwarp.finish.detail_limits import measure_detail_limits
+from nexwarp.finish.order import ordered
 from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.model.model import Model
 from nexwarp.representation.exposures import Exposures
@@ -43,7 +44,9 @@ def finish_model(
     settings: FinishSettings,
     observe: FinishObserver = lambda *_: None,
 ) -> Model:
-    """Return a finished model with surfels of its own: smooth SH, detail limits and exposures. The texture is shared.
+    """Return a finished model with surfels of its own: smooth SH, detail limits and exposures.
+
+    The surfels are ordered by their share of the training pictures, largest first. The texture is shared.
 
     Args:
         model: the trained surfels and texture, at the photos' mean exposure; stays as it is.
@@ -68,7 +71,8 @@ def finish_model(
         exposures = with_auto_exposure(copy.deepcopy(exposures), finished, cameras, progress=progress)
         finished.exposures = exposures.to(model.device)
     finished.meta = model.meta | {"smooth_sh": settings.smooth_sh}
-    return finished
+    with deterministic(settings.deterministic and model.device.type == "cuda"):
+        return ordered(finished, counted(cameras, "ordering surfels", observe))
 
 
 def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Iterator[Item]:

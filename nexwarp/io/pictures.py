@@ -54,6 +54,21 @@ def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
+def save_jpeg(path: str | os.PathLike[str], image: torch.Tensor, quality: int) -> None:
+    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a JPEG file with full colour resolution; see `save_png`.
+
+    Args:
+        path: the file.
+        image: the image.
+        quality: of the compression, 1 to 100.
+    """
+    from PIL import Image
+
+    pixels = _to_uint8("image", image).numpy()
+    with written_aside(path, durable=False) as temporary:
+        Image.fromarray(pixels).save(temporary, format="JPEG", quality=quality, subsampling=0)
+
+
 def save_exr(
     path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, object] | None = None
 ) -> None:

@@ -1,16 +1,21 @@
-"""Videos: H.264, or VP9 for .webm, through PyAV; written atomically."""
+"""Videos through PyAV: written atomically as H.264, or as VP9 for .webm; read in every format that PyAV knows."""
 
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from nexwarp.checks import check_range
-from nexwarp.errors import SettingError
-from nexwarp.io.files import written_aside
+from nexwarp.errors import FormatError, SettingError
+from nexwarp.io.files import one_line, written_aside
+
+if TYPE_CHECKING:
+    import av
 
 # Encoder and its options: constant quality, without visible artefacts.
 H264 = ("libx264", {"crf": "16", "preset": "medium"})
@@ -35,6 +40,10 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
         raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
     if not 0 < fps <= FASTEST:
         raise SettingError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
+    _check_av(path)
+
+
+def _check_av(path: str | os.PathLike[str]) -> None:
     try:
         import av  # noqa: F401
     except ImportError:
@@ -101,3 +110,43 @@ def video_writer(
             if not count:
                 raise ValueError(f"{path}: expected at least one frame, got none")
             container.mux(stream.encode())
+
+
+def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
+    """Decode the frames of a video's first video stream, in the order in which they are shown.
+
+    Raises:
+        SettingError: PyAV (extra `video`) is missing.
+        FormatError: the file is no video, has no video stream, or is damaged.
+    """
+    _check_av(path)
+    import av
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file, expected a video")
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise FormatError(f"{path}: expected a video, but the file has no video stream")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            yield from container.decode(stream)
+    except av.error.FFmpegError as error:
+        raise FormatError(f"{path}: expected a video, could not decode it ({one_line(error)})") from None
+
+
+def frame_pixels(frame: "av.VideoFrame") -> np.ndarray:
+    """Return a frame as (H, W, 3) uint8 sRGB, upright as players show it."""
+    return _upright(frame, frame.to_ndarray(format="rgb24"))
+
+
+def frame_luma(frame: "av.VideoFrame", longest: int) -> np.ndarray:
+    """Return a frame's brightness as (H, W) uint8, upright and reduced to at most `longest` pixels a side."""
+    scale = min(1.0, longest / max(frame.width, frame.height))
+    size = (max(round(frame.width * scale), 2), max(round(frame.height * scale), 2))
+    return _upright(frame, frame.reformat(*size, format="gray", interpolation="AREA").to_ndarray())
+
+
+def _upright(frame: "av.VideoFrame", pixels: np.ndarray) -> np.ndarray:
+    """Rotate pixels by the angle that a phone stores beside the frames, counterclockwise in degrees."""
+    return np.rot90(pixels, round(frame.rotation / 90) % 4).copy() if frame.rotation else pixels

@@ -36,7 +36,8 @@ class Model(nn.Module):
         detail_limits: detail limits of the N surfels; None limits nothing.
         options: the options of its rendering.
         meta: further facts, as JSON values: `near` [world units], `scene_scale` [world units], `preset`, `iteration`;
-            a finished model also has `smooth_sh`.
+            a finished model also has `smooth_sh`, and `ordered` where surfels are in the order of their share of the
+            training pictures, largest first (see `at_detail`).
 
     Raises:
         TypeError, ValueError: the message names the argument.
@@ -76,7 +77,24 @@ class Model(nn.Module):
         self.detail_limits = detail_limits
         self.options = RenderOptions() if options is None else options
         self.meta: dict[str, Json] = dict(meta or {})
-        self.register_load_state_dict_pre_hook(_report_removed_parts)
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, torch.Tensor],
+        prefix: str,
+        local_metadata: dict[str, object],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Name the tensors of parts that were set to None, too: torch passes over them when a state dict is loaded."""
+        for part, module in self._modules.items():
+            if strict and module is None:
+                unexpected_keys += [name for name in state_dict if name.startswith(f"{prefix}{part}.")]
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
 
     @property
     def device(self) -> torch.device:
@@ -210,6 +228,20 @@ class Model(nn.Module):
         """
         return Model(self.surfels, None, options=self.options.changed(**changes), meta=self.meta)
 
+    def at_detail(self, detail: float) -> "Model":
+        """Return a coarser model with parameters of its own, for slow devices and quick looks.
+
+        Args:
+            detail: share of the surfels, 0.0001 to 1: those that make up most of the training pictures. The texture
+                keeps its coarse levels, all of them from a detail of 0.5 on.
+
+        Raises:
+            ValueError: a detail out of range, or the surfels are not in the order of their share of the pictures.
+        """
+        from nexwarp.model.detail import at_detail
+
+        return at_detail(self, detail)
+
     def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> Path:
         """Write the model; `nexwarp.load` reads it.
 
@@ -227,19 +259,3 @@ class Model(nn.Module):
         from nexwarp.model.model_file import save_model
 
         return save_model(path, self, compact=compact)
-
-
-def _report_removed_parts(
-    model: nn.Module,
-    state: dict[str, torch.Tensor],
-    prefix: str,
-    _metadata: object,
-    strict: bool,
-    _missing: list[str],
-    unexpected: list[str],
-    _errors: list[str],
-) -> None:
-    """Name the tensors of parts that were set to None: torch passes over them when a state dict is loaded."""
-    for part, module in model._modules.items():
-        if strict and module is None:
-            unexpected += [name for name in state if name.startswith(f"{prefix}{part}.")]

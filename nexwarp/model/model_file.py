@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -17,13 +18,14 @@ from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
 from nexwarp.model.compact import STORED, code_names, decode, encode
+from nexwarp.model.detail import ORDERED, check_detail, coarse_shape, surfel_count, texture_levels
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
 from nexwarp.representation.exposures import BUFFERS, Exposures
 from nexwarp.representation.merged_texture import MergedTexture, make_texture
 from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.representation.texture import NeuralTexture, TextureShape
 
 FORMAT_VERSION = 1
 COMPACT_VERSION = 2  # of compact files, which older readers cannot read
@@ -85,11 +87,12 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     return file
 
 
-def load(path: str | os.PathLike[str]) -> Model:
+def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
     """Load a model onto the CPU. The scene's photos are not needed.
 
     Args:
         path: a run folder or a model file.
+        detail: read the first surfels and coarse texture levels only, as `Model.at_detail` describes.
 
     Raises:
         FileNotFoundError: the folder or the file does not exist.
@@ -99,6 +102,7 @@ def load(path: str | os.PathLike[str]) -> Model:
 
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    check_detail("detail", detail)
     path = Path(path)
     if path.is_dir():
         path = path / MODEL_FILE
@@ -115,13 +119,40 @@ def load(path: str | os.PathLike[str]) -> Model:
                 if name in FIXED_NAMES or name in header.texture_shapes or (header.compact and name in CODE_NAMES)
             }
             _check_kinds(path, kinds, header)
-            tensors = {name: file.get_tensor(name) for name in kinds}
+            if detail < 1.0 and header.meta.get(ORDERED) is not True:
+                raise FormatError(f"{path}: expected surfels in the order of their share of the pictures, for a detail")
+            if detail < 1.0 and header.compact:
+                return load(path).at_detail(detail)  # codes are decoded together
+            parts = {name: _first_parts(name, kinds, detail) for name in kinds if detail < 1.0}
+            tensors = {n: file.get_slice(n)[parts[n]] if n in parts else file.get_tensor(n) for n in kinds}
+    except FormatError:
+        raise
     except (SafetensorError, OSError) as error:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     try:
+        if detail < 1.0 and header.texture is not None:
+            resolutions = tensors["texture.resolutions"]
+            shape = coarse_shape(cast(TextureShape, header.texture), resolutions, len(resolutions))
+            header = dataclasses.replace(header, texture=cast(dict[str, Json], shape))
         return _make_model(header, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         raise _no_model(path, error) from None
+
+
+def _first_parts(name: str, kinds: Mapping[str, tuple[str, list[int]]], detail: float) -> tuple[slice, ...]:
+    """Return the part of a tensor that a detail has."""
+    shape = kinds[name][1]
+    everything = tuple(slice(size) for size in shape)
+    if name.startswith("surfels.") or name in DETAIL_LIMITS.values():
+        return (slice(surfel_count(detail, shape[0])), *everything[1:])
+    if name.startswith("texture."):
+        all_levels, _, features = kinds["texture.grid"][1]
+        levels = texture_levels(detail, all_levels)
+        if name in ("texture.grid", "texture.resolutions"):
+            return (slice(levels), *everything[1:])
+        if name == "texture.mlp.0.weight":
+            return (everything[0], slice(levels * features))
+    return everything
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import warp as wp
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.native.fixed_point import HIGH, LOW
 from nexwarp.kernels.tiles import LARGEST_INT
+from nexwarp.ops.startup import start_warp
 
 # What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.
 Argument: TypeAlias = object
@@ -67,6 +68,7 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
 
 @functools.cache
 def _device(kind: str, index: int | None) -> wp.Device:
+    start_warp()
     return wp.get_device("cpu" if kind == "cpu" else f"cuda:{index}")
 
 
@@ -89,7 +91,7 @@ def stream_of(tensor: torch.Tensor) -> wp.Stream | None:
 
 def stream_on(stream: torch.cuda.Stream) -> wp.Stream:
     """Warp's view of a stream of torch."""
-    wp.init()
+    start_warp()
     return _stream(stream.device_index, stream.cuda_stream)
 
 

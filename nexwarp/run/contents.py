@@ -17,6 +17,7 @@ METRICS_FILE = "metrics.json"
 LOG_FILE = "metrics.jsonl"
 DIVERGED_FILE = "diverged.json"
 LOCK_FILE = "run.lock"
+WANDB_FILE = "wandb.json"  # the id of the run at Weights & Biases
 CAMERA_PATH = "camera_path_{}.json"
 
 TENSORBOARD_FOLDER = "tensorboard"
@@ -34,7 +35,7 @@ PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures
 
 OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
 
-ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE)
+ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
 EXPORTS = (
     SURFELS_FILE,
     SPLATS_FILE,

@@ -12,7 +12,7 @@ from nexwarp.distributed.ranks import Ranks
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.contents import COMPARE, TEST, picture_name
-from nexwarp.run.metrics import CONVENTION, flip, lpips_vgg, psnr, ssim
+from nexwarp.run.metrics import CONVENTION, check_available, flip, lpips_vgg, psnr, ssim
 
 
 class Evaluation(TypedDict, total=False):
@@ -65,8 +65,7 @@ def evaluate(
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
-    if unknown := [name for name in metrics if name not in METRICS]:
-        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
+    _check_names(metrics)
     ranks = Ranks.alone(model.device) if ranks is None else ranks
     results: dict[str, dict[str, float | None]] = {}
     for begin in range(0, len(views), ranks.size):
@@ -80,6 +79,18 @@ def evaluate(
                 progress(view.name)
     means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
     return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
+
+
+def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
+    """Raise ValueError unless all metrics are known and can be computed on the device."""
+    _check_names(metrics)
+    for name in metrics:
+        check_available(name, device)
+
+
+def _check_names(metrics: Sequence[str]) -> None:
+    if unknown := [name for name in metrics if name not in METRICS]:
+        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
 
 
 def _judge(

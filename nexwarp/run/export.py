@@ -8,10 +8,10 @@ import torch
 from nexwarp.bake.fit import bake
 from nexwarp.bake.glb import check_package, save_glb
 from nexwarp.camera import Camera, resized
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
-from nexwarp.model.model_file import load, save_model
+from nexwarp.model.model_file import save_model
 from nexwarp.model.splats_spz import save_splats_spz
 from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
 from nexwarp.run.contents import (
@@ -27,24 +27,25 @@ from nexwarp.run.contents import (
     TRANSFORMS_FILE,
     WEB_FILE,
 )
-from nexwarp.run.folder import SceneSource, read_run
+from nexwarp.run.folder import SceneSource
 from nexwarp.run.mesh import Progress, extract_mesh, save_mesh
+from nexwarp.run.opened import OpenedModel
 
 FORMATS = ("ply", "mesh", "compact", "cameras", "web", "glb", "spz")
 
 
 def export_run(
-    run: Path,
+    opened: OpenedModel,
     kind: str,
     folder: Path | None = None,
     max_extent: float = MAX_EXTENT,
     quality: str = "quantised",
     device: torch.device | str = "cpu",
 ) -> Sequence[Path]:
-    """Export a run to a folder; docs/outputs.md describes the files.
+    """Export a run or a model to a folder; docs/outputs.md describes the files.
 
     Args:
-        run: run folder.
+        opened: the run or model.
         kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply), "compact" (compact.safetensors), "cameras"
             (transforms.json, camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
         folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
@@ -63,23 +64,23 @@ def export_run(
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
         raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
-    source, _, _ = read_run(run)
     if kind == "web":
         from nexwarp.web.export import export_web
 
-        model, out = load(run).to(device), folder or run / EXPORT_FOLDER / WEB_FILE
-        return export_web(model, _all_cameras(run), out, quality=quality, title=run_title(source))
-    folder = folder or run / EXPORT_FOLDER
+        out = folder or opened.folder / EXPORT_FOLDER / WEB_FILE
+        title, cameras = run_title(opened), _all_cameras(opened)
+        return export_web(opened.model.to(device), cameras, out, quality=quality, title=title)
+    folder = folder or opened.folder / EXPORT_FOLDER
     if kind == "mesh":
-        return export_mesh(run, folder, device)
+        return export_mesh(opened, folder, device)
     if kind == "cameras":
-        return _export_cameras(run, folder, source)
+        return _export_cameras(opened, folder)
     if kind == "compact":
-        return [save_model(folder / COMPACT_FILE, load(run), compact=True)]
+        return [save_model(folder / COMPACT_FILE, opened.model, compact=True)]
     if kind == "glb":
-        return _export_glb(run, folder, device)
-    model, cameras = load(run), list(_all_cameras(run).values())
-    gaussians = (model.surfels, model.options.sh_degree)
+        return _export_glb(opened, folder, device)
+    cameras = list(_all_cameras(opened).values())
+    gaussians = (opened.model.surfels, opened.model.options.sh_degree)
     if kind == "spz":
         save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=cameras, max_extent=max_extent)
         return [folder / SPZ_FILE]
@@ -90,7 +91,7 @@ def export_run(
 
 
 def export_mesh(
-    run: Path,
+    opened: OpenedModel,
     folder: Path,
     device: torch.device | str = "cpu",
     *,
@@ -101,7 +102,7 @@ def export_mesh(
     """Write the mesh of a run, mesh.ply.
 
     Args:
-        run: run folder.
+        opened: the run, or a model with training cameras beside it.
         folder: output folder, created if it does not exist.
         device: where to render.
         voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
@@ -111,36 +112,36 @@ def export_mesh(
     Raises:
         ValueError, OSError: the message names the option or file.
     """
-    read_run(run)
-    trained = load_cameras(run / CAMERAS_FILE).get(TRAIN, {})
+    trained = opened.cameras.get(TRAIN, {})
     if not trained:
-        raise RunError(f"{run / CAMERAS_FILE}: expected training cameras, found none")
-    mesh = extract_mesh(load(run).to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
+        raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
+    mesh = extract_mesh(opened.model.to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
     save_mesh(folder / MESH_FILE, mesh)
     return [folder / MESH_FILE]
 
 
-def _export_glb(run: Path, folder: Path, device: torch.device | str) -> Sequence[Path]:
+def _export_glb(opened: OpenedModel, folder: Path, device: torch.device | str) -> Sequence[Path]:
     """Write the baked surfels of a run as a glTF file."""
-    cameras = list(_all_cameras(run).values())
+    cameras = list(_all_cameras(opened).values())
     if not cameras:
-        raise RunError(f"{run}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
     check_package()
-    save_glb(folder / GLB_FILE, bake(load(run).to(device), cameras), cameras)
+    save_glb(folder / GLB_FILE, bake(opened.model.to(device), cameras), cameras)
     return [folder / GLB_FILE]
 
 
-def _export_cameras(run: Path, folder: Path, source: SceneSource) -> Sequence[Path]:
+def _export_cameras(opened: OpenedModel, folder: Path) -> Sequence[Path]:
     """Write the cameras of a run for nerfstudio."""
-    sets = load_cameras(run / CAMERAS_FILE)
+    cameras_file = opened.folder / CAMERAS_FILE
+    images = SceneSource.images if opened.source is None else opened.source.images
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
-        group: {f"{source.images}/{name}": camera for name, camera in members.items()}
-        for group, members in sets.items()
+        group: {f"{images}/{name}": camera for name, camera in members.items()}
+        for group, members in opened.cameras.items()
     }
     cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
-        raise RunError(f"{run / CAMERAS_FILE}: expected at least one camera, found none")
+        raise RunError(f"{cameras_file}: expected at least one camera, found none")
     files = [folder / TRANSFORMS_FILE, folder / CAMERA_PATH_FILE]
     save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
     first = next(iter(cameras.values()))
@@ -148,13 +149,13 @@ def _export_cameras(run: Path, folder: Path, source: SceneSource) -> Sequence[Pa
     return files
 
 
-def _all_cameras(run: Path) -> dict[str, Camera]:
+def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:
     """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
-    if not (run / CAMERAS_FILE).is_file():
+    if not (opened.folder / CAMERAS_FILE).is_file():
         return {}
-    return {name: camera for members in load_cameras(run / CAMERAS_FILE).values() for name, camera in members.items()}
+    return {name: camera for members in opened.cameras.values() for name, camera in members.items()}
 
 
-def run_title(source: SceneSource) -> str:
-    """Return the name of a run's scene, as a title."""
-    return Path(source.path).name or "nexwarp"
+def run_title(opened: OpenedModel) -> str:
+    """Return the name of a run's scene, or of a model, as a title."""
+    return opened.title if opened.source is None else Path(opened.source.path).name or "nexwarp"

@@ -16,7 +16,7 @@ from nexwarp.checks import check_version
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
 from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
-from nexwarp.io.json_files import READ_ERRORS, Json, read_json
+from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.run.contents import CAMERA_PATH, CONFIG_FILE, LOCK_FILE, METRICS_FILE, delete_files
 from nexwarp.run.lock import locked_run
 from nexwarp.train.config import Config
@@ -44,6 +44,10 @@ class SceneSource:
     """PLY file of the initial points; None takes the scene's points."""
     format: str | None = None
     """Format of the scene, for a folder that holds several; None detects it."""
+    follow_links: bool = False
+    """Whether photos may lie behind symbolic links that leave the scene's folder."""
+    skip_missing: bool = False
+    """Whether to go on without photos that do not exist."""
 
     @property
     def name(self) -> str:
@@ -155,6 +159,11 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str, laun
     return foreign
 
 
+def rewrite_config(run: Path, config: Config) -> None:
+    """Replace the settings in a run's config; the file's other entries stay."""
+    write_json(run / CONFIG_FILE, {**read_run(run)[2], "config": config.as_dict()})
+
+
 def began(run: Path, launch: str) -> bool:
     """Whether a folder holds a run that the ranks of this launch have created."""
     try:
@@ -204,6 +213,9 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         for name in ("images", "masks", "background", "points", "format"):
             if not isinstance(scene.get(name), (str, type(None))):
                 raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
+        for name in ("follow_links", "skip_missing"):
+            if not isinstance(scene.get(name, False), bool):
+                raise ValueError(f"scene: {name}: expected true or false, got {scene[name]!r}")
         known = {field.name for field in dataclasses.fields(SceneSource)}
         source = SceneSource(**{name: value for name, value in scene.items() if name in known})
         return source, config_from_dict(data["config"]), data
@@ -227,15 +239,22 @@ def read_metrics(run: Path) -> dict[str, Json]:
         raise FormatError(f"{path}: expected the metrics of a nexwarp run ({one_line(error)})") from None
 
 
-def keep_camera_path(run: Path, content: bytes) -> str:
-    """Write a camera path (JSON) into a run under the next free name; return the command that renders it."""
+def keep_camera_path(folder: Path, content: bytes, opened: Path | None = None) -> str:
+    """Write a camera path (JSON) into a folder under the next free name; return the command that renders it.
+
+    Args:
+        folder: run folder, or the folder of a model's results; created if it does not exist.
+        content: the path.
+        opened: the run or model that the command renders; None is `folder`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
-        path = run / CAMERA_PATH.format(number)
+        path = folder / CAMERA_PATH.format(number)
         try:
             path.touch(exist_ok=False)  # another viewer may look for a name at the same time
         except FileExistsError:
             number += 1
             continue
         write_atomically(path, content)
-        return f"nexwarp render {run} --path {path}"
+        return f"nexwarp render {opened or folder} --path {path}"

@@ -1,22 +1,19 @@
-"""Training logs: lines of JSON at regular iterations and, on request, TensorBoard events."""
+"""Training logs: lines of JSON at regular iterations and, on request, TensorBoard and Weights & Biases."""
 
-import importlib.util
 import json
 import math
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO, TypedDict
+from typing import TextIO, TypedDict
 
 import torch
 
 from nexwarp.io.files import written_aside
-from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
+from nexwarp.run.contents import LOG_FILE
+from nexwarp.run.log_sinks import Sink, TensorboardSink, WandbSink
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
 
 # Iterations between two lines, fewer in short runs, which get about MIN_LINES lines.
 EVERY = 100
@@ -34,14 +31,6 @@ RATES = {
     "shN": "shN",
     "grid": "grid",
 }
-
-
-def check_tensorboard() -> None:
-    """Raise ValueError unless the package tensorboard is installed."""
-    if importlib.util.find_spec("tensorboard") is None:
-        raise ValueError(
-            "--tensorboard: expected the package tensorboard, found none; pip install 'nexwarp[tensorboard]'"
-        )
 
 
 def peak_memory(device: torch.device) -> int | None:
@@ -88,35 +77,34 @@ class TrainingLog:
     Values that are not finite are written as null.
     """
 
-    def __init__(self, run: Path, trainer: Trainer, *, tensorboard: bool = False) -> None:
+    def __init__(self, run: Path, trainer: Trainer, *, tensorboard: bool = False, wandb: bool = False) -> None:
         """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
 
         Args:
             run: an existing folder.
             trainer: the trainer to observe.
             tensorboard: also write the values as scalars to `run/tensorboard`.
+            wandb: also log the values, by the same names, to Weights & Biases.
         """
-        self.run, self.trainer, self.tensorboard = run, trainer, tensorboard
+        self.run, self.trainer, self.tensorboard, self.wandb = run, trainer, tensorboard, wandb
         total = trainer.config.iterations
         self.every = max(min(EVERY, total // MIN_LINES), 1)
         self.last = trainer.iteration
         self.file: TextIO | None = None
-        self.writer: SummaryWriter | None = None
+        self.sinks: list[Sink] = []
 
     def __enter__(self) -> "TrainingLog":
         keep_lines(self.run / LOG_FILE, self.trainer.iteration)
         if self.tensorboard:
-            from torch.utils.tensorboard import SummaryWriter
-
-            # TensorBoard hides older events of iterations that are trained again after the checkpoint.
-            purge = self.trainer.iteration + 1 if self.trainer.iteration else None
-            self.writer = SummaryWriter(str(self.run / TENSORBOARD_FOLDER), purge_step=purge)
+            self.sinks.append(TensorboardSink(self.run, self.trainer.iteration))
+        if self.wandb:
+            self.sinks.append(WandbSink(self.run, self.trainer.config.as_dict()))
         self.file = _open_log(self.run / LOG_FILE)
         self.written = time.perf_counter()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for file in (self.file, self.writer):
+        for file in (self.file, *self.sinks):
             try:
                 if file is not None:
                     file.close()
@@ -141,10 +129,8 @@ class TrainingLog:
         line = self._line(step)
         self.file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
         self.file.flush()
-        if self.writer is not None:
-            for tag, value in _scalars(line):
-                self.writer.add_scalar(tag, value, step.iteration)
-            self.writer.flush()
+        for sink in self.sinks:
+            sink.write(_scalars(line), step.iteration)
 
     def _line(self, step: StepReport) -> LogLine:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
@@ -214,7 +200,7 @@ def _finite(value: object) -> object:
 
 
 def _scalars(line: LogLine) -> list[tuple[str, float]]:
-    """Return a line as tags and values for TensorBoard."""
+    """Return a line as names and values for the sinks."""
     tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
     tags |= {f"loss/{name}": value for name, value in line["losses"].items()}
     tags["speed/iterations_per_second"] = line["iterations_per_second"]

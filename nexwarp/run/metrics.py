@@ -1,11 +1,14 @@
 """Image metrics, computed from 8-bit images to be comparable with published numbers."""
 
+import importlib.util
 import warnings
 from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 
+from nexwarp.errors import SettingError
+from nexwarp.io.files import one_line
 from nexwarp.io.pictures import to_uint8
 
 PIXELS_PER_DEGREE = 67.02064514160156  # FLIP's default: a display 0.7 m and 3840 pixels wide, from 0.7 m
@@ -81,14 +84,33 @@ def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
     return float(error)
 
 
+def check_available(metric: str, device: torch.device) -> None:
+    """Raise SettingError if a metric needs a package that is not installed, or weights that cannot be downloaded."""
+    packages = {"flip": ("flip_evaluator", "flip-evaluator"), "lpips": ("lpips", "lpips")}
+    module, package = packages.get(metric, ("", ""))
+    if module and importlib.util.find_spec(module) is None:
+        raise SettingError(
+            f"--metrics: {metric} needs the package {package}, which is not installed: pip install 'nexwarp[{metric}]'"
+        )
+    if metric == "lpips":
+        try:
+            _load_lpips(device)
+        except (ImportError, OSError, RuntimeError) as error:
+            raise SettingError(f"--metrics: lpips cannot be computed: {one_line(error)}") from None
+
+
+def _load_lpips(device: torch.device) -> torch.nn.Module:
+    import lpips
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
+        return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+
+
 @lru_cache(maxsize=2)
 def _lpips_network(device: torch.device) -> torch.nn.Module | None:
     try:
-        import lpips
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
-            return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+        return _load_lpips(device)
     except (ImportError, OSError, RuntimeError) as error:
         warnings.warn(f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3)
         return None

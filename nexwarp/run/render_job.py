@@ -12,7 +12,7 @@ import torch
 
 from nexwarp.buffers import render_buffers, save_buffers
 from nexwarp.camera import Camera, resized
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS
 from nexwarp.errors import RunError, SettingError
@@ -21,7 +21,7 @@ from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.run.contents import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, frame_name, picture_name
-from nexwarp.run.folder import read_run
+from nexwarp.run.opened import OpenedModel
 from nexwarp.run.optics import PLAIN, Optics
 
 FRAMES, FPS = 120, 30.0
@@ -162,16 +162,18 @@ class RenderOrder:
         if self.video is not None:
             _check_video(self.video, FPS if self.fps is None else self.fps)
 
-    def prepare(self, run: Path) -> RenderJob:
+    def prepare(self, opened: OpenedModel) -> RenderJob:
         """Choose the cameras and the files; write nothing.
+
+        Args:
+            opened: the run or model; one without cameras has no still views, and its paths lead around its surfels.
 
         Raises:
             ValueError, FileNotFoundError: the message names the option or file.
         """
         size = self._size()
-        read_run(run)
-        cameras = load_cameras(run / CAMERAS_FILE)
-        renders, pictures = run / RENDERS_FOLDER, []
+        cameras = opened.cameras
+        renders, pictures = opened.folder / RENDERS_FOLDER, []
         if self.optics.kind != "pinhole":
             renders = renders / self.optics.kind
         for group in SETS[self.views]:
@@ -180,7 +182,7 @@ class RenderOrder:
                 pictures.append(PictureJob(file, size(camera), False, self.buffers))
         fps = FPS
         if self.path is not None and self.frames != 0:
-            folder, path, fps = self._path(cameras, renders)
+            folder, path, fps = self._path(opened, renders)
             first = size(path[0])
             path = [resized(size(camera), first.width, first.height) for camera in path]
             for i, camera in enumerate(path):
@@ -188,21 +190,24 @@ class RenderOrder:
                 wanted = self.buffers and self.views is None
                 pictures.append(PictureJob(folder / frame_name(i), camera, True, wanted, following))
         if not pictures:
-            raise RunError(f"{run / CAMERAS_FILE}: expected {self.views} views to render, found none")
+            raise RunError(
+                f"{opened.folder / CAMERAS_FILE}: expected {self.views} views to render, found none; see --path"
+            )
         fps = fps if self.fps is None else self.fps
         return RenderJob(pictures, self.video, fps, cast(Exposure | None, self.exposure), self.optics)
 
-    def _path(self, cameras: dict[str, dict[str, Camera]], renders: Path) -> tuple[Path, list[Camera], float]:
+    def _path(self, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
         assert self.path is not None
-        near = next((c.near for group in cameras.values() for c in group.values()), 0.01)
         if self.path not in PATHS:
             file = Path(self.path)
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
+            near = next((c.near for group in opened.cameras.values() for c in group.values()), opened.near)
             path = load_camera_path(file, near)
             return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
+        cameras = opened.path_cameras()
         views = cameras.get(TRAIN, {})
         if self.path == "interpolate":
             views = dict(sorted((views | cameras.get(TEST, {})).items()))

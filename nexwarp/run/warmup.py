@@ -20,6 +20,7 @@ from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.fused_texture import supported, takes_shape
+from nexwarp.ops.startup import start_warp
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
@@ -150,5 +151,5 @@ def tiny_scene() -> Scene:
 
 def cached_binaries() -> set[Path]:
     """Return the compiled kernels in Warp's cache."""
-    wp.init()  # sets the folder of the cache
+    start_warp()  # sets the folder of the cache
     return {path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in BINARIES}

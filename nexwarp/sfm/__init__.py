@@ -2,6 +2,7 @@
 
 from nexwarp.sfm.options import SfmOptions
 from nexwarp.sfm.pipeline import reconstruct
+from nexwarp.sfm.process import ProcessReport, process
 from nexwarp.sfm.report import SfmReport
 
-__all__ = ["SfmOptions", "SfmReport", "reconstruct"]
+__all__ = ["ProcessReport", "SfmOptions", "SfmReport", "process", "reconstruct"]

@@ -5,7 +5,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +13,12 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.io.json_files import write_json
+from nexwarp.io.json_files import Json, write_json
 from nexwarp.sfm.colmap_scene import move_scene
 from nexwarp.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.sfm.pairs import exhaustive_pairs, sequential_pairs
 from nexwarp.sfm.photos import InputPhoto, camera_groups, camera_model, list_photos, read_photos
-from nexwarp.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out
+from nexwarp.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out, moving_things
 from nexwarp.sfm.work import Count, open_database, quiet, run_stage
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def reconstruct(
     *,
     overwrite: bool = False,
     observe: Observer = lambda stage, done, total: None,
+    notes: Mapping[str, Json] | None = None,
 ) -> SfmReport:
     """Estimate the cameras and points of photos, and write a COLMAP scene for `load_scene`.
 
@@ -52,6 +53,7 @@ def reconstruct(
         options: settings; None is the defaults.
         overwrite: replace `scene` if this function wrote it.
         observe: called repeatedly with the stage's name, the number of finished items and their total.
+        notes: further entries of sfm.json.
 
     Returns:
         The report.
@@ -65,9 +67,9 @@ def reconstruct(
     photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
     options.check()
     names = list_photos(photos)
-    _check_target(photos, scene, overwrite)
+    check_target(photos, scene, overwrite)
     with (
-        _parents(scene),
+        parents(scene),
         tempfile.TemporaryDirectory(
             dir=scene.parent, prefix=f".{scene.name}-", ignore_cleanup_errors=True
         ) as temporary,
@@ -76,7 +78,8 @@ def reconstruct(
         work = _Work(photos, Path(temporary), options, observe)
         report = work.run(names)
         made = work.folder / "scene"
-        write_json(made / REPORT_FILE, dataclasses.asdict(report) | {"options": dataclasses.asdict(options)})
+        entries = dataclasses.asdict(report) | {"options": dataclasses.asdict(options)}
+        write_json(made / REPORT_FILE, entries | dict(notes or {}))
         _publish(made, scene, work.folder / "replaced")
     return report
 
@@ -134,6 +137,7 @@ class _Work:
             matching="sequential" if sequential else "exhaustive",
             seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
             advice=advise(overlaps, len(registered)),
+            moving=moving_things(overlaps, names),
         )
 
     @contextmanager
@@ -235,7 +239,11 @@ class _Work:
                 if count:
                     one, other = pycolmap.pair_id_to_image_pair(pair)
                     inliers[images[one], images[other]] = count
-        return Overlaps(features, inliers, pairs, sequential)
+            matches: dict[tuple[str, str], int] = {}
+            for pair, count in zip(*database.read_num_matches(), strict=True):
+                one, other = pycolmap.pair_id_to_image_pair(pair)
+                matches[images[one], images[other]] = count
+        return Overlaps(features, inliers, pairs, sequential, matches)
 
     def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list["pycolmap.Reconstruction"]:
         """Return all models, largest first."""
@@ -320,7 +328,7 @@ def _cameras(model: "pycolmap.Reconstruction", photos: dict[str, InputPhoto]) ->
     ]
 
 
-def _check_target(photos: Path, scene: Path, overwrite: bool) -> None:
+def check_target(photos: Path, scene: Path, overwrite: bool) -> None:
     """Raise FileExistsError or ValueError if `scene` may not be written, before any work."""
     source, target = photos.resolve(), scene.resolve()
     if source.is_relative_to(target) or target.is_relative_to(source):
@@ -336,7 +344,7 @@ def _check_target(photos: Path, scene: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _parents(scene: Path) -> Iterator[None]:
+def parents(scene: Path) -> Iterator[None]:
     """Create the folders above `scene`; after an error, remove those of them that are empty."""
     missing = [folder for folder in scene.absolute().parents if not folder.exists()]
     scene.absolute().parent.mkdir(parents=True, exist_ok=True)

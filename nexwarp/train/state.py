@@ -182,7 +182,7 @@ def restore_random(
     random.setstate((version, tuple(internal), gauss))
 
 
-def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str) -> None:
+def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str, *, extend: bool = False) -> None:
     """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
 
     Args:
@@ -190,9 +190,12 @@ def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str) -> 
         config: settings.
         views: fingerprint of the training views.
         scene: digest of the scene.
+        extend: whether the run may have had fewer iterations.
     """
     state = snapshot.state
     saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
+    if extend and saved.iterations < config.iterations:
+        saved = dataclasses.replace(saved, iterations=config.iterations)
     if saved != config:
         raise ValueError("its settings are others")
     if state["views"] != views:

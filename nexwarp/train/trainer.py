@@ -1,5 +1,6 @@
 """Training: the loop of paper Sec. 4.3, as a class that the command line and `nexwarp.train` drive."""
 
+import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from functools import cached_property, reduce
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.distributed.ranks import Ranks
@@ -15,6 +17,7 @@ from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
+from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
@@ -309,8 +312,15 @@ class Trainer:
         state = watched_tensors(dict(self._named_parameters()), self.optimizer)
         return state | {"densify.errors": self.densifier.errors}
 
-    def save(self, run: Path) -> None:
-        """Write a checkpoint: everything that shapes the future of the run.
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write a checkpoint, the model as it is, and the cameras into a folder, which the commands open."""
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        self.save_checkpoint(Path(folder))
+        save_model(folder, self.model())
+        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
+
+    def save_checkpoint(self, run: Path) -> None:
+        """Write a checkpoint into a folder: everything that shapes the future of the run.
 
         Raises:
             DivergedError: something in it is not finite.
@@ -327,12 +337,13 @@ class Trainer:
     def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
         return Snapshot(*load_checkpoint(run, warn))
 
-    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None) -> None:
+    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
 
         Args:
             run: run folder.
             warn: is told of a damaged checkpoint that is passed over.
+            extend: also accept a checkpoint of a run of fewer iterations; schedules are those of `config.iterations`.
 
         Raises:
             FileNotFoundError: there is none.
@@ -340,7 +351,7 @@ class Trainer:
         """
         snapshot = self._read(run, warn)
         try:
-            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest)
+            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
@@ -358,16 +369,9 @@ class Trainer:
         numbers, generators = gather_random(self.generator, self.noise, self.device)
         tensors = learned_tensors(self.surfels, self.texture, self.poses) | moments
         tensors |= {"densify.errors": self.densifier.errors, **numbers}
-        state = {
-            "iteration": self.iteration,
-            "seconds": self.seconds,
-            "order": list(self.order),
-            "views": self.views.fingerprint(),
-            **generators,
-            "rate_factor": self.rate_factor,
-            "scene": self._scene_digest,
-            "config": self.config.as_dict(),
-        }
+        state = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order), **generators}
+        state |= {"views": self.views.fingerprint(), "scene": self._scene_digest}
+        state |= {"rate_factor": self.rate_factor, "config": self.config.as_dict()}
         if optimizer is not None:
             state["optimizer"] = optimizer
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)

@@ -14,12 +14,11 @@ from nexwarp.camera import Camera
 from nexwarp.viewer.camera_path import Keyframe, interpolate, path_json
 from nexwarp.viewer.modes import Settings
 from nexwarp.viewer.panel import Panel, set_value
-from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, frustum_size, vertical_fov
 
 if TYPE_CHECKING:
     import viser
 
-FRUSTUM_SIZE = 0.16  # browser units; all cameras lie within 3 of the origin
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 PATH_COLOUR = (230, 70, 120)
 PLAY_FPS = 20
@@ -152,6 +151,7 @@ class Session:
         chosen = names[:: -(-len(names) // MOST_FRUSTUMS) or 1]
         poses = np.array([camera_to_world(self.cameras[name]) for name in chosen]).reshape(-1, 4, 4)
         self.places = self.world.to_browser(poses[:, :3, 3])
+        self.frustum_size = frustum_size(self.places)
         self.shown = np.ones(len(chosen), dtype=bool)
         self.group = self.client.scene.add_frame("/cameras", show_axes=False)
         for name, pose, place in zip(chosen, poses, self.places, strict=True):
@@ -161,7 +161,7 @@ class Session:
                 f"/cameras/{name}",
                 fov=vertical_fov(camera),
                 aspect=camera.width / camera.height * camera.fy / camera.fx,
-                scale=FRUSTUM_SIZE,
+                scale=self.frustum_size,
                 thickness=1.5,
                 thickness_units="screen",
                 color=COLOURS.get(name.partition("/")[0], (160, 160, 160)),
@@ -183,11 +183,11 @@ class Session:
             self.frustums[name].image = pixels
 
     def show_cameras(self, visible: bool, size: float) -> None:
-        """Show or hide the frustums; `size` is relative to `FRUSTUM_SIZE`."""
+        """Show or hide the frustums; `size` is relative to their first one."""
         self.group.visible = visible
         if size != self.frustum_shape[1]:
             for frustum in self.frustums.values():
-                frustum.scale = FRUSTUM_SIZE * size
+                frustum.scale = self.frustum_size * size
         self.frustum_shape = (visible, size)
         self._hide_near()
 
@@ -196,7 +196,7 @@ class Session:
         if self.viewpoint is None:
             return
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
-        reach = 1.5 * FRUSTUM_SIZE * self.frustum_shape[1]
+        reach = 1.5 * self.frustum_size * self.frustum_shape[1]
         far = np.linalg.norm(self.places - eye, axis=1) > reach
         frustums = list(self.frustums.values())
         for i in np.flatnonzero(far != self.shown):

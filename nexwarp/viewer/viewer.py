@@ -20,7 +20,7 @@ from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session
 from nexwarp.viewer.training_panel import TrainingPanel
-from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, vertical_fov
 
 if TYPE_CHECKING:
     import viser
@@ -153,11 +153,15 @@ class Viewer:
             model: returns the current model, as in the constructor.
         """
         self.model = model
+        self.redraw()
+        if self.training is not None:
+            self.training.finish(text)
+
+    def redraw(self) -> None:
+        """Draw all pictures anew: the model has changed."""
         for session in list(self.sessions.values()):
             session.drawn_version = -1  # its picture shows the previous model
         self._news.set()
-        if self.training is not None:
-            self.training.finish(text)
 
     # Drawing
 
@@ -278,8 +282,8 @@ class Viewer:
     # The page
 
     def _home(self) -> Viewpoint:
-        """The initial view: the first camera, or a view of the surfels' middle if there are no cameras."""
-        first = next(iter(self.cameras.values()), None)
+        """The initial view: the camera with the clearest one, or one of the surfels' middle if there are no cameras."""
+        first = clearest(list(self.cameras.values())) if self.cameras else None
         if first is not None:
             return Viewpoint(camera_to_world(first), vertical_fov(first), first.width, first.height)
         pose = np.eye(4)

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from nexwarp.camera import Camera
@@ -16,6 +17,9 @@ from nexwarp.viewer.pacing import MOST_SIDE
 
 # The browser moves two units a second, so that it crosses a scene of this radius in three seconds.
 RADIUS = 3.0
+MOST_COMPARED = 300  # cameras, for the first view
+FRUSTUM_SHARE = 0.4  # size of a frustum, in distances of neighbouring cameras
+SMALLEST_FRUSTUM, LARGEST_FRUSTUM = 0.02, 0.16  # browser units; all cameras lie within RADIUS of the origin
 BAND_ROWS = 16  # rows of a tile
 
 FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
@@ -150,6 +154,30 @@ class LimitedCamera(Camera):
     def focal(self) -> float:
         """Focal length for the weights of the texture's levels (paper Eq. 4), pixels."""
         return min(super().focal, self.focal_limit)
+
+
+def clearest(cameras: Sequence[Camera]) -> Camera:
+    """Return the camera in whose picture the frustums of the others cover the least; the first one of those.
+
+    A frustum covers about 1 / depth^2 of a picture, if its camera is inside of it. At most 300 cameras are compared.
+    """
+    chosen = list(cameras[:: -(-len(cameras) // MOST_COMPARED)])
+    centres = torch.stack([camera.position.detach().double().cpu() for camera in chosen])
+    covered: list[float] = []
+    for camera in chosen:
+        pixels, depths = camera.to("cpu", torch.float64).project(centres)
+        size = torch.tensor([camera.width, camera.height])
+        seen = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+        covered.append(float(depths[seen].square().reciprocal().sum()))
+    return chosen[int(np.argmin(np.round(covered, 9)))]
+
+
+def frustum_size(places: np.ndarray) -> float:
+    """Return a size of frustums at which those of neighbours among `places` (N, 3) stay apart; browser units."""
+    if len(places) < 2:
+        return LARGEST_FRUSTUM
+    distances = cKDTree(places).query(places, k=2)[0][:, 1]
+    return float(np.clip(FRUSTUM_SHARE * np.median(distances), SMALLEST_FRUSTUM, LARGEST_FRUSTUM))
 
 
 def camera_to_world(camera: Camera) -> np.ndarray:

@@ -109,13 +109,13 @@ def test_a_closed_terminal_does_not_stop_what_nohup_started(scene, tmp_path):
 
 
 def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, monkeypatch, capsys):
-    seen, save = [], Trainer.save
+    seen, save = [], Trainer.save_checkpoint
 
     def note(self, run):
         seen.append(self.iteration)
         save(self, run)
 
-    monkeypatch.setattr(Trainer, "save", note)
+    monkeypatch.setattr(Trainer, "save_checkpoint", note)
     run = tmp_path / "run"
     command = ["train", str(scene), "--run", str(run), *FLAGS]
     assert cli.main([*command, "--checkpoint-every", "7"]) == 0

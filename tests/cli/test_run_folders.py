@@ -24,7 +24,7 @@ def test_existing_run_is_refused_and_untouched(finished, scene, capsys):
     refused(capsys, command, str(finished), "exists", "--resume or --overwrite")
     refused(capsys, [*command, "--resume", "--overwrite"], "--resume, --overwrite", "at most one")
     for flag, value in (
-        ("--iterations", "40"),
+        ("--iterations", "10"),
         ("--max-surfels", "99"),
         ("--max-hits", "1"),
         ("--seed", "5"),

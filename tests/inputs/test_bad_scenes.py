@@ -60,7 +60,7 @@ BAD = {
         "each photo once, got view_00.* twice",
     ),
     "no file name": (frame(file_path=None), "frame 3: file_path: expected the name of a file, got None"),
-    "no such file": (frame(file_path="images/x.png"), "frame 3 .images/x.png.: image not found: .*x.png"),
+    "no such file": (frame(file_path="images/x.png"), "1 of .* photos: image not found: images/x.png; --skip-missing"),
     "parent": (frame(file_path="images/../../x.png"), "file_path: .* leaves the scene's folder"),
     "absolute": (frame(file_path="/etc/passwd"), "file_path: '/etc/passwd' leaves the scene's folder"),
     "drive": (frame(file_path="C:\\x.png"), "file_path: .* leaves the scene's folder"),

@@ -1,0 +1,86 @@
+"""`nexwarp process`, and the scene of a video that is given to `nexwarp train`."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from nexwarp.cli import display
+from nexwarp.cli.options import option
+from nexwarp.errors import RunError
+from nexwarp.io.json_files import READ_ERRORS, read_object
+from nexwarp.sfm import SfmOptions, process
+from nexwarp.sfm.photos import FILMS
+from nexwarp.sfm.pipeline import REPORT_FILE
+from nexwarp.sfm.process import FRAMES, video_identity
+
+SCENES = Path("scenes")
+
+
+@dataclass
+class Process:
+    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras as nexwarp sfm does.
+
+    Blurred frames and frames that repeat the one before are left out of a video, and named among photos. Frames in
+    which things move are named.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
+    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP) with its subfolders."""
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Output folder: images/, sparse/0/ and the report sfm.json."""
+    frames: Annotated[int, option("N")] = FRAMES
+    """Number of equal parts of a video, of which each gives its sharpest frame."""
+    settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
+    overwrite: bool = False
+    """Replace SCENE if nexwarp process or sfm created it."""
+
+    def __call__(self, console: Console) -> None:
+        """Make the scene."""
+        make_scene(self, console)
+        console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
+
+
+def make_scene(order: Process, console: Console) -> None:
+    """Make a scene, and print the report."""
+    with display.stages(console) as observe:
+        report = process(
+            order.source, order.scene, order.frames, order.settings, overwrite=order.overwrite, observe=observe
+        )
+    console.print(display.results_table(report.rows(), str(order.scene)))
+    for line in report.lines():
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def is_video(path: str) -> bool:
+    """Whether a path is the file of a video, by its suffix."""
+    return Path(path).suffix.lower() in FILMS and not Path(path).is_dir()
+
+
+def scene_of_video(video: Path, console: Console) -> Path:
+    """Return the scene of a video, scenes/NAME, which is made of it unless that was done before.
+
+    Raises:
+        RunError: the folder holds something else.
+    """
+    if not video.is_file():
+        raise FileNotFoundError(f"{video}: no such file, expected a video")
+    scene = SCENES / video.stem
+    if (scene / REPORT_FILE).is_file():
+        try:
+            made_of = read_object(scene / REPORT_FILE).get("video")
+        except READ_ERRORS:
+            made_of = None
+        if made_of == video_identity(video):
+            console.print(f"{video}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
+            return scene
+    if scene.exists():
+        raise RunError(
+            f"{scene}: expected no folder of that name, or a scene made of {video}; "
+            f"make a scene with nexwarp process {video} SCENE, and train that"
+        )
+    make_scene(Process(video, scene), console)
+    return scene

@@ -1,0 +1,108 @@
+"""What `nexwarp view`, `render`, `export`, `info` and `eval` open: a run, or a model that Python saved."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from nexwarp.camera import Camera
+from nexwarp.cameras.around import surrounding
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.errors import FormatError, MissingError
+from nexwarp.finish.order import ordered
+from nexwarp.model.detail import ORDERED
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
+from nexwarp.run.contents import CONFIG_FILE
+from nexwarp.run.folder import SceneSource, read_run
+from nexwarp.train.config import Config
+
+
+@dataclass(frozen=True)
+class OpenedModel:
+    """A run, or a model alone: its file, or a folder with `model.safetensors` and perhaps `cameras.json`.
+
+    Attributes:
+        path: as the user gave it.
+        folder: where results are written: the run, the model's folder, or a folder named after the model's file.
+        file: the model's file; a run that has not finished has none yet.
+        source: the run's scene; None for a model alone.
+        config: the run's settings; None for a model alone.
+    """
+
+    path: Path
+    folder: Path
+    file: Path
+    source: SceneSource | None
+    config: Config | None
+
+    @property
+    def title(self) -> str:
+        """Name of the scene, or of the model's file or folder."""
+        return self.folder.resolve().name if self.source is None else self.source.name
+
+    @cached_property
+    def model(self) -> Model:
+        """The model, on the CPU."""
+        return load(self.file)
+
+    def model_at(self, detail: float, device: torch.device) -> Model:
+        """Return the model on a device, at a detail as `Model.at_detail` describes it.
+
+        Models of older versions, with surfels in no order, are ordered by their share of the cameras' pictures.
+        """
+        if detail == 1.0:
+            return self.model.to(device)
+        try:
+            return load(self.file, detail=detail).to(device)
+        except FormatError:
+            whole = self.model.to(device)  # names a damaged file
+            cameras = [camera.to(device) for members in self.cameras.values() for camera in members.values()]
+            if whole.meta.get(ORDERED) is True or not cameras:
+                raise
+            return ordered(whole, cameras).at_detail(detail)
+
+    @property
+    def near(self) -> float:
+        """Near depth of new cameras, world units."""
+        return near_depth(self.model)
+
+    @cached_property
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """Cameras by set and name; none for a model alone without `cameras.json`. MissingError for a run without it."""
+        if self.source is None and not (self.folder / CAMERAS_FILE).is_file():
+            return {}
+        return load_cameras(self.folder / CAMERAS_FILE)
+
+    def path_cameras(self) -> dict[str, dict[str, Camera]]:
+        """Return the cameras that a path is made of; for a model without any, a ring around its surfels."""
+        if any(self.cameras.values()):
+            return self.cameras
+        ring = surrounding(self.model.surfels.means, self.near)
+        return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}
+
+
+def near_depth(model: Model) -> float:
+    """Return the near depth of a model's training cameras, world units; 0.01 if the model does not tell."""
+    return near if isinstance(near := model.meta.get("near"), float) else 0.01
+
+
+def open_model(path: Path) -> OpenedModel:
+    """Open a run folder, a folder with a model, or a model's file; the model itself is read on first use.
+
+    Raises:
+        FileNotFoundError: there is neither a run nor a model.
+        ValueError: the run's config is damaged.
+    """
+    folder, file = path, path / MODEL_FILE
+    if path.is_file() and path.suffix == SUFFIX:
+        folder, file = (path.parent if path.name == MODEL_FILE else path.with_suffix("")), path
+    if (folder / CONFIG_FILE).is_file() and file == folder / MODEL_FILE:
+        source, config, _ = read_run(folder)
+        return OpenedModel(path, folder, file, source, config)
+    if not file.is_file():
+        raise MissingError(
+            f"{path}: expected a run folder or a model, found no {CONFIG_FILE} and no {MODEL_FILE} there"
+        )
+    return OpenedModel(path, folder, file, None, None)

@@ -1,0 +1,156 @@
+"""Choice of sharp, distinct frames from a video, as photos for a reconstruction."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nexwarp.errors import SceneError, SettingError
+from nexwarp.io.pictures import save_jpeg
+from nexwarp.io.video import frame_luma, frame_pixels, read_frames
+
+SIDE = 640  # pixels of the longer side at which sharpness is measured: a blur below two of its pixels hardly shows
+THUMBNAIL = 160  # pixels of the longer side at which motion is measured
+NEIGHBOURS = 7  # chosen frames on either side that a frame's sharpness is compared with
+BLURRED = 0.5  # sharpness, relative to the median of the neighbours, below which a frame is left out
+STILL = 0.15  # motion since the frame before, in pixels of a thumbnail, below which a frame is left out
+FLAT = 1e-3  # least mean gradient of a thumbnail, grey levels a pixel
+FEWEST = 3  # frames that a reconstruction needs
+JPEG_QUALITY = 97
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """The frames of a video that become photos, and those that were left out. Numbers count from 0.
+
+    Attributes:
+        frames: number of frames in the video.
+        seconds: length of the video.
+        chosen: numbers of the chosen frames, ascending.
+        blurred: numbers of frames that were the sharpest of their part of the video and still blurred.
+        duplicates: numbers of frames that show nearly the same as the chosen frame before.
+    """
+
+    frames: int
+    seconds: float
+    chosen: list[int]
+    blurred: list[int]
+    duplicates: list[int]
+
+    def rows(self) -> dict[str, str]:
+        """The figures as rows of a table: name -> text."""
+        parts = len(self.chosen) + len(self.blurred) + len(self.duplicates)
+        return {
+            "video": f"{self.frames:,} frames, {self.seconds:.1f} s",
+            "frames taken": f"{len(self.chosen)}, the sharpest of each of {parts} parts but for those left out",
+            "left out": f"{len(self.blurred)} blurred, {len(self.duplicates)} that repeat the one before",
+        }
+
+
+def sharpness(luma: np.ndarray) -> float:
+    """Return the variance of an (H, W) uint8 picture's Laplacian, relative to the variance of its brightness.
+
+    A blur lowers it, as it removes fine detail and keeps coarse contrast; brightness and contrast do not matter.
+    """
+    from kornia.filters import laplacian
+
+    picture = torch.from_numpy(luma).float()[None, None]
+    return float(laplacian(picture, 3).var() / picture.var().clamp_min(1.0))
+
+
+def reduced_luma(luma: np.ndarray, longest: int = SIDE) -> np.ndarray:
+    """Return an (H, W) uint8 picture reduced to at most `longest` pixels a side."""
+    from PIL import Image
+
+    picture = Image.fromarray(luma)
+    picture.thumbnail((longest, longest), Image.Resampling.BOX)
+    return np.array(picture)
+
+
+def motion(luma: np.ndarray, before: np.ndarray) -> float:
+    """Return about how far, in pixels, one (H, W) uint8 picture has moved against another: |change| / |gradient|."""
+    first, second = before.astype(np.float32), luma.astype(np.float32)
+    gradient = float(np.mean(np.hypot(*np.gradient(first))))
+    return float(np.mean(np.abs(second - first))) / max(gradient, FLAT)
+
+
+def choose_frames(path: str | os.PathLike[str], count: int, observe: Callable[[str, int, int], None]) -> FrameChoice:
+    """Divide a video into `count` parts of equal length, and choose the sharpest frame of each.
+
+    A chosen frame is left out if it is much less sharp than its neighbours, or nearly the same as the one before.
+
+    Args:
+        path: the video.
+        count: number of parts, at least 3; a video with fewer frames has a part for each frame.
+        observe: called with the stage's name, the number of frames read and their total, which is not known before.
+
+    Raises:
+        SettingError: `count` is less than 3, or PyAV is missing.
+        FormatError: the file is no video, or is damaged.
+        SceneError: fewer than 3 frames are left.
+    """
+    if count < FEWEST:
+        raise SettingError(f"--frames: expected at least {FEWEST}, got {count}")
+    scores: list[float] = []
+    thumbnails: list[np.ndarray] = []
+    seconds = 0.0
+    for frame in read_frames(path):
+        scores.append(sharpness(frame_luma(frame, SIDE)))
+        thumbnails.append(frame_luma(frame, THUMBNAIL))
+        seconds = max(seconds, frame.time or 0.0)
+        observe("reading the video", len(scores), len(scores))
+    candidates = [part[int(np.argmax([scores[i] for i in part]))] for part in _parts(len(scores), count)]
+    blurred = [
+        index
+        for place, index in enumerate(candidates)
+        if scores[index] < BLURRED * np.median([scores[i] for i in _around(candidates, place)])
+    ]
+    chosen: list[int] = []
+    duplicates: list[int] = []
+    for index in candidates:
+        if index in blurred:
+            continue
+        if chosen and motion(thumbnails[index], thumbnails[chosen[-1]]) < STILL:
+            duplicates.append(index)
+        else:
+            chosen.append(index)
+    if len(chosen) < FEWEST:
+        raise SceneError(
+            f"{path}: expected a video of a moving camera, got {len(scores)} frames, of which {len(chosen)} are sharp "
+            "and differ"
+        )
+    return FrameChoice(len(scores), seconds, chosen, blurred, duplicates)
+
+
+def write_frames(
+    path: str | os.PathLike[str], choice: FrameChoice, folder: Path, observe: Callable[[str, int, int], None]
+) -> None:
+    """Write the chosen frames of a video into a folder, as frame_NUMBER.jpg in the order of the video."""
+    wanted = set(choice.chosen)
+    done = 0
+    for index, frame in enumerate(read_frames(path)):
+        if index in wanted:
+            save_jpeg(folder / frame_name(index), torch.from_numpy(frame_pixels(frame)), JPEG_QUALITY)
+            done += 1
+            observe("writing frames", done, len(wanted))
+            if done == len(wanted):
+                return
+
+
+def frame_name(index: int) -> str:
+    """Return the file name of a frame."""
+    return f"frame_{index:06d}.jpg"
+
+
+def _parts(total: int, count: int) -> list[range]:
+    """Divide range(total) into at most `count` parts of equal length."""
+    count = min(count, total)
+    return [range(total * k // count, total * (k + 1) // count) for k in range(count)]
+
+
+def _around(items: Sequence[int], place: int) -> Sequence[int]:
+    """Return the items around a place."""
+    return items[max(place - NEIGHBOURS, 0) : place + NEIGHBOURS + 1]

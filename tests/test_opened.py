@@ -1,0 +1,100 @@
+"""Models that Python saved open in view, render, export, info and eval, with or without a run around them."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cameras.around import surrounding
+from nexwarp.cli import main as cli
+from nexwarp.data import write_demo
+from nexwarp.run.evaluate import evaluate
+from nexwarp.run.opened import open_model
+from nexwarp.train.trainer import Trainer
+from tests.scenes import make_surfels, make_texture, random_scene
+from tests.trainer_support import small
+
+SIZE = ["--size", "32x24", "--device", "cpu"]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=48, height=36, views=10, points=200)
+
+
+@pytest.fixture
+def model() -> nw.Model:
+    return nw.Model(make_surfels(random_scene(30)), make_texture(), options=nw.RenderOptions(sh_degree=2))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Return the one line on stderr of a command that exits with 2."""
+    capsys.readouterr()
+    assert cli.main([str(argument) for argument in arguments]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
+    return err
+
+
+@pytest.mark.parametrize("name", ["folder", "scene.safetensors"])
+def test_a_saved_model_opens_everywhere(
+    name: str, model: nw.Model, demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = tmp_path / name
+    model.save(saved)
+    results = tmp_path / "scene" if saved.suffix else saved
+    assert cli.main(["info", str(saved)]) == 0
+    assert "30" in capsys.readouterr().out
+    assert cli.main(["render", str(saved), "--frames", "3", *SIZE]) == 0
+    assert [f.name for f in sorted((results / "renders" / "ellipse").iterdir())] == ["0000.png", "0001.png", "0002.png"]
+    assert cli.main(["export", str(saved)]) == 0
+    assert {f.name for f in (results / "export").iterdir()} == {"surfels.ply", "splats.ply"}
+    assert "give --scene SCENE" in refused(capsys, "eval", saved)
+    assert "expected test views to render, found none" in refused(capsys, "render", saved, "--set", "test")
+    assert cli.main(["eval", str(saved), "--scene", str(demo), "--device", "cpu"]) == 0
+    metrics = json.loads((results / "metrics.json").read_text())
+    views = nw.load_scene(demo).test
+    assert metrics["psnr"] == pytest.approx(evaluate(nw.load(saved), views)["psnr"])
+
+
+def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(demo: Path, tmp_path: Path) -> None:
+    scene, config = nw.load_scene(demo), small(iterations=4)
+    trainer = Trainer(scene, config, "cpu")
+    trainer.run(until=2)
+    folder = tmp_path / "new" / "folder"
+    trainer.save(folder)
+    opened = open_model(folder)
+    assert torch.equal(opened.model.surfels.means, trainer.surfels.means)
+    assert opened.cameras["test"].keys() == {view.name for view in scene.test}
+    assert opened.near == pytest.approx(scene.train[0].camera.near)
+    assert cli.main(["render", str(folder), "--set", "test", "--device", "cpu"]) == 0
+    assert cli.main(["eval", str(folder), "--scene", str(demo), "--device", "cpu"]) == 0
+    again = Trainer(scene, config, "cpu")
+    again.restore(folder)
+    for each in (trainer, again):
+        each.run()
+    assert torch.equal(trainer.surfels.means, again.surfels.means)
+
+
+def test_the_ring_around_a_scene_sees_its_middle() -> None:
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) + torch.tensor([5.0, -3.0, 2.0])
+    for camera in surrounding(points, near=0.1):
+        middle = points.median(dim=0).values
+        pixels, depths = camera.project(middle[None])
+        torch.testing.assert_close(pixels[0], torch.tensor([camera.width / 2, camera.height / 2]), atol=1e-2, rtol=0)
+        assert depths[0] > (points - middle).norm(dim=1).median()
+        inside, _ = camera.project(points)
+        seen = (inside >= 0).all(-1) & (inside < torch.tensor([camera.width, camera.height])).all(-1)
+        assert seen.float().mean() > 0.8
+
+
+@pytest.mark.parametrize("metric", ["lpips", "flip"])
+def test_a_metric_without_its_package_is_one_line(
+    metric: str, model: nw.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model.save(tmp_path / "run")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    line = refused(capsys, "eval", tmp_path / "run", "--scene", "nowhere", "--metrics", metric)
+    assert f"--metrics: {metric} needs the package" in line and f"pip install 'nexwarp[{metric}]'" in line
