@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "requirements"
 # torch and CUDA are on their own, since many users have another build of torch, with other hashes.
 TORCH = re.compile(r"torch==|triton==|nvidia-|cuda-")
-USERS = ("--extra=viewer", "--extra=video", "--extra=tensorboard", "--extra=wandb", "--extra=flip")
+EXTRAS = ("viewer", "video", "tensorboard", "wandb", "flip", "wgpu", "glb", "splats")  # of users, in run.txt
 HEADERS = {
     "torch": "torch and its CUDA libraries.",
-    "run": "What nexwarp and its extras viewer, video, tensorboard, wandb and flip need beside torch.txt.",
+    "run": f"What nexwarp and its extras {', '.join(EXTRAS)} need beside torch.txt.",
     "dev": "What the other extras need beside torch.txt and run.txt: tests, documentation, releases.",
 }
 
@@ -36,7 +36,7 @@ def resolve(*options: str) -> list[str]:
 def main() -> None:
     """Write the three files."""
     FOLDER.mkdir(exist_ok=True)
-    users = {block.split("==")[0] for block in resolve(*USERS)}
+    users = {block.split("==")[0] for block in resolve(*(f"--extra={extra}" for extra in EXTRAS))}
     texts = {file: f"# {header} Written by .ci/lock.py.\n" for file, header in HEADERS.items()}
     for block in resolve("--all-extras"):
         texts["torch" if TORCH.match(block) else "run" if block.split("==")[0] in users else "dev"] += block

@@ -19,7 +19,7 @@ from nexwarp.io.json_files import Json, write_json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, picture_name, remove_leftovers
+from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TRAIN, picture_name, remove_leftovers
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog

@@ -79,14 +79,14 @@ def export_run(
         return [save_model(folder / COMPACT_FILE, opened.model, compact=True)]
     if kind == "glb":
         return _export_glb(opened, folder, device)
-    cameras = list(_all_cameras(opened).values())
+    views = list(_all_cameras(opened).values())
     gaussians = (opened.model.surfels, opened.model.options.sh_degree)
     if kind == "spz":
-        save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=cameras, max_extent=max_extent)
+        save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=views, max_extent=max_extent)
         return [folder / SPZ_FILE]
     files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
-    save_surfels_ply(files[0], model.surfels)
-    save_splats_ply(files[1], *gaussians, cameras=cameras, max_extent=max_extent)
+    save_surfels_ply(files[0], opened.model.surfels)
+    save_splats_ply(files[1], *gaussians, cameras=views, max_extent=max_extent)
     return files
 
 
