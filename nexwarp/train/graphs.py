@@ -241,21 +241,22 @@ def can_capture(optimizer: torch.optim.Optimizer) -> bool:
 
 
 def graph_key(
-    options: RenderOptions, optimizer: torch.optim.Optimizer, state: Sequence[torch.Tensor], *, densify: bool
+    options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
 ) -> Hashable:
     """Key that decides whether a captured graph can be reused, beside its target's kind.
 
     Args:
         options: how the step renders.
-        optimizer: whose learning rates are tensors.
-        state: tensors that a step reads and writes: the parameters, their moments and the densifier's sums.
+        optimizer: whose learning rates are tensors; a step reads and writes its moments.
+        tensors: what else a step reads and writes: the parameters and the densifier's sums.
         densify: whether the step adds to these sums.
     """
+    moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
     return (
         densify,
         options.max_hits,
         options.sh_degree,
         torch.are_deterministic_algorithms_enabled(),
-        *((x.data_ptr(), x.shape) for x in state),
+        *((x.data_ptr(), x.shape) for x in (*tensors, *moments)),
         *(group["lr"].data_ptr() for group in optimizer.param_groups),
     )

@@ -246,11 +246,8 @@ class Trainer:
         return None
 
     def _graph_key(self) -> Hashable:
-        state = [self.densifier.errors]
-        for _, parameter in self._named_parameters():
-            kept = self.optimizer.state.get(parameter, {}).values()
-            state += [parameter, *(x for x in kept if isinstance(x, torch.Tensor))]
-        key = graph_key(self.render_options(), self.optimizer, state, densify=self.densifier.active(self.iteration))
+        tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
+        key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
         return key, self.texture.half_copy_key()
 
     def _floaters_due(self) -> bool:
@@ -283,9 +280,7 @@ class Trainer:
         return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
-        """Return a finished model, with surfels of its own: smooth SH, detail limits and exposures, as configured.
-
-        The texture is the trainer's own.
+        """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures.
 
         Args:
             observe: called with each stage's name, how many views of it are rendered, and of how many.
