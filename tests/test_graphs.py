@@ -217,7 +217,7 @@ def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene:
 
     def failing(target: Target) -> step_graphs.StepResult:
         if trainer.iteration == 31 and not failed:  # the first step after a round
-            assert graphs_of(trainer) > 0
+            assert trainer.graphs is not None and trainer.graphs.keeper is not None  # whose memory may be missing
             failed.append(1)
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return optimize(target)

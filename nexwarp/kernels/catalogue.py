@@ -77,7 +77,9 @@ def thread_kernels(
         yield from (kernels.forward, kernels.backward)
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
     yield from (antialias_kernels(real).forward, limit_depths_kernel(real))
-    yield from (surfel_ids_kernel, tile_offsets_kernel)
+    yield tile_offsets_kernel
+    if cpu:  # elsewhere the surfels themselves are sorted
+        yield surfel_ids_kernel
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     if not cpu:
         yield adam_kernel()

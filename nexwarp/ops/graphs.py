@@ -1,5 +1,6 @@
 """Recording of launches, torch's and Warp's alike, as CUDA graphs."""
 
+import gc
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -21,7 +22,7 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
     """
     ours = stream_on(stream)  # before: Warp may have to start first
     stream.wait_stream(torch.cuda.current_stream(stream.device))
-    with warp_streams, torch.cuda.stream(stream):
+    with warp_streams, torch.cuda.stream(stream), _no_collection():
         graph.capture_begin(pool=pool, capture_error_mode="thread_local")
         try:
             # Lets Warp take the temporary memory of its sorts from the graph.
@@ -37,7 +38,7 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
                 with warnings.catch_warnings():
                     warnings.filterwarnings("ignore", "The CUDA Graph is empty")  # nothing was launched before it
                     graph.capture_end()
-            except RuntimeError:
+            except Exception:
                 # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
                 with suppress(RuntimeError):
                     torch._C._cuda_endAllocateToPool(stream.device_index, pool)
@@ -45,3 +46,15 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
                 generator.graphsafe_set_state(generator.clone_state())
             raise
     torch.cuda.current_stream(stream.device).wait_stream(stream)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Keep Python from collecting garbage: freeing other graphs in the middle of a capture may invalidate it."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -35,8 +35,9 @@ class DistanceField:
             truncation: distance to a surface at which the field ends, world units; at most the side of a block.
             device: of the field.
         """
-        self.voxel, self.truncation, self.device = voxel, truncation, device
+        self.voxel, self.truncation = voxel, truncation
         self.keys = torch.zeros(0, dtype=torch.int64, device=device)
+        self.device = self.keys.device  # with its index
 
     def reserve(self, camera: Camera, depths: torch.Tensor, most: int) -> None:
         """Note the blocks around a depth image's surfaces; ValueError when there are more than `most`.
