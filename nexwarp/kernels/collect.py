@@ -32,7 +32,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
     load = record_row_function(real)
-    vec, ivec, colors = buffer_types(real, max_hits)
+    vec, ivec, _ = buffer_types(real, max_hits)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
@@ -78,7 +78,6 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         color = vec3()
         buffer_ids = ivec()
         buffer_weights = vec()
-        buffer_colors = colors()
         for j in range(wp.static(max_hits)):
             buffer_ids[j] = -1
         overflow = overflowed(ends, surfel_ids)
@@ -129,37 +128,34 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                     displaced = bool(False)
                     out_id = int(i)
                     out_weight = real(weight)
-                    out_color = vec3(rc[0], rc[1], rc[2])
                     for j in range(wp.static(max_hits)):
                         w_ = buffer_weights[j]
                         i_ = buffer_ids[j]
-                        c_ = vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2])
                         displaced = displaced or out_weight > w_
                         buffer_weights[j] = wp.where(displaced, out_weight, w_)
                         buffer_ids[j] = wp.where(displaced, out_id, i_)
-                        buffer_colors[j, 0] = wp.where(displaced, out_color[0], c_[0])
-                        buffer_colors[j, 1] = wp.where(displaced, out_color[1], c_[1])
-                        buffer_colors[j, 2] = wp.where(displaced, out_color[2], c_[2])
                         out_weight = wp.where(displaced, w_, out_weight)
                         out_id = wp.where(displaced, i_, out_id)
-                        out_color = wp.where(displaced, c_, out_color)
-                    # Out of an empty slot comes the weight 0.
-                    color += out_color * out_weight
+                    # Its colour is read again: colours in the buffer would cost registers and moves. Out of an empty
+                    # slot comes the weight 0.
+                    if wp.static(max_hits > 0):
+                        rc = load(records, wp.max(out_id, 0), 3)
+                    color += vec3(rc[0], rc[1], rc[2]) * out_weight
         if not inside:
             return
         p = xy[1] * size[0] + xy[0]
         plain[p] = color
         kept = vec3()
         for j in range(wp.static(max_hits)):
-            kept += vec3(buffer_colors[j, 0], buffer_colors[j, 1], buffer_colors[j, 2]) * buffer_weights[j]
             i = buffer_ids[j]
-            # Computed again: in the loop, depths would cost registers and moves.
             depth = real(0.0)
             if i >= 0:
                 ra = load(records, i, 0)
                 rb = load(records, i, 1)
                 rn = load(records, i, 2)
-                u, v, depth = h.plane(ra, rb, rn, load(records, i, 3)[3], d[0], d[1])
+                rc = load(records, i, 3)
+                kept += vec3(rc[0], rc[1], rc[2]) * buffer_weights[j]
+                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
                 if wp.static(low_pass):
                     _alpha, depth = h.kernel(u, v, depth, ra, rb, rn, centers[i], d[0], d[1], focal, near)
             ids[p, j] = i
