@@ -208,7 +208,7 @@ def test_a_finished_model_can_go_on_training(tmp_path: Path) -> None:
         trainer.run(until=10)
     seen: dict[str, list[tuple[int, int]]] = {}
     model = one.finish(lambda stage, done, total: seen.setdefault(stage, []).append((done, total)))
-    assert list(seen) == ["smoothing SH", "measuring detail limits", "predicting auto exposure"]
+    assert list(seen) == ["smoothing SH", "measuring detail limits", "predicting auto exposure", "ordering surfels"]
     views = len(scene.train)
     for stage, counts in seen.items():
         assert [done for done, _ in counts] == [*range(1, len(counts) + 1)], stage

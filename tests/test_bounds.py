@@ -156,7 +156,7 @@ def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
     assert set(TENSORS) == tensors.keys()
 
 
-@pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats"}))
+@pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats", *MERGED}))
 @pytest.mark.parametrize("end", [0, 1])
 def test_bounds_themselves_render_finite(stored: Path, tmp_path: Path, name: str, end: int) -> None:
     """All elements at an end of the range at once, up to the float32 value next to it."""

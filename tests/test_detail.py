@@ -136,7 +136,7 @@ def test_a_finished_training_is_ordered(tmp_path: Path) -> None:
     from tests.trainer_support import small
 
     scene = nw.load_scene(write_demo(tmp_path / "tiny", width=48, height=36, views=10, points=200))
-    config = small(iterations=2, exposures=False, metering=False, smooth_sh=0.0, footprints=False)
+    config = small(iterations=2, exposures=False, smooth_sh=0.0, footprints=False)
     model = nw.train(scene, config, device="cpu")
     shares = picture_shares(model, [view.camera for view in scene.train])
     assert model.meta["ordered"] is True

@@ -24,7 +24,7 @@ def test_floaters_are_looked_for_while_there_is_time_to_learn_what_was_behind(sc
     monkeypatch.setattr(trainer_module, "FLOATERS_EVERY", 1)
     looks = []
 
-    def first(model, cameras, nearest, generator, *, last):
+    def first(model, cameras, nearest, generator, *, last, ranks):
         looks.append((trainer.iteration, len(model.surfels), generator.initial_seed()))
         assert last == (trainer.iteration == 60)
         return torch.arange(len(model.surfels)) == 0

@@ -22,7 +22,7 @@ SCENES = Path("scenes")
 
 @dataclass
 class Process:
-    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras as nexwarp sfm does.
+    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras as `sfm` does.
 
     Blurred frames and frames that repeat the one before are left out of a video, and named among photos. Frames in
     which things move are named.

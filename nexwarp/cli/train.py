@@ -51,7 +51,7 @@ class Train:
 
     scene: Scene_
     """Folder of a COLMAP, nerfstudio or Blender scene, `demo` for the built-in one (docs/scenes.md), or a video, which
-    first becomes the scene scenes/NAME as with `nexwarp process`."""
+    first becomes the scene scenes/NAME as with the command `process`."""
     run: Annotated[Path | None, option("RUN", "runs/SCENE")] = None
     """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None

@@ -21,7 +21,7 @@ def picture_shares(model: Model, cameras: Iterable[Camera]) -> torch.Tensor:
         model: its surfels and options count.
         cameras: of the training views, on any device.
     """
-    bare = model.bare(max_hits=0)
+    bare = model.bare()
     shares = torch.zeros_like(model.surfels.logit_opacities)
     for camera in cameras:
         out = bare.render(reduced(camera, HEIGHT))

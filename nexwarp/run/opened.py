@@ -77,7 +77,7 @@ class OpenedModel:
 
     def path_cameras(self) -> dict[str, dict[str, Camera]]:
         """Return the cameras that a path is made of; for a model without any, a ring around its surfels."""
-        if any(self.cameras.values()):
+        if self.source is not None or any(self.cameras.values()):
             return self.cameras
         ring = surrounding(self.model.surfels.means, self.near)
         return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}

@@ -57,7 +57,7 @@ def test_no_registered_images(tmp_path, refuses):
 def test_absent_photo(tmp_path, refuses):
     folder = make_scene(tmp_path / "scene")
     (folder / "images" / "03.png").unlink()
-    refuses(folder, [], str(folder / "images" / "03.png"), "not found", "the COLMAP model names it")
+    refuses(folder, [], str(folder), "of 10 photos: image not found: 03.png; --skip-missing")
 
 
 def test_truncated_photo(tmp_path, refuses):
@@ -147,7 +147,7 @@ def test_negative_frames(finished, capsys):
     ("arguments", "words"),
     [
         ([], ["expected one of {train, eval", "see nexwarp --help"]),
-        (["fly"], ["unrecognized options: fly", "see nexwarp --help"]),
+        (["fly"], ["no command 'fly', expected one of train, eval"]),
         (["train"], ["missing from nexwarp train: scene folder of a colmap", "see nexwarp train --help"]),
         (["train", "x", "--iterations", "many"], ["--iterations: expected an integer, got 'many'; see nexwarp train"]),
         (["train", "x", "--port", "8o80"], ["--port: expected an integer, got '8o80'; see nexwarp train --help"]),

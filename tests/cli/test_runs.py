@@ -27,12 +27,15 @@ pytestmark = pytest.mark.usefixtures("small_preset")
 # A run
 
 
+LINKS = {"follow_links": False, "skip_missing": False}
+
+
 def test_a_run_holds_what_it_should(trained, scene):
     assert {f.name for f in trained.iterdir()} == RUN_FILES
     assert {f.name for f in (trained / "checkpoint").iterdir()} == {"tensors.safetensors", "state.json"}
     config = read(trained, "config.json")
     given = {"path": str(scene.resolve()), "images": "images", "downscale": 1, "masks": "masks"}
-    assert config["scene"] == given | dict.fromkeys(("background", "points", "format"))
+    assert config["scene"] == given | LINKS | dict.fromkeys(("background", "points", "format"))
     assert config["device"] == "cpu" and config["config"]["preset"] == "default"
     settings = config_from_dict(config["config"])
     assert (settings.iterations, settings.max_surfels, settings.texture) == (20, 100, SMALL.texture)
@@ -189,7 +192,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
     assert "50 points" in capsys.readouterr().out
     config = read(run, "config.json")
     given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
-    assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given
+    assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given | LINKS
     assert config["config"]["background"] == [0.0, 0.5, 1.0]
     assert nw.load(run).options.background == (0.0, 0.5, 1.0)
     before = read(run, "metrics.json")["psnr"]
