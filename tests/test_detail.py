@@ -156,7 +156,7 @@ def test_the_viewer_has_a_coarse_model_first_and_the_whole_one_later(model: nw.M
     assert thread is not None and len(gradual().surfels) == 6 and not ready.is_set()
     gate.set()
     thread.join(10.0)
-    assert ready.is_set() and gradual() is whole
+    assert ready.is_set() and gradual() is whole and gradual.whole() is whole
 
     def fail() -> nw.Model:
         raise OSError("gone")

@@ -98,3 +98,11 @@ def test_a_metric_without_its_package_is_one_line(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     line = refused(capsys, "eval", tmp_path / "run", "--scene", "nowhere", "--metrics", metric)
     assert f"--metrics: {metric} needs the package" in line and f"pip install 'nexwarp[{metric}]'" in line
+
+
+def test_a_model_beside_a_run_of_its_name_leaves_the_run_alone(model: nw.Model, tmp_path: Path) -> None:
+    file = tmp_path / "fox.safetensors"
+    model.save(tmp_path / "fox")
+    model.save(file)
+    opened = open_model(file)
+    assert opened.folder == tmp_path / "fox.safetensors.results" and opened.source is None and opened.cameras == {}

@@ -123,6 +123,10 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
     broken.write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(100))
     refused(capsys, ["process", str(broken), str(scene)], "broken.mp4: expected a video, could not decode it")
     refused(capsys, ["process", str(tmp_path / "no.mp4"), str(scene)], "no.mp4", "no such")
+    # A training's settings are checked before the video is decoded.
+    refused(
+        capsys, ["train", str(broken), "--run", str(tmp_path / "run"), "--set", "typo=1"], "typo: expected a setting"
+    )
     picture = texture()[20:140, :160]
     still = clip(tmp_path / "still.mp4", 10, lambda i, x: picture)
     refused(capsys, ["process", str(still), str(scene)], "expected a video of a moving camera, got 10 frames", "1 are")

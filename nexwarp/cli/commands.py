@@ -113,7 +113,7 @@ class Export:
 
     --format mesh writes mesh.ply: a triangle mesh with colours, from the depths of the training views.
 
-    --format compact writes compact.safetensors, the model in about a third of its size: `nexwarp.load` reads it.
+    --format compact writes compact.safetensors, the model in less than half of its size: `nexwarp.load` reads it.
 
     --format cameras writes all cameras for nerfstudio: as transforms.json, and as a camera path in the order of their
     names, camera_path.json.

@@ -133,7 +133,7 @@ class Train:
     def _train(self, ranks: Ranks, console: Console) -> None:
         if is_video(self.scene):
             # Rank 0 makes the scene; the others find it.
-            made = str(self._scene_of_video(console)) if ranks.first else None
+            made = str(self._scene_of_video(ranks, console)) if ranks.first else None
             self.scene = str(ranks.share(made)) if ranks.size > 1 else str(made)
         run = self.run or Path("runs") / self._source().name
         with ExitStack() as claim:
@@ -172,13 +172,16 @@ class Train:
                 soft_wrap=True,
             )
 
+    def _folder_flags(self, run: Path, ranks: Ranks) -> dict[str, bool]:
+        """Whether to resume or to overwrite; ranks that torchrun has restarted go on with the run that they began."""
+        again = ranks.restarted and began(run, ranks.launch)
+        return {"resume": self.resume or again, "overwrite": self.overwrite and not again}
+
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[SceneSource, Config, bool]:
         """Claim the run folder, on rank 0; return scene, settings and whether to resume, the same on all ranks."""
         source, config, resume = self._source(), None, False
         if ranks.first:
-            # Ranks that torchrun has restarted go on with the run that they had begun.
-            again = ranks.restarted and began(run, ranks.launch)
-            flags = {"resume": self.resume or again, "overwrite": self.overwrite and not again}
+            flags = self._folder_flags(run, ranks)
             resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
             if resume:
                 source = self._resumed_source(source, run)
@@ -255,12 +258,12 @@ class Train:
         print_url(viewer, console)
         return viewer
 
-    def _scene_of_video(self, console: Console) -> Path:
+    def _scene_of_video(self, ranks: Ranks, console: Console) -> Path:
         """Return the scene of a video; what would stop the training later stops it before the scene is made."""
         video = Path(self.scene)
         self._check()
         run, scene = self.run or Path("runs") / video.stem, SceneSource(str(SCENES / video.stem))
-        prepare_run(run, scene, resume=self.resume, overwrite=self.overwrite)
+        self._config(run, prepare_run(run, scene, **self._folder_flags(run, ranks)))
         return scene_of_video(video, console)
 
     def _source(self) -> SceneSource:

@@ -54,7 +54,7 @@ class ViewCommand:
             host=self.host,
             port=self.port,
             save_path=partial(keep_camera_path, opened.folder, opened=self.run),
-            make_page=lambda: web_page(model(), named, opened.title),
+            make_page=lambda: web_page(model.whole(), named, opened.title),
         ) as viewer:
             model.read_rest(viewer.redraw)
             show_until_interrupted(viewer, console)

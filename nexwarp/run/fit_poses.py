@@ -72,7 +72,7 @@ def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
     small = _halved(given, photo, counts)
     best, least = given.viewmat, float("inf")
     for step in range(steps + 1):
-        coarse = small is not None and step < steps // 2
+        coarse = small is not None and 0 < step < steps // 2  # the given pose is judged at full size
         camera, target, mask = small if coarse and small is not None else (given, photo, counts)
         viewmat = corrected(given.viewmat, units * twist, pivot)
         moved = dataclasses.replace(camera, viewmat=viewmat, checked=(camera.fx, camera.fy, camera.cx, camera.cy))

@@ -25,7 +25,8 @@ class OpenedModel:
 
     Attributes:
         path: as the user gave it.
-        folder: where results are written: the run, the model's folder, or a folder named after the model's file.
+        folder: where results are written: the run, the model's folder, or a folder named after the model's file, never
+            that of another model.
         file: the model's file; a run that has not finished has none yet.
         source: the run's scene; None for a model alone.
         config: the run's settings; None for a model alone.
@@ -98,6 +99,8 @@ def open_model(path: Path) -> OpenedModel:
     folder, file = path, path / MODEL_FILE
     if path.is_file() and path.suffix == SUFFIX:
         folder, file = (path.parent if path.name == MODEL_FILE else path.with_suffix("")), path
+        if path.name != MODEL_FILE and ((folder / CONFIG_FILE).is_file() or (folder / MODEL_FILE).is_file()):
+            folder = path.with_name(f"{path.name}.results")  # another model's folder is left alone
     if (folder / CONFIG_FILE).is_file() and file == folder / MODEL_FILE:
         source, config, _ = read_run(folder)
         return OpenedModel(path, folder, file, source, config)

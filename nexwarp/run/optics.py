@@ -91,7 +91,7 @@ class Optics:
             following: the camera of the path's next frame, towards which an open shutter sees the camera move.
             changes: see `Model.render`.
         """
-        if not self.averages:
+        if self.aperture == 0 and (self.shutter == 0 or following is None):
             return model.render(self._taken(model, camera), **changes).image
         focus = self.focus
         if focus is None and self.aperture > 0:

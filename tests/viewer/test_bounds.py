@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -298,8 +299,13 @@ def test_a_screenshot_counts_in_full_for_the_share_of_time(model, monkeypatch):
         session = session_of(viewer)
         counted: list[float] = []
         monkeypatch.setattr(viewer.share, "spend", lambda _, seconds: counted.append(seconds))
-        for _ in range(2):
+
+        def drawn(count: int) -> bool:
+            viewer.between_steps(1, lambda: "fine")
+            return len(counted) >= count
+
+        for count in (1, 2):
             wait_for(lambda: not session.waiting())
             session.take_screenshot(64)
-            viewer.between_steps(1, lambda: "fine")
+            wait_for(partial(drawn, count))
         assert counted[0] == pacing.FIRST_SECONDS and counted[1] >= 0.3

@@ -283,9 +283,11 @@ class Viewer {
         const mode = new URLSearchParams(text).get("mode") ?? "image";
         if (!pose) return;
         this.pose = pose;
-        if (mode !== this.mode && Object.hasOwn(MODES, mode)) {
-            this.mode = mode;
-            if (element("mode").options.length) element("mode").value = mode;
+        const modes = this.renderer.modes ?? Object.keys(MODES);
+        const offered = modes.includes(mode) ? mode : "image";
+        if (offered !== this.mode) {
+            this.mode = offered;
+            if (element("mode").options.length) element("mode").value = offered;
         }
     }
 
