@@ -10,6 +10,7 @@ import nexwarp as nw
 from benchmarks import blocks
 from nexwarp.data import Scene
 from nexwarp.errors import SceneError
+from nexwarp.finish.order import ordered
 from nexwarp.model.model import Model
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.merged_texture import MergedTexture, make_texture
@@ -62,6 +63,20 @@ def test_a_model_cut_into_cells_and_merged_renders_the_same(tmp_path: Path) -> N
     positions = torch.randn(50, 3)
     depths = torch.ones(50)
     assert torch.equal(merged.texture(positions, depths, 100.0), texture(positions, depths, 100.0))
+
+
+def test_a_merged_model_has_details_once_it_is_ordered(tmp_path: Path) -> None:
+    scene = random_scene(40)
+    camera, model = make_camera(scene), Model(make_surfels(scene).float(), random_texture().float())
+    cells = split_space(model.surfels.means.detach(), 2)
+    merged = merge_blocks([ordered(model, [camera])] * 2, cells)
+    with pytest.raises(ValueError, match="detail: expected a model with surfels in the order"):
+        merged.at_detail(0.5)
+    whole = ordered(merged, [camera])
+    coarse, file = whole.at_detail(0.5), whole.save(tmp_path)
+    assert len(coarse.surfels) == 20 and isinstance(coarse.texture, MergedTexture)
+    read = nw.load(file, detail=0.5)
+    assert torch.equal(read.surfels.means, coarse.surfels.means) and isinstance(read.texture, MergedTexture)
 
 
 def test_points_have_the_texture_of_their_cell() -> None:

@@ -220,6 +220,8 @@ class TrainingSession:
     def _finish_with_others(self) -> Model:
         """Return the model that rank 0 has finished; render a share of the test views for it."""
         trainer = self.trainer
+        if trainer.graphs is not None:
+            trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
         with TemporaryDirectory() as folder:
             (Path(folder) / MODEL_FILE).write_bytes(self.ranks.share_bytes(None))
             model = load(folder).to(trainer.device)

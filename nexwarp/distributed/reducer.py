@@ -17,6 +17,7 @@ class GradientReducer:
     sent in this order on every rank, whatever a rank renders, and all ranks receive the same bits.
 
     Attributes:
+        sent: the first bucket of a step, from its sending until both have arrived.
         bytes_sent: bytes of the last step's buckets.
     """
 
@@ -58,7 +59,6 @@ class GradientReducer:
         if self.early is not None and self.sent is None:
             self._send(self.early)
         early, rest = self.sent, [x for x in parameters if x is not self.early]
-        self.sent = None
         parts = [x.grad for x in rest if x.grad is not None] + ([] if sums is None else [sums])
         flat, places = _flattened(parts)
         self.bytes_sent = (0 if early is None else self.bytes_sent) + _bytes(flat)
@@ -66,6 +66,7 @@ class GradientReducer:
         for work in (early, last):
             if work is not None:
                 work.wait()
+        self.sent = None
         for parameter, place in zip(rest, places, strict=False):
             parameter.grad = place
         return None if sums is None else places[-1]

@@ -1,5 +1,6 @@
 """Level of detail: the first surfels of an ordered model and the coarse levels of its texture are a coarser model."""
 
+import copy
 import math
 
 import torch
@@ -7,6 +8,7 @@ import torch
 from nexwarp.checks import check_range
 from nexwarp.model.model import Model
 from nexwarp.representation.detail_limits import DetailLimits
+from nexwarp.representation.merged_texture import MergedTexture
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture, TextureShape
 
@@ -69,7 +71,9 @@ def at_detail(model: Model, detail: float) -> Model:
         )
     rows = torch.arange(surfel_count(detail, len(model.surfels)), device=model.device)
     coarse = pick_surfels(model, rows)
-    if model.texture is not None:
+    if isinstance(model.texture, MergedTexture):
+        coarse.texture = copy.deepcopy(model.texture)
+    elif model.texture is not None:
         levels = len(model.texture.resolutions)
         coarse.texture = coarse_texture(model.texture, texture_levels(detail, levels))
     return coarse

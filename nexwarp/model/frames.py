@@ -7,7 +7,8 @@ number of surfels or a parameter that is replaced, needs another graph: the firs
 kernel, the next one is captured. Both do the same arithmetic on the same numbers.
 
 Where a frame cannot be captured, it is launched kernel by kernel: on a CPU, with gradients, in float64, with a depth
-jitter, of very large images (which keep the GPU busy anyway), and where memory does not suffice.
+jitter, of very large images (which keep the GPU busy anyway), of models merged from blocks, and where memory does not
+suffice.
 """
 
 import dataclasses
@@ -30,6 +31,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.render import Color, Rendering, background_numbers
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
+from nexwarp.representation.merged_texture import MergedTexture
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 
@@ -128,6 +130,8 @@ class FrameGraphs:
 
     def _capture(self, camera: Camera, work: Work, exposures: Exposures | None, state: Hashable) -> "_Frame | None":
         """Return the captured frame; None if that is not possible."""
+        if not self.frames:
+            self.pool = None  # it has gone with its last graph
         try:
             return _Frame(self, camera, work, exposures, state)
         except Exception as error:
@@ -338,7 +342,7 @@ def render_by_graph(
         background: of the frame.
     """
     device = parts.surfels.device
-    if not _enabled or device.type != "cuda":
+    if not _enabled or device.type != "cuda" or isinstance(parts.texture, MergedTexture):
         return None
     tensors = parts.tensors()
     if not _can_capture(device, tensors, options, camera, background):
@@ -347,7 +351,8 @@ def render_by_graph(
         graphs = _graphs.get(parts.surfels)
         if graphs is None or graphs.stream.device != device:
             graphs = _graphs[parts.surfels] = FrameGraphs(device)
-    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture)
+    there = tuple(part is not None for part in parts)
+    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture, there)
     return graphs.render(camera, background, work, kind, parts.state(tensors), parts.exposures)
 
 

@@ -204,7 +204,8 @@ class Model(nn.Module):
         try:
             return work(camera, background)
         except OutOfMemoryError:
-            if not frames.release_graphs():
+            # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
+            if torch.cuda.is_current_stream_capturing() or not frames.release_graphs():
                 raise
         # Outside of the handler: the error's traceback would keep alive what has been allocated.
         return work(camera, background)

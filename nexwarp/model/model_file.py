@@ -130,7 +130,7 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
     except (SafetensorError, OSError) as error:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     try:
-        if detail < 1.0 and header.texture is not None:
+        if detail < 1.0 and header.texture is not None and "parts" not in header.texture:
             resolutions = tensors["texture.resolutions"]
             shape = coarse_shape(cast(TextureShape, header.texture), resolutions, len(resolutions))
             header = dataclasses.replace(header, texture=cast(dict[str, Json], shape))
@@ -145,7 +145,7 @@ def _first_parts(name: str, kinds: Mapping[str, tuple[str, list[int]]], detail: 
     everything = tuple(slice(size) for size in shape)
     if name.startswith("surfels.") or name in DETAIL_LIMITS.values():
         return (slice(surfel_count(detail, shape[0])), *everything[1:])
-    if name.startswith("texture."):
+    if name.startswith("texture.") and "texture.grid" in kinds:  # a merged texture is read whole
         all_levels, _, features = kinds["texture.grid"][1]
         levels = texture_levels(detail, all_levels)
         if name in ("texture.grid", "texture.resolutions"):

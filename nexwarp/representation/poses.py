@@ -104,8 +104,8 @@ class PoseCorrections(nn.Module):
         self.corrections = nn.Parameter(torch.zeros(len(cameras), 6))
         viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
         pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
-        self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float(), persistent=False)
-        self.register_buffer("pivots", pivots.float(), persistent=False)
+        self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float().contiguous(), persistent=False)
+        self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
         """Return the corrected viewmat (4, 4) of a view; differentiable.

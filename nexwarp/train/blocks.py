@@ -13,6 +13,7 @@ import torch
 from nexwarp.camera import visible_points
 from nexwarp.data import Scene
 from nexwarp.errors import SceneError
+from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.merged_texture import MergedTexture
@@ -171,4 +172,6 @@ def merge_blocks(models: Sequence[Model], cells: torch.Tensor, *, margin: float 
     if textures and len(textures) < len(models):
         raise ValueError("models: expected textures in all models or in none")
     texture = MergedTexture(textures, cells.to(first.device).float()) if textures else None
-    return Model(Surfels(raw), texture, None, merged_limits, first.options, first.meta)
+    # One block after another, so not in the order of their share of the pictures.
+    meta = {name: value for name, value in first.meta.items() if name != ORDERED}
+    return Model(Surfels(raw), texture, None, merged_limits, first.options, meta)

@@ -17,9 +17,10 @@ from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.errors import DivergedError, RankError, SceneError
+from nexwarp.memory import needed_memory
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
-from nexwarp.train.graphs import Gradients, StepResult
+from nexwarp.train.graphs import Gradients, StepResult, UpdateError
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
 from nexwarp.train.step_losses import OwnLoss
@@ -78,6 +79,8 @@ class ParallelTrainer(Trainer):
         )
         # The same already, unless the ranks' processors round differently.
         ranks.share_tensors(x for _, x in self._named_parameters())
+        if self.poses is not None:
+            ranks.share_tensors(self.poses.buffers())
         self.texture.drop_half_copy()
         self.beside = self.graphs is not None and (ranks.backend != "nccl" if beside is None else beside)
         self.reducer = GradientReducer(self.texture.grid if config.max_hits else None)
@@ -112,6 +115,18 @@ class ParallelTrainer(Trainer):
             if isinstance(self.optimizer, FusedAdam) and self.optimizer.grid_loss is not None:
                 result = result._replace(losses=result.losses | {"grid": self.optimizer.grid_loss})
         return result
+
+    def _optimize(self, target: Target) -> StepResult:
+        try:
+            return super()._optimize(target)
+        except (MemoryError, RuntimeError) as error:
+            sent, self.reducer.sent = self.reducer.sent, None
+            needed = needed_memory(error)
+            if sent is None or needed is None or torch.cuda.is_current_stream_capturing():
+                raise
+            told = f"out of memory while gradients were sent: needed {needed}"
+        # The other ranks have part of the step: it cannot be repeated here.
+        raise UpdateError(told, needed)
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss * self.share
