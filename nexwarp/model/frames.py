@@ -363,6 +363,11 @@ def release_graphs() -> bool:
     return any([graphs.clear() for graphs in everything])
 
 
+def capturing(device: torch.device) -> bool:
+    """Whether a graph is being captured on the current stream; torch without CUDA cannot be asked."""
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
 def _can_capture(
     device: torch.device, tensors: list[torch.Tensor], options: RenderOptions, camera: Camera, background: Color
 ) -> bool:
@@ -381,7 +386,7 @@ def _can_capture(
         differentiated.append(background)
     if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
         return False
-    return not torch.cuda.is_current_stream_capturing()
+    return not capturing(device)
 
 
 def _tensors_of(module: nn.Module) -> list[torch.Tensor]:

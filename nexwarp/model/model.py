@@ -205,7 +205,7 @@ class Model(nn.Module):
             return work(camera, background)
         except OutOfMemoryError:
             # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
-            if torch.cuda.is_current_stream_capturing() or not frames.release_graphs():
+            if frames.capturing(self.device) or not frames.release_graphs():
                 raise
         # Outside of the handler: the error's traceback would keep alive what has been allocated.
         return work(camera, background)

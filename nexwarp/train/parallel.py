@@ -18,6 +18,7 @@ from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.memory import needed_memory
+from nexwarp.model.frames import capturing
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
 from nexwarp.train.graphs import Gradients, StepResult, UpdateError
@@ -122,7 +123,7 @@ class ParallelTrainer(Trainer):
         except (MemoryError, RuntimeError) as error:
             sent, self.reducer.sent = self.reducer.sent, None
             needed = needed_memory(error)
-            if sent is None or needed is None or torch.cuda.is_current_stream_capturing():
+            if sent is None or needed is None or capturing(self.device):
                 raise
             told = f"out of memory while gradients were sent: needed {needed}"
         # The other ranks have part of the step: it cannot be repeated here.
