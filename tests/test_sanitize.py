@@ -3,6 +3,7 @@
 import os
 import stat
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -157,8 +158,13 @@ def test_a_part_that_is_none_is_one_line(capsys):
 
 def test_parts_are_the_whole(monkeypatch):
     """Every job of a sweep belongs to one part."""
-    done = []
-    monkeypatch.setattr(kernel_sweep, "_jobs", lambda *_: (lambda i=i: done.append(i) or 1 for i in range(7)))
+    done: list[int] = []
+
+    def job(i: int) -> int:
+        done.append(i)
+        return 1
+
+    monkeypatch.setattr(kernel_sweep, "_jobs", lambda *_: (partial(job, i) for i in range(7)))
     assert [sweep(torch.device("cpu"), (2,), part=(i, 3)).renderings for i in range(3)] == [3, 2, 2]
     assert sorted(done) == list(range(7))
 
