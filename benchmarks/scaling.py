@@ -27,6 +27,7 @@ from torch import nn
 
 from benchmarks.timing import git_commit, synchronize
 from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.data.shared import shared_scene
 from nexwarp.distributed.launch import launch
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
@@ -115,7 +116,8 @@ def work(options: Scaling) -> None:
         wp.set_device(f"cuda:{local}")
     backend = options.backend or ("gloo" if options.share_gpu else None)
     with Ranks.join(device, {}, backend=backend) as ranks:
-        scene = load_scene(demo_folder() if options.scene == DEMO else options.scene)
+        folder = demo_folder() if options.scene == DEMO else options.scene
+        scene = shared_scene(lambda: load_scene(folder), ranks)
         for mode in options.modes if device.type == "cuda" else ("eager",):
             if mode == "captured" and ranks.backend != "nccl":
                 continue

@@ -112,8 +112,7 @@ class Trainer:
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
         calibration = calibrate_exposures(scene, config)
         self.surfels, self.texture = self._initial_model(None if calibration is None else calibration.colors)
-        self.cells_unit = cells_unit(scene, config)
-        self.poses = initial_poses(scene, config, self.device)
+        self.cells_unit, self.poses = cells_unit(scene, config), initial_poses(scene, config, self.device)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
