@@ -154,6 +154,18 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
+    # Other rules, which a benchmark compares with it.
+    for rule, factor, betas in (
+        ("linear", 4, (0.9**4, 0.999**4)),
+        ("none", 1, (0.9, 0.999)),
+        ("rates", 2, (0.9, 0.999)),
+    ):
+        other = Trainer(scene, short_config(), CPU).optimizer
+        scale_for_batch(other, 4)
+        scaling.change_rule(other, 4, rule)
+        for before, after in zip(one.optimizer.param_groups, other.param_groups, strict=True):
+            assert after["ends"] == pytest.approx(tuple(factor * rate for rate in before["ends"]))
+            assert after["betas"] == pytest.approx(betas)
 
 
 def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
