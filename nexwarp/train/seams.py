@@ -22,7 +22,7 @@ from nexwarp.train.config import Config
 from nexwarp.train.graphs import Gradients
 from nexwarp.train.trainer import Trainer
 
-BAND = 0.1  # of the scene's scale, on each side of a seam
+BAND = 0.3  # of the scene's scale, on each side of a seam
 BEGIN = 0.5  # of the schedules of a whole training
 
 
