@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -300,6 +301,18 @@ def test_errors_and_signals_of_one_rank_are_told_once(tiny_folder: Path, tmp_pat
     # An option that does not exist: each rank finds out by itself.
     wrong = start_ranks(2, lambda _: _exit_code([*arguments, "--nonsense"]), tmp_path / "c")
     assert wait(wrong) == [2, 2] and len(printed(tmp_path / "c")) == 1
+
+
+def test_a_scene_that_cannot_be_read_is_told_once(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    """One rank of the machine reads it for all."""
+    folder = shutil.copytree(tiny_folder, tmp_path / "scene")
+    photo = sorted((folder / "images").iterdir())[1]
+    photo.write_bytes(photo.read_bytes()[:200])
+    run = tmp_path / "run"
+    processes = start_ranks(2, lambda _: cli.main(["train", str(folder), "--run", str(run), *TRAIN]), tmp_path / "a")
+    assert wait(processes)[0] == 2
+    (line,) = printed(tmp_path / "a")
+    assert line.startswith(f"nexwarp: error: {photo}: ") and not run.exists()
 
 
 def _exit_code(arguments: list[str]) -> int:
