@@ -99,7 +99,8 @@ def _moved(scene: Scene, file: int) -> tuple[Scene, Described]:
             views[index] = _view(told[group][index], memory)
     told["cloud"] = {name: memory.put(getattr(scene, name)) for name in CLOUD}
     told["rest"] = [scene.scale, str(scene.path), scene.background, scene.random_background]
-    return dataclasses.replace(scene, **memory.get_all(told["cloud"])), told
+    cloud: dict[str, Any] = memory.get_all(told["cloud"])
+    return dataclasses.replace(scene, **cloud), told
 
 
 def _mapped(told: Described) -> Scene | None:
