@@ -46,9 +46,9 @@ def shared_scene(load: Callable[[], Scene], ranks: Ranks) -> Scene:
         file = os.memfd_create("nexwarp-scene") if hasattr(os, "memfd_create") else None
         if file is not None:
             scene, told = _moved(scene, file)
-    told = ranks.gather(told)[ranks.rank - ranks.local_rank]
-    if scene is None and isinstance(told, dict):
-        scene = _mapped(told)
+    given = ranks.gather(told)[ranks.rank - ranks.local_rank]
+    if scene is None and isinstance(given, dict):
+        scene = _mapped(given)
     ranks.barrier()
     if file is not None:
         os.close(file)  # its mappings stay
