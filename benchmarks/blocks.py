@@ -1,10 +1,12 @@
-"""Two blocks of the demo, trained apart and merged, against one training of as many surfels.
+"""Two blocks of the demo, trained apart, merged and refined at the seam, against one training of as many surfels.
 
     python -m benchmarks.blocks --device cuda
 
-Prints the PSNR of all test views, and of those of their pixels that show what is close to the seam.
+Prints the PSNR of all test views, and of those of their pixels that show what is close to the seam, and how many views
+each training saw.
 """
 
+import copy
 import dataclasses
 import json
 import math
@@ -22,14 +24,15 @@ from benchmarks.timing import git_commit
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.model.model import Model
-from nexwarp.train.blocks import BlockTrainer, block_scene, merge_blocks, split_space
+from nexwarp.train.blocks import CONTEXT, BlockTrainer, block_scene, merge_blocks, split_space
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.seams import BAND, SeamTrainer
 from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import mean_color
 
-BAND = 0.1  # of the scene's scale, around the seam
+CLOSE = 0.1  # of the scene's scale, around the seam
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,12 @@ class Blocks:
     """Budget of a block with its overlap and context, in units of its share of the surfels."""
     overlap: float = 0.1
     """How far a block reaches beyond its cell, in units of the scene's scale."""
+    context: float = CONTEXT
+    """Share of the points outside of a block that it starts from."""
+    refine: float = 0.25
+    """Views of the refinement at the seams, in units of those of a training; 0 merges finished blocks, no more."""
+    band: float = BAND
+    """How far from a seam the refinement trains surfels, in units of the scene's scale."""
     margin: float = 0.0
     """How far a block's surfels beyond its cell are kept, in units of the scene's scale."""
     device: str = "cpu"
@@ -53,7 +62,7 @@ class Blocks:
     settings: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = ()
     """Further settings, KEY=VALUE."""
     out: Path | None = None
-    """Folder for the merged model."""
+    """Folder for the models."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -71,32 +80,42 @@ def main(arguments: list[str] | None = None) -> int:
         models.append(train_block(scene, config, cell, options))
         seconds.append(round(time.perf_counter() - start, 1))
     merged = merge_blocks(models, cells, margin=options.margin * scene.scale)
+    compared = {"merged": merged}
+    start, views = time.perf_counter(), [config.iterations] * options.count
+    if options.refine:
+        views.append(round(options.refine * config.iterations))
+        refinement = dataclasses.replace(config, iterations=views[-1])
+        trainer = SeamTrainer(scene, copy.deepcopy(merged), refinement, band=options.band)
+        trainer.run()
+        compared["refined"] = trainer.finish()
+    seconds.append(round(time.perf_counter() - start, 1))
     whole = Trainer(scene, dataclasses.replace(config, max_surfels=len(merged.surfels)), options.device)
     whole.run()
-    alone = whole.finish()
+    alone = compared["one training"] = whole.finish()
     facts: dict[str, object] = {
         "cells": cells.tolist(),
         "surfels of blocks": [len(model.surfels) for model in models],
         "surfels": [len(merged.surfels), len(alone.surfels)],
-        "seconds of blocks": seconds,
+        "views of blocks and refinement": views,
+        "seconds of blocks and refinement": seconds,
         "commit": git_commit(),
     }
-    for name, model in (("merged", merged), ("one training", alone)):
+    for name, model in compared.items():
         everywhere, seam = psnrs(model, alone, scene, cells)
         facts[name] = {"psnr": round(everywhere, 3), "psnr at the seam": round(seam, 3)}
+        if options.out is not None:
+            model.save(options.out / f"{name.replace(' ', '_')}.safetensors")
     print(json.dumps(facts))
-    if options.out is not None:
-        merged.save(options.out)
     return 0
 
 
 def train_block(scene: Scene, config: Config, cell: torch.Tensor, options: Blocks) -> Model:
     budget = round(options.budget * options.surfels / options.count)
-    part = block_scene(scene, cell, overlap=options.overlap)
+    part = block_scene(scene, cell, overlap=options.overlap, context=options.context)
     config = dataclasses.replace(config, max_surfels=budget)
     trainer = BlockTrainer(part, config, options.device, cell, overlap=options.overlap)
     trainer.run()
-    return trainer.finish()
+    return trainer.model() if options.refine else trainer.finish()
 
 
 @torch.no_grad()
@@ -115,7 +134,7 @@ def psnrs(model: Model, reference: Model, scene: Scene, cells: torch.Tensor) -> 
         image = (model.render(view.camera).image.clamp(0, 1) * 255).round().cpu() / 255
         errors = (image - photo).square().mean(dim=-1)
         whole.append(-10 * math.log10(errors.mean().item()))
-        close = seam_pixels(reference, view.camera, cells, BAND * scene.scale)
+        close = seam_pixels(reference, view.camera, cells, CLOSE * scene.scale)
         if close.any():
             near.append(-10 * math.log10(errors[close].mean().item()))
     return sum(whole) / len(whole), sum(near) / max(len(near), 1)

@@ -2,6 +2,7 @@
 
     python -m benchmarks.scaling --ranks 1 2 4 --scene SCENE --surfels 400000
     python -m benchmarks.scaling --ranks 1 2 --scene SCENE --train 30000          # PSNR at equal views seen
+    python -m benchmarks.scaling --ranks 2 --device cpu --train 1200 --surfels 3000 --rule linear
     python -m benchmarks.scaling --simulate --step-ms 6 --surfels 400000          # more GPUs than there are, on paper
 
 Each rank renders one view a step, so that weak scaling (as many views a step as ranks) and strong scaling (a run of
@@ -27,6 +28,7 @@ from torch import nn
 
 from benchmarks.timing import git_commit, synchronize
 from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.data.shared import shared_scene
 from nexwarp.distributed.launch import launch
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
@@ -41,6 +43,8 @@ from nexwarp.train.trainer import Trainer
 DEMO = "demo"
 LATE = 26_000  # an iteration of 30,000 after density control, with SH of degree 3
 CHUNKS = 5
+# Power of the number of views that rates are multiplied by, and whether Adam's betas stay as they are.
+RULES = {"sqrt": (0.5, False), "linear": (1.0, False), "rates": (0.5, True), "none": (0.0, True)}
 # Bytes a second that leave a GPU over NVLink 4: 450 GB/s in each direction (NVIDIA's data sheet of the H100), of which
 # an all-reduce is assumed to reach 80 %. Of the network's rate, 90 % are assumed.
 NVLINK, NVLINK_SHARE, NETWORK_SHARE = 450e9, 0.8, 0.9
@@ -67,6 +71,10 @@ class Scaling:
     """How steps run on CUDA: all-reduce inside the CUDA graph, after it, or no graph. A CPU has only `eager`."""
     device: str = "cuda"
     """Device: cuda or cpu."""
+    rule: str = "sqrt"
+    """Rates of a step of N views: `sqrt`, those of one view times sqrt(N), and betas to the power of N, as `nexwarp
+    train` does; `linear`, rates times N, and betas likewise; `rates`, sqrt(N) with betas as they are; `none`, all as
+    they are."""
     backend: str | None = None
     """Backend of the gradients; default nccl on CUDA, gloo on a CPU or with --share-gpu."""
     share_gpu: bool = False
@@ -91,6 +99,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = tyro.cli(Scaling, args=given, description=__doc__)
     wp.config.log_level = wp.LOG_ERROR
+    if options.rule not in RULES:
+        raise SystemExit(f"--rule: expected one of {', '.join(RULES)}, got {options.rule!r}")
     if options.simulate:
         print(simulate(options.step_ms, options.hidden_ms, options.surfels, options.table, options.gbits))
         return 0
@@ -115,7 +125,8 @@ def work(options: Scaling) -> None:
         wp.set_device(f"cuda:{local}")
     backend = options.backend or ("gloo" if options.share_gpu else None)
     with Ranks.join(device, {}, backend=backend) as ranks:
-        scene = load_scene(demo_folder() if options.scene == DEMO else options.scene)
+        folder = demo_folder() if options.scene == DEMO else options.scene
+        scene = shared_scene(lambda: load_scene(folder), ranks)
         for mode in options.modes if device.type == "cuda" else ("eager",):
             if mode == "captured" and ranks.backend != "nccl":
                 continue
@@ -123,6 +134,7 @@ def work(options: Scaling) -> None:
             facts = {
                 "ranks": ranks.size,
                 "mode": mode,
+                "rule": options.rule,
                 "backend": ranks.backend,
                 "scene": Path(options.scene).name,
                 "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
@@ -141,7 +153,26 @@ def make_trainer(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> Tra
     config = with_settings(config, parse_settings(options.settings))
     if ranks.size == 1:
         return Trainer(scene, config, ranks.device)
-    return ParallelTrainer(scene, config, ranks.device, ranks, beside=mode == "beside")
+    trainer = ParallelTrainer(scene, config, ranks.device, ranks, beside=mode == "beside")
+    change_rule(trainer.optimizer, ranks.size, options.rule)
+    return trainer
+
+
+def change_rule(optimizer: torch.optim.Optimizer, views: int, rule: str) -> None:
+    """Change the rates of an optimizer, which follow the square-root rule, to those of another rule.
+
+    Args:
+        optimizer: of a `ParallelTrainer`.
+        views: of a step.
+        rule: see `Scaling.rule`.
+    """
+    power, keeps_betas = RULES[rule]
+    factor = views ** (power - 0.5)
+    for group in optimizer.param_groups:
+        first, last = group["ends"]
+        group["ends"] = first * factor, last * factor
+        if keeps_betas:
+            group["betas"] = tuple(beta ** (1 / views) for beta in group["betas"])
 
 
 def trained(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, object]:

@@ -116,7 +116,7 @@ def digest(trainer: Trainer) -> str:
     """Digest of everything that a training's future depends on."""
     found = hashlib.sha256()
     for name, value in sorted(state_of(trainer).items()):
-        found.update(name.encode() + value.contiguous().numpy().tobytes())
+        found.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -154,6 +155,18 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
+    # Other rules, which a benchmark compares with it.
+    for rule, factor, betas in (
+        ("linear", 4, (0.9**4, 0.999**4)),
+        ("none", 1, (0.9, 0.999)),
+        ("rates", 2, (0.9, 0.999)),
+    ):
+        other = Trainer(scene, short_config(), CPU).optimizer
+        scale_for_batch(other, 4)
+        scaling.change_rule(other, 4, rule)
+        for before, after in zip(one.optimizer.param_groups, other.param_groups, strict=True):
+            assert after["ends"] == pytest.approx(tuple(factor * rate for rate in before["ends"]))
+            assert after["betas"] == pytest.approx(betas)
 
 
 def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
@@ -288,6 +301,18 @@ def test_errors_and_signals_of_one_rank_are_told_once(tiny_folder: Path, tmp_pat
     # An option that does not exist: each rank finds out by itself.
     wrong = start_ranks(2, lambda _: _exit_code([*arguments, "--nonsense"]), tmp_path / "c")
     assert wait(wrong) == [2, 2] and len(printed(tmp_path / "c")) == 1
+
+
+def test_a_scene_that_cannot_be_read_is_told_once(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    """One rank of the machine reads it for all."""
+    folder = shutil.copytree(tiny_folder, tmp_path / "scene")
+    photo = sorted((folder / "images").iterdir())[1]
+    photo.write_bytes(photo.read_bytes()[:200])
+    run = tmp_path / "run"
+    processes = start_ranks(2, lambda _: cli.main(["train", str(folder), "--run", str(run), *TRAIN]), tmp_path / "a")
+    assert wait(processes)[0] == 2
+    (line,) = printed(tmp_path / "a")
+    assert line.startswith(f"nexwarp: error: {photo}: ") and not run.exists()
 
 
 def _exit_code(arguments: list[str]) -> int:

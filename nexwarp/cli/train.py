@@ -18,6 +18,7 @@ from nexwarp.cli.process import SCENES, is_video, scene_of_video
 from nexwarp.cli.training_session import TrainingSession
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
+from nexwarp.data.shared import shared_scene
 from nexwarp.distributed.join import is_rank
 from nexwarp.distributed.launch import check_count
 from nexwarp.distributed.ranks import Ranks
@@ -201,7 +202,7 @@ class Train:
         device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
         console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
-            scene = source.load(progress)
+            scene = shared_scene(lambda: source.load(progress), ranks)
         size = scene.train[0].camera
         console.print(
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "

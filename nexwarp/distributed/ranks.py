@@ -25,6 +25,7 @@ class Ranks:
     Attributes:
         rank: number of this one, from 0; rank 0 writes files and shows progress.
         size: how many there are.
+        local_rank: number of this one among those on this machine, which have consecutive ranks.
         local_size: how many of them are on this machine.
         device: of this rank.
         backend: of the gradients, "nccl" or "gloo"; "" for a process alone.
@@ -34,7 +35,8 @@ class Ranks:
 
     def __init__(self, place: Place, device: torch.device, backend: str) -> None:
         """Use `join`, or `alone`, instead."""
-        self.rank, self.size, self.local_size = place.rank, place.size, place.local_size
+        self.rank, self.size = place.rank, place.size
+        self.local_rank, self.local_size = place.local_rank, place.local_size
         self.device, self.backend = device, backend
         self.launch, self.restarted = place.launch, place.restarted
         self.control: dist.ProcessGroup | None = None

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from nexwarp.model.options import RenderOptions
+from nexwarp.representation.merged_texture import MergedTexture
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
@@ -48,9 +49,10 @@ def make_optimizer(
         ValueError: its groups are not those that it was given.
     """
     ends = rate_ends(config, scale)
+    textures = texture.textures if isinstance(texture, MergedTexture) else [texture]
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
     if config.max_hits:
-        parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+        parts |= {"grid": [x.grid for x in textures], "mlp": [w for x in textures for w in x.mlp.parameters()]}
     if poses is not None:
         parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
@@ -63,7 +65,7 @@ def make_optimizer(
         raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {given}")
     for group in optimizer.param_groups:
         group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
-    if isinstance(optimizer, FusedAdam) and config.max_hits:
+    if isinstance(optimizer, FusedAdam) and config.max_hits and not isinstance(texture, MergedTexture):
         optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 

@@ -78,14 +78,15 @@ def step_losses(
         TypeError, ValueError: an own loss returned no scalar; the message names it.
     """
     textured, factors = config.max_hits > 0, config.losses
+    grid_term = grid_term and textured and factors.grid > 0
     losses = training_losses(
         image=out.image.clamp(0, 1) if config.clamp_image else out.image,
         textured=out.textured,
         weights=out.weights,
         target=target.photo,
         opacities=surfels.opacities,
-        grid=texture.grid if textured and grid_term else None,
-        resolutions=texture.resolutions * cells_unit if textured and grid_term else None,
+        grid=texture.grid if grid_term else None,
+        resolutions=texture.resolutions * cells_unit if grid_term else None,
         loss_weights=factors,
         mask=target.counts,
         empty=target.empty,

@@ -111,11 +111,8 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
         calibration = calibrate_exposures(scene, config)
-        colors = None if calibration is None else calibration.colors
-        self.surfels = initial_surfels(scene, config, self.generator, colors).to(self.device)
-        self.texture = NeuralTexture(**texture_shape(scene, config)).to(self.device)
-        self.cells_unit = cells_unit(scene, config)
-        self.poses = initial_poses(scene, config, self.device)
+        self.surfels, self.texture = self._initial_model(None if calibration is None else calibration.colors)
+        self.cells_unit, self.poses = cells_unit(scene, config), initial_poses(scene, config, self.device)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
         self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
@@ -193,6 +190,10 @@ class Trainer:
     def _next_target(self) -> Target:
         self.iteration += 1
         return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+
+    def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
+        surfels = initial_surfels(self.scene, self.config, self.generator, colors)
+        return surfels.to(self.device), NeuralTexture(**texture_shape(self.scene, self.config)).to(self.device)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
