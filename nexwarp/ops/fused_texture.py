@@ -290,30 +290,38 @@ def _scatter(
     """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
     table, positions, shape = inputs.table, inputs.positions, inputs.shape
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    count = shape.blocks * (32 if positions.is_cuda else 1)
+    count = shape.units * (32 if positions.is_cuda else 1)
     grad_points = positions.new_empty(len(positions) * need_points, 4)
-    launch(
-        positions,
-        fused_scatter_kernel(table.shape[2]),
-        count,
-        [
-            array(table.view(-1), wp.float16),
-            array(positions, wp.vec3),
-            array(inputs.depths, wp.float32),
-            array(inputs.resolutions, wp.float32),
-            array(inputs.focal, wp.float32),
-            wp.uint32(table.shape[1] - 1),
-            array(grad_encoded.view(-1), wp.float16),
-            shape.units * 16,
-            array(unscale, wp.float32),
-            *shape,
-            shape.shift,
-        ],
-        [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
-        block_dim=SCATTER_THREADS,
-        smallest=count,  # in one thread on a CPU
-    )
+    levels, size, features = table.shape
+    inputs_and_places = [
+        array(table.view(-1), wp.float16),
+        array(positions, wp.vec3),
+        array(inputs.depths, wp.float32),
+        array(inputs.resolutions, wp.float32),
+        array(inputs.focal, wp.float32),
+        wp.uint32(size - 1),
+        array(grad_encoded.view(-1), wp.float16),
+        shape.units * 16,
+        array(unscale, wp.float32),
+        *shape,
+        shape.shift,
+    ]
+    for first, end in level_groups(levels):
+        launch(
+            positions,
+            fused_scatter_kernel(features),
+            count,
+            [*inputs_and_places, first, end],
+            [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
+            block_dim=SCATTER_THREADS,
+            smallest=count,  # in one thread on a CPU
+        )
     return grad_grid, grad_points if need_points else None
+
+
+def level_groups(levels: int) -> list[tuple[int, int]]:
+    """Return the ranges of levels that a launch of the backward lookup takes."""
+    return [(0, levels)]
 
 
 def _launch(

@@ -57,7 +57,7 @@ PRELUDE = """
         x[0] += __shfl_xor_sync(0xffffffffu, x[0], 2);
     };
     auto any_lane = [](const int* x) { return __any_sync(0xffffffffu, x[0]); };
-    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+    auto swap_lanes = [](const auto* x, int bit, auto* to) {
         to[0] = __shfl_xor_sync(0xffffffffu, x[0], bit);
     };
     auto vote = [](const int* x) { return __ballot_sync(0xffffffffu, x[0]); };
@@ -116,7 +116,7 @@ PRELUDE = """
         for (int lane = 0; lane < 32; ++lane) any |= x[lane];
         return any;
     };
-    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+    auto swap_lanes = [](const auto* x, int bit, auto* to) {
         for (int lane = 0; lane < 32; ++lane) to[lane] = x[lane ^ bit];
     };
     auto vote = [](const int* x) {
