@@ -30,9 +30,9 @@ _BITS = (2, 16, 4, 8)
 
 _PROGRAM = """
     const float focal_length = focal.data[0], factor = unscale.data[0];
-    auto map_positive = [](int i) { return (unsigned)(i > 0 ? 2 * i - 1 : -2 * i); };
-    auto read_row = [](const unsigned* row, wp::float32* to, auto low, auto high) {
-        unsigned word[F / 2];
+    // 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..., of the negative coordinate.
+    auto map_negative = [](int i) { return ((unsigned)i << 1) ^ (unsigned)(i >> 31); };
+    auto read_row = [](const unsigned* row, unsigned* word) {
 #if defined(__CUDA_ARCH__)
         if (F == 4) {
             const uint2 both = __ldg(reinterpret_cast<const uint2*>(row));
@@ -42,11 +42,6 @@ _PROGRAM = """
 #else
         for (int f = 0; f < F / 2; ++f) word[f] = row[f];
 #endif
-        UNROLL
-        for (int f = 0; f < F / 2; ++f) {
-            to[2 * f] = low(word[f]);
-            to[2 * f + 1] = high(word[f]);
-        }
     };
     auto add = [](wp::float32* to, const wp::float32* from) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
@@ -66,77 +61,67 @@ _PROGRAM = """
     const int tile = unit / hits, hit = unit % hits;
     const int left = (tile % across) << shift, top = (tile / across) << (4 - shift);
     int seen[LANES], point[LANES];
-    wp::float32 depth[LANES], at[3][LANES], total[4][LANES] = {};
+    wp::float32 per_depth[LANES], at[3][LANES], total[4][LANES] = {};
     EACH_LANE {
         const int row = lane >> 1;
         const int x = left + (row & ((1 << shift) - 1)), y = top + (row >> shift);
         const bool inside = x < width && y < height;
         point[l] = inside ? (y * width + x) * hits + hit : -1;
-        depth[l] = inside ? depths.data[point[l]] : 0.0f;
-        seen[l] = depth[l] > 0.0f;
+        const float depth = inside ? depths.data[point[l]] : 0.0f;
+        seen[l] = depth > 0.0f;
         const size_t source = seen[l] ? point[l] : 0;
         const wp::float32* from = reinterpret_cast<const wp::float32*>(positions.data) + 3 * source;
         UNROLL
         for (int i = 0; i < 3; ++i) at[i][l] = from[i];
-        if (!seen[l]) depth[l] = 1.0f;
+        per_depth[l] = seen[l] ? 1.0f / depth : 0.0f;
     }
+    const bool need_points = grad_points.shape[0] > 0;
     const int last_level = any_lane(seen) ? end_level : first_level;
     #pragma unroll 1
     for (int level = first_level; level < last_level; ++level) {
         const float scale = resolutions.data[level];
         const size_t first_row = (size_t)level * (mask + 1u);
+        const unsigned* rows = reinterpret_cast<const unsigned*>(table.data) + first_row * (F / 2);
+        wp::float32* sums = grad_table.data + first_row * F;
+        const unsigned* incoming = reinterpret_cast<const unsigned*>(grad_encoded.data)
+            + ((size_t)level * places + (size_t)unit * 16) * (F / 2);
         int cell[3][LANES], held[LANES], whole[LANES];
         unsigned slot[4][LANES];
         wp::float32 v[4 * F][LANES];
         EACH_LANE {
             const int side = lane & 1;
-            wp::float32 g[F] = {}, fraction[3];
-            if (seen[l]) {
-                const size_t place = (size_t)unit * 16 + (lane >> 1);
-                const size_t word = ((size_t)level * places + place) * (F / 2);
-                read_row(reinterpret_cast<const unsigned*>(grad_encoded.data) + word, g, low_half, high_half);
-            }
-            whole[l] = 0;
-            UNROLL
-            for (int f = 0; f < F; ++f) {
-                g[f] *= factor;
-                whole[l] |= g[f] != 0.0f;
-            }
+            wp::float32 g[F], fraction[3];
+            unsigned given[F / 2] = {}, found[4][F / 2] = {};
+            if (seen[l]) read_row(incoming + (lane >> 1) * (F / 2), given);
             UNROLL
             for (int i = 0; i < 3; ++i) {
                 const float x = at[i][l] * scale, base = floorf(x);
                 fraction[i] = x - base;
-                cell[i][l] = (int)base;
+                cell[i][l] = (int)-base;
             }
-            const float fx = fraction[0], fy = fraction[1], fz = fraction[2];
-            const unsigned hx = map_positive(cell[0][l] + side);
+            const unsigned hx = map_negative(cell[0][l] - side);
             const unsigned hy[2] = {
-                map_positive(cell[1][l]) * 2654435761u, map_positive(cell[1][l] + 1) * 2654435761u};
-            const unsigned hz[2] = {map_positive(cell[2][l]) * 805459861u, map_positive(cell[2][l] + 1) * 805459861u};
+                map_negative(cell[1][l]) * 2654435761u, map_negative(cell[1][l] - 1) * 2654435761u};
+            const unsigned hz[2] = {map_negative(cell[2][l]) * 805459861u, map_negative(cell[2][l] - 1) * 805459861u};
             UNROLL
             for (int j = 0; j < 4; ++j) slot[j][l] = (hx ^ hy[j & 1] ^ hz[j >> 1]) & mask;
-            const float ratio = focal_length / (scale * depth[l]), power = 0.15915494309189535f * ratio * ratio;
+            // All loads before the first use.
+            if (need_points && seen[l]) {
+                UNROLL
+                for (int j = 0; j < 4; ++j) read_row(rows + (size_t)slot[j][l] * (F / 2), found[j]);
+            }
+            const float fx = fraction[0], fy = fraction[1], fz = fraction[2];
+            const float ratio = quotient(focal_length * per_depth[l], scale);
+            const float power = 0.15915494309189535f * ratio * ratio;
             const float rest = power_of_e(-power), fade = 1.0f - rest;
             const float wx = side ? fx : 1.0f - fx;
-            if (grad_points.shape[0] > 0 && seen[l]) {
-                wp::float32 s[4];
-                UNROLL
-                for (int j = 0; j < 4; ++j) {
-                    const size_t word = (first_row + slot[j][l]) * (F / 2);
-                    wp::float32 features[F];
-                    read_row(reinterpret_cast<const unsigned*>(table.data) + word, features, low_half, high_half);
-                    s[j] = 0.0f;
-                    UNROLL
-                    for (int f = 0; f < F; ++f) s[j] += features[f] * g[f];
-                }
-                const float y0 = s[1] - s[0], y1 = s[3] - s[2];
-                const float z0 = s[0] + fy * y0, z1 = (s[2] + fy * y1) - z0;
-                const float value = z0 + fz * z1, steep = fade * scale;
-                total[0][l] += side ? steep * value : -steep * value;
-                total[1][l] += wx * steep * (y0 + fz * (y1 - y0));
-                total[2][l] += wx * steep * z1;
-                total[3][l] += wx * value * -2.0f * power * rest / depth[l];
+            whole[l] = 0;
+            UNROLL
+            for (int f = 0; f < F; ++f) {
+                g[f] = factor * (f & 1 ? high_half(given[f / 2]) : low_half(given[f / 2]));
+                whole[l] |= g[f] != 0.0f;
             }
+            held[l] = whole[l] ? 4 : 0;
             const float wy[2] = {1.0f - fy, fy}, wz[2] = {(1.0f - fz) * (wx * fade), fz * (wx * fade)};
             UNROLL
             for (int j = 0; j < 4; ++j) {
@@ -144,7 +129,22 @@ _PROGRAM = """
                 UNROLL
                 for (int f = 0; f < F; ++f) v[j * F + f][l] = weight * g[f];
             }
-            held[l] = whole[l] ? 4 : 0;
+            if (need_points && seen[l]) {
+                wp::float32 s[4] = {};
+                UNROLL
+                for (int j = 0; j < 4; ++j) {
+                    UNROLL
+                    for (int f = 0; f < F; ++f)
+                        s[j] += (f & 1 ? high_half(found[j][f / 2]) : low_half(found[j][f / 2])) * g[f];
+                }
+                const float y0 = s[1] - s[0], y1 = s[3] - s[2];
+                const float z0 = s[0] + fy * y0, z1 = (s[2] + fy * y1) - z0;
+                const float value = z0 + fz * z1, steep = fade * scale, part = wx * steep;
+                total[0][l] += side ? steep * value : -steep * value;
+                total[1][l] += part * (y0 + fz * (y1 - y0));
+                total[2][l] += part * z1;
+                total[3][l] += wx * value * (power * rest);
+            }
         }
 MERGE
         UNROLL
@@ -153,11 +153,12 @@ MERGE
                 wp::float32 part[F];
                 UNROLL
                 for (int f = 0; f < F; ++f) part[f] = v[j * F + f][l];
-                if (j < held[l]) add(grad_table.data + (first_row + slot[j][l]) * F, part);
+                if (j < held[l]) add(sums + (size_t)slot[j][l] * F, part);
             }
         }
     }
-    if (grad_points.shape[0] > 0) {
+    if (need_points) {
+        EACH_LANE total[3][l] *= -2.0f * per_depth[l];
         UNROLL
         for (int i = 0; i < 4; ++i) {
             wp::float32 other[LANES];
@@ -238,6 +239,7 @@ def _merge(features: int) -> str:
 
 
 SCATTER_THREADS = 128  # of a block
+SCATTER_BLOCKS = 8  # that a multiprocessor holds at least
 
 Halves, Reals = wp.array(dtype=wp.float16), wp.array(dtype=wp.float32)
 
@@ -270,7 +272,9 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
         grad_points: wp.array(dtype=wp.vec4),
     ): ...
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
+    @wp.kernel(
+        enable_backward=False, grid_stride=False, module="unique", launch_bounds=(SCATTER_THREADS, SCATTER_BLOCKS)
+    )
     def fused_scatter(
         first: wp.int32,
         table: Halves,

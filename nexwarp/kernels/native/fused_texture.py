@@ -101,7 +101,8 @@ _PIXELS = """
 
 _LOOKUP = """
     const float focal_length = focal.data[0];
-    auto map_positive = [](int i) { return (unsigned)(i > 0 ? 2 * i - 1 : -2 * i); };
+    // 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..., of the negative coordinate.
+    auto map_negative = [](int i) { return ((unsigned)i << 1) ^ (unsigned)(i >> 31); };
     // A point's features at one level, of the four corners of its cell at the lower x, or at the upper x.
     auto look_up = [&](int level, const float* at, int side, wp::float32 (*sum)[LANES], int l) {
         const float scale = resolutions.data[level];
@@ -109,29 +110,32 @@ _LOOKUP = """
         const float bx = floorf(x), by = floorf(y), bz = floorf(z);
         const float fx = x - bx, fy = y - by, fz = z - bz, wx = side ? fx : 1.0f - fx;
         const float wy[2] = {1.0f - fy, fy}, wz[2] = {(1.0f - fz) * wx, fz * wx};
-        const int cy = (int)by, cz = (int)bz;
-        const unsigned hx = map_positive((int)bx + side);
-        const unsigned hy[2] = {map_positive(cy) * 2654435761u, map_positive(cy + 1) * 2654435761u};
-        const unsigned hz[2] = {map_positive(cz) * 805459861u, map_positive(cz + 1) * 805459861u};
+        const int cy = (int)-by, cz = (int)-bz;
+        const unsigned hx = map_negative((int)-bx - side);
+        const unsigned hy[2] = {map_negative(cy) * 2654435761u, map_negative(cy - 1) * 2654435761u};
+        const unsigned hz[2] = {map_negative(cz) * 805459861u, map_negative(cz - 1) * 805459861u};
         const unsigned* rows = reinterpret_cast<const unsigned*>(table.data) + (size_t)level * (mask + 1u) * (F / 2);
+        unsigned word[4][F / 2];
         UNROLL
         for (int j = 0; j < 4; ++j) {
             const unsigned slot = (hx ^ hy[j & 1] ^ hz[j >> 1]) & mask;
             const unsigned* row = rows + (size_t)slot * (F / 2);
-            unsigned word[F / 2];
 #if defined(__CUDA_ARCH__)
             if (F == 4) {
                 const uint2 both = __ldg(reinterpret_cast<const uint2*>(row));
-                word[0] = both.x; word[F / 2 - 1] = both.y;
-            } else word[0] = __ldg(row);
+                word[j][0] = both.x; word[j][F / 2 - 1] = both.y;
+            } else word[j][0] = __ldg(row);
 #else
-            for (int f = 0; f < F / 2; ++f) word[f] = row[f];
+            for (int f = 0; f < F / 2; ++f) word[j][f] = row[f];
 #endif
+        }
+        UNROLL
+        for (int j = 0; j < 4; ++j) {
             const float weight = wy[j & 1] * wz[j >> 1];
             UNROLL
             for (int f = 0; f < F / 2; ++f) {
-                sum[2 * f][l] += weight * low_half(word[f]);
-                sum[2 * f + 1][l] += weight * high_half(word[f]);
+                sum[2 * f][l] += weight * low_half(word[j][f]);
+                sum[2 * f + 1][l] += weight * high_half(word[j][f]);
             }
         }
     };
@@ -154,7 +158,7 @@ _LOOKUP = """
             EACH_LANE part[0][f][l] = (lane & 1 ? part[1][f][l] : part[0][f][l]) + got[l];
         }
         EACH_LANE {
-            const float ratio = focal_length / (resolutions.data[first + (lane & 3)] * depth[l]);
+            const float ratio = quotient(focal_length, resolutions.data[first + (lane & 3)] * depth[l]);
             const float fade = depth[l] > 0.0f ? 1.0f - power_of_e(-0.15915494309189535f * ratio * ratio) : 0.0f;
             UNROLL
             for (int f = 0; f < F / 2; ++f) out[f][l] = halves(part[0][2 * f][l] * fade, part[0][2 * f + 1][l] * fade);

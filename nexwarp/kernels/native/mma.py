@@ -66,6 +66,7 @@ PRELUDE = """
         to[0] = __match_any_sync(0xffffffffu, xy) & __match_any_sync(0xffffffffu, x[2][0]);
     };
     auto power_of_e = [](float x) { return __expf(x); };
+    auto quotient = [](float x, float y) { return __fdividef(x, y); };
 #else
 #define UNROLL
     constexpr int LANES = 32;
@@ -132,6 +133,7 @@ PRELUDE = """
         }
     };
     auto power_of_e = [](float x) { return expf(x); };
+    auto quotient = [](float x, float y) { return x / y; };
 #endif
 #define EACH_LANE for (int l = 0, lane = lane0; l < LANES; ++l, ++lane)
 """
