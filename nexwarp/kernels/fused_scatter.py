@@ -45,7 +45,7 @@ _PROGRAM = """
     };
     auto add = [](wp::float32* to, const wp::float32* from) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-        atomicAdd(reinterpret_cast<floatFEATURES*>(to), make_floatFEATURES(VALUES));
+        asm volatile("red.relaxed.gpu.global.add.vFEATURES.f32 [%0], {PLACES};" :: "l"(to), VALUES : "memory");
 #elif defined(__CUDA_ARCH__)
         for (int f = 0; f < F; ++f) atomicAdd(to + f, from[f]);
 #else
@@ -81,11 +81,12 @@ _PROGRAM = """
     for (int level = first_level; level < last_level; ++level) {
         const float scale = resolutions.data[level];
         const size_t first_row = (size_t)level * (mask + 1u);
-        const unsigned* rows = reinterpret_cast<const unsigned*>(table.data) + first_row * (F / 2);
-        wp::float32* sums = grad_table.data + first_row * F;
+        const unsigned* rows = opaque(reinterpret_cast<const unsigned*>(table.data) + first_row * (F / 2));
+        wp::float32* sums = const_cast<wp::float32*>(opaque(grad_table.data + first_row * F));
+        const float per_scale = focal_length * reciprocal(scale);
         const unsigned* incoming = reinterpret_cast<const unsigned*>(grad_encoded.data)
             + ((size_t)level * places + (size_t)unit * 16) * (F / 2);
-        int cell[3][LANES], held[LANES], whole[LANES];
+        int cell[3][LANES], held[LANES], whole[LANES], wide[LANES];
         unsigned slot[4][LANES];
         wp::float32 v[4 * F][LANES];
         EACH_LANE {
@@ -111,9 +112,9 @@ _PROGRAM = """
                 for (int j = 0; j < 4; ++j) read_row(rows + (size_t)slot[j][l] * (F / 2), found[j]);
             }
             const float fx = fraction[0], fy = fraction[1], fz = fraction[2];
-            const float ratio = quotient(focal_length * per_depth[l], scale);
-            const float power = 0.15915494309189535f * ratio * ratio;
-            const float rest = power_of_e(-power), fade = 1.0f - rest;
+            const float ratio = per_scale * per_depth[l];
+            const float power = -0.15915494309189535f * 1.4426950408889634f * ratio * ratio;
+            const float rest = exponential2(power), fade = 1.0f - rest;
             const float wx = side ? fx : 1.0f - fx;
             whole[l] = 0;
             UNROLL
@@ -122,6 +123,8 @@ _PROGRAM = """
                 whole[l] |= g[f] != 0.0f;
             }
             held[l] = whole[l] ? 4 : 0;
+            // Pixels smaller than a cell share cells, others hardly.
+            wide[l] = whole[l] && ratio > 1.0f;
             const float wy[2] = {1.0f - fy, fy}, wz[2] = {(1.0f - fz) * (wx * fade), fz * (wx * fade)};
             UNROLL
             for (int j = 0; j < 4; ++j) {
@@ -158,7 +161,7 @@ MERGE
         }
     }
     if (need_points) {
-        EACH_LANE total[3][l] *= -2.0f * per_depth[l];
+        EACH_LANE total[3][l] *= 2.0f * 0.6931471805599453f * per_depth[l];
         UNROLL
         for (int i = 0; i < 4; ++i) {
             wp::float32 other[LANES];
@@ -217,7 +220,7 @@ _SUM = """
 
 def _merge(features: int) -> str:
     """Return the text of the exchanges: each step is inside of the one before it."""
-    text = ""
+    text = "        if (any_lane(wide)) {"
     for step, bit in enumerate(_BITS):
         corners = 2 >> step  # that a lane is left with; none in the last two steps, where it already has but one
         if corners:
@@ -235,11 +238,11 @@ def _merge(features: int) -> str:
         for name, value in names.items():
             part = part.replace(name, value)
         text += part
-    return text + "}" * len(_BITS)
+    return text + "}" * (len(_BITS) + 1)
 
 
 SCATTER_THREADS = 128  # of a block
-SCATTER_BLOCKS = 8  # that a multiprocessor holds at least
+SCATTER_BLOCKS = 7  # that a multiprocessor holds at least
 
 Halves, Reals = wp.array(dtype=wp.float16), wp.array(dtype=wp.float32)
 
@@ -247,8 +250,10 @@ Halves, Reals = wp.array(dtype=wp.float16), wp.array(dtype=wp.float32)
 @functools.cache
 def fused_scatter_kernel(features: int) -> wp.Kernel:
     """Make the kernel, for F = 2 or 4; threads are 32 times the number of warps, on a CPU that number."""
-    values = ", ".join(f"from[{f}]" for f in range(features))
-    text = _PROGRAM.replace("FEATURES", str(features)).replace("VALUES", values).replace("MERGE", _merge(features))
+    values = ", ".join(f'"f"(from[{f}])' for f in range(features))
+    places = ", ".join(f"%{f + 1}" for f in range(features))
+    text = _PROGRAM.replace("FEATURES", str(features)).replace("VALUES", values).replace("PLACES", places)
+    text = text.replace("MERGE", _merge(features))
 
     @wp.func_native(PRELUDE + f"    constexpr int F = {features};\n" + text)
     def scatter(

@@ -114,7 +114,8 @@ _LOOKUP = """
         const unsigned hx = map_negative((int)-bx - side);
         const unsigned hy[2] = {map_negative(cy) * 2654435761u, map_negative(cy - 1) * 2654435761u};
         const unsigned hz[2] = {map_negative(cz) * 805459861u, map_negative(cz - 1) * 805459861u};
-        const unsigned* rows = reinterpret_cast<const unsigned*>(table.data) + (size_t)level * (mask + 1u) * (F / 2);
+        const unsigned* rows =
+            opaque(reinterpret_cast<const unsigned*>(table.data) + (size_t)level * (mask + 1u) * (F / 2));
         unsigned word[4][F / 2];
         UNROLL
         for (int j = 0; j < 4; ++j) {
@@ -158,8 +159,9 @@ _LOOKUP = """
             EACH_LANE part[0][f][l] = (lane & 1 ? part[1][f][l] : part[0][f][l]) + got[l];
         }
         EACH_LANE {
-            const float ratio = quotient(focal_length, resolutions.data[first + (lane & 3)] * depth[l]);
-            const float fade = depth[l] > 0.0f ? 1.0f - power_of_e(-0.15915494309189535f * ratio * ratio) : 0.0f;
+            const float ratio = focal_length * reciprocal(resolutions.data[first + (lane & 3)] * depth[l]);
+            const float power = -0.15915494309189535f * 1.4426950408889634f * ratio * ratio;
+            const float fade = depth[l] > 0.0f ? 1.0f - exponential2(power) : 0.0f;
             UNROLL
             for (int f = 0; f < F / 2; ++f) out[f][l] = halves(part[0][2 * f][l] * fade, part[0][2 * f + 1][l] * fade);
         }

@@ -65,8 +65,21 @@ PRELUDE = """
         const unsigned long long xy = ((unsigned long long)(unsigned)x[1][0] << 32) | (unsigned)x[0][0];
         to[0] = __match_any_sync(0xffffffffu, xy) & __match_any_sync(0xffffffffu, x[2][0]);
     };
-    auto power_of_e = [](float x) { return __expf(x); };
-    auto quotient = [](float x, float y) { return __fdividef(x, y); };
+    auto exponential2 = [](float x) {
+        float y;
+        asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
+    auto reciprocal = [](float x) {
+        float y;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
+    // An address that the compiler adds an index to by one instruction, as it does not know how it came about.
+    auto opaque = [](const auto* x) {
+        asm volatile("" : "+l"(x));
+        return x;
+    };
 #else
 #define UNROLL
     constexpr int LANES = 32;
@@ -132,8 +145,9 @@ PRELUDE = """
                 to[lane] |= (unsigned)(x[0][i] == x[0][lane] && x[1][i] == x[1][lane] && x[2][i] == x[2][lane]) << i;
         }
     };
-    auto power_of_e = [](float x) { return expf(x); };
-    auto quotient = [](float x, float y) { return x / y; };
+    auto exponential2 = [](float x) { return exp2f(x); };
+    auto reciprocal = [](float x) { return 1.0f / x; };
+    auto opaque = [](const auto* x) { return x; };
 #endif
 #define EACH_LANE for (int l = 0, lane = lane0; l < LANES; ++l, ++lane)
 """
