@@ -60,6 +60,17 @@ PRELUDE = """
     auto swap_lanes = [](const auto* x, int bit, auto* to) {
         to[0] = __shfl_xor_sync(0xffffffffu, x[0], bit);
     };
+    auto take_from = [](const auto* x, const int* source, auto* to) {
+        to[0] = __shfl_sync(0xffffffffu, x[0], source[0]);
+    };
+    auto times_halves = [](unsigned a, unsigned b) {
+        unsigned y;
+        asm("mul.rn.f16x2 %0, %1, %2;" : "=r"(y) : "r"(a), "r"(b));
+        return y;
+    };
+    auto pair_at = [](const unsigned short* x) { return *reinterpret_cast<const unsigned*>(x); };
+    auto lowest_lane = [](unsigned lanes) { return __ffs(lanes) - 1; };
+    auto await_lanes = []() { __syncwarp(); };
     auto vote = [](const int* x) { return __ballot_sync(0xffffffffu, x[0]); };
     auto equal_lanes = [](const wp::int32 (*x)[1], unsigned* to) {
         const unsigned long long xy = ((unsigned long long)(unsigned)x[1][0] << 32) | (unsigned)x[0][0];
@@ -133,6 +144,18 @@ PRELUDE = """
     auto swap_lanes = [](const auto* x, int bit, auto* to) {
         for (int lane = 0; lane < 32; ++lane) to[lane] = x[lane ^ bit];
     };
+    auto take_from = [](const auto* x, const int* source, auto* to) {
+        for (int lane = 0; lane < 32; ++lane) to[lane] = x[source[lane]];
+    };
+    auto times_halves = [&](unsigned a, unsigned b) {
+        return halves(low_half(a) * low_half(b), high_half(a) * high_half(b));
+    };
+    auto pair_at = [](const unsigned short* x) { return x[0] | ((unsigned)x[1] << 16); };
+    auto lowest_lane = [](unsigned lanes) {
+        for (int lane = 0; lane < 32; ++lane) if (lanes >> lane & 1u) return lane;
+        return -1;
+    };
+    auto await_lanes = []() {};
     auto vote = [](const int* x) {
         unsigned lanes = 0;
         for (int lane = 0; lane < 32; ++lane) lanes |= (unsigned)(x[lane] != 0) << lane;
