@@ -15,8 +15,9 @@ The derivative of the interpolation is written by hand. With s_j = <features of 
 position's gradient is that of the interpolation of the s_j, and the depth's is their interpolation times the
 derivative of the fade. A lane's share of both is linear in its own four s_j.
 
-Points in one cell add up theirs before any atomic. Pairs of points that share a cell exchange halves: each is left with
-two of a lane's four corners, and the sum of both points. Fours in one cell then share out one corner each.
+Where pixels are smaller than cells, the points of a cell add up theirs before any atomic, by a product on tensor cores:
+the matrix that says which points share a cell, times what each point adds to each corner, rounded to half precision and
+summed in float32. Elsewhere few points share a cell, and each adds its own.
 """
 
 import functools

@@ -58,12 +58,6 @@ class Shape(NamedTuple):
         wide, high = 1 << self.shift, 16 >> self.shift
         return -(-self.width // wide) * -(-self.height // high) * self.hits
 
-    @property
-    def blocks(self) -> int:
-        """Warps of `fused_scatter`: blocks of two tiles times hits."""
-        wide = 2 * self.shift - 3
-        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits
-
 
 def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
     """Whether the fused kernels take textures of a shape: L * F = 32, F 2 or 4, two hidden layers of 64."""
