@@ -1,6 +1,7 @@
 """Texturing of an image's hits, K = 2, in the shape that training uses: hash lookup, MLP and SH, with detail limits.
 
-The table's half-precision copy exists, as in training and in frames. The second pair of figures includes the composition.
+The table's half-precision copy exists, as in training and in frames. The second pair of figures includes the
+composition.
 """
 
 import sys

@@ -143,7 +143,8 @@ _LOOKUP = """
     // Features, as words of two halves, of the lanes' points at level `first` + lane % 4. Two neighbouring lanes share
     // a point: each looks up one side of both lanes' cells, as rows that differ in x alone mostly lie in one line of
     // 128 bytes, which a load then visits once.
-    auto look_up_level = [&](int first, const wp::float32 (*at)[LANES], const wp::float32* depth, unsigned (*out)[LANES]) {
+    auto look_up_level = [&](int first, const wp::float32 (*at)[LANES], const wp::float32* depth,
+                             unsigned (*out)[LANES]) {
         wp::float32 part[2][F][LANES] = {}, given[LANES], got[LANES];
         UNROLL
         for (int e = 0; e < 2; ++e) {
