@@ -15,9 +15,9 @@ The derivative of the interpolation is written by hand. With s_j = <features of 
 position's gradient is that of the interpolation of the s_j, and the depth's is their interpolation times the
 derivative of the fade. A lane's share of both is linear in its own four s_j.
 
-Where pixels are smaller than cells, the points of a cell add up theirs before any atomic, by a product on tensor cores:
-the matrix that says which points share a cell, times what each point adds to each corner, rounded to half precision and
-summed in float32. Elsewhere few points share a cell, and each adds its own.
+Where pixels are smaller than cells, points in one cell add up theirs before any atomic. Pairs of points that share a
+cell exchange halves: each is left with two of a lane's four corners, and the sum of both points. Fours in one cell then
+share out one corner each.
 """
 
 import functools
@@ -25,6 +25,9 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.mma import PRELUDE
+
+# Lanes of a group after each step: x, y, x, x in the 8 x 2 pixels of a warp, whose lowest bit is the side of the cell.
+_BITS = (2, 16, 4, 8)
 
 _PROGRAM = """
     const float focal_length = focal.data[0], factor = unscale.data[0];
@@ -52,11 +55,8 @@ _PROGRAM = """
     };
 #if defined(__CUDA_ARCH__)
     const int unit = thread >> 5;
-    __shared__ __align__(16) unsigned short stages[THREADS / 32][(7 + F) * 16];
-    unsigned short* stage = stages[threadIdx.x >> 5];
 #else
     const int unit = thread;
-    unsigned short stage[(7 + F) * 16];
 #endif
     const int across = (width + (1 << shift) - 1) >> shift;
     const int tile = unit / hits, hit = unit % hits;
@@ -87,14 +87,14 @@ _PROGRAM = """
         const float per_scale = focal_length * reciprocal(scale);
         const unsigned* incoming = reinterpret_cast<const unsigned*>(grad_encoded.data)
             + ((size_t)level * places + (size_t)unit * 16) * (F / 2);
-        int cell[3][LANES], useful[LANES], wide[LANES];
-        unsigned slot[4][LANES], given[F / 2][LANES];
-        wp::float32 share[3][LANES], weight[4][LANES];
+        int cell[3][LANES], held[LANES], whole[LANES], wide[LANES];
+        unsigned slot[4][LANES];
+        wp::float32 v[4 * F][LANES];
         EACH_LANE {
             const int side = lane & 1;
             wp::float32 g[F], fraction[3];
-            unsigned incoming_row[F / 2] = {}, found[4][F / 2] = {};
-            if (seen[l]) read_row(incoming + (lane >> 1) * (F / 2), incoming_row);
+            unsigned given[F / 2] = {}, found[4][F / 2] = {};
+            if (seen[l]) read_row(incoming + (lane >> 1) * (F / 2), given);
             UNROLL
             for (int i = 0; i < 3; ++i) {
                 const float x = at[i][l] * scale, base = floorf(x);
@@ -117,21 +117,22 @@ _PROGRAM = """
             const float power = -0.15915494309189535f * 1.4426950408889634f * ratio * ratio;
             const float rest = exponential2(power), fade = 1.0f - rest;
             const float wx = side ? fx : 1.0f - fx;
-            useful[l] = 0;
+            whole[l] = 0;
             UNROLL
             for (int f = 0; f < F; ++f) {
-                g[f] = f & 1 ? high_half(incoming_row[f / 2]) : low_half(incoming_row[f / 2]);
-                useful[l] |= g[f] != 0.0f;
-                given[f / 2][l] = incoming_row[f / 2];
+                g[f] = factor * (f & 1 ? high_half(given[f / 2]) : low_half(given[f / 2]));
+                whole[l] |= g[f] != 0.0f;
             }
+            held[l] = whole[l] ? 4 : 0;
             // Pixels smaller than a cell share cells, others hardly.
-            wide[l] = useful[l] && ratio > 1.0f;
-            share[0][l] = wx;
-            share[1][l] = side ? fy : 1.0f - fy;
-            share[2][l] = (side ? fz : 1.0f - fz) * fade;
+            wide[l] = whole[l] && ratio > 1.0f;
             const float wy[2] = {1.0f - fy, fy}, wz[2] = {(1.0f - fz) * (wx * fade), fz * (wx * fade)};
             UNROLL
-            for (int j = 0; j < 4; ++j) weight[j][l] = wy[j & 1] * wz[j >> 1];
+            for (int j = 0; j < 4; ++j) {
+                const float weight = wy[j & 1] * wz[j >> 1];
+                UNROLL
+                for (int f = 0; f < F; ++f) v[j * F + f][l] = weight * g[f];
+            }
             if (need_points && seen[l]) {
                 wp::float32 s[4] = {};
                 UNROLL
@@ -149,21 +150,14 @@ _PROGRAM = """
                 total[3][l] += wx * value * (power * rest);
             }
         }
-        if (any_lane(wide)) {
-MERGED
-        } else {
+MERGE
+        UNROLL
+        for (int j = 0; j < 4; ++j) {
             EACH_LANE {
-                if (useful[l]) {
-                    UNROLL
-                    for (int j = 0; j < 4; ++j) {
-                        wp::float32 part[F];
-                        UNROLL
-                        for (int f = 0; f < F; ++f)
-                            part[f] = factor * weight[j][l]
-                                * (f & 1 ? high_half(given[f / 2][l]) : low_half(given[f / 2][l]));
-                        add(sums + (size_t)slot[j][l] * F, part);
-                    }
-                }
+                wp::float32 part[F];
+                UNROLL
+                for (int f = 0; f < F; ++f) part[f] = v[j * F + f][l];
+                if (j < held[l]) add(sums + (size_t)slot[j][l] * F, part);
             }
         }
     }
@@ -173,7 +167,7 @@ MERGED
         for (int i = 0; i < 4; ++i) {
             wp::float32 other[LANES];
             swap_lanes(total[i], 1, other);
-            EACH_LANE total[i][l] = factor * (total[i][l] + other[l]);
+            EACH_LANE total[i][l] += other[l];
         }
         EACH_LANE {
             if (point[l] >= 0) {
@@ -193,75 +187,59 @@ MERGED
     }
 """
 
-# The sums of the cells' points, as a product of matrices: one row for each point that is the first of a cell, with ones
-# where the points of its cell stand, times what each point adds, a column for each corner and feature. Columns are
-# ordered so that a lane finds all features of a corner in its fragments: it has x by its lowest bit, y by the next one.
-_MERGED = """
-            unsigned peers[LANES], left[4][LANES], right[F][2][LANES];
-            wp::float32 sum[F][4][LANES] = {};
-            equal_lanes(cell, peers);
-            const unsigned able = vote(useful);
-            await_lanes();
-            EACH_LANE {
-                const int side = lane & 1;
-                unsigned short* to = stage + (lane >> 1);
-                UNROLL
-                for (int i = 0; i < 3; ++i) to[(2 * i + side) * 16] = (unsigned short)halves(share[i][l], 0.0f);
-                const unsigned word = side ? given[F / 2 - 1][l] : given[0][l];
-                if (F == 4) {
-                    to[(6 + 2 * side) * 16] = (unsigned short)word;
-                    to[(7 + 2 * side) * 16] = (unsigned short)(word >> 16);
-                } else to[(6 + side) * 16] = (unsigned short)(side ? word >> 16 : word);
-                if (!side) to[(6 + F) * 16] = useful[l] ? (unsigned short)(lowest_lane(peers[l] & able) >> 1) : NOBODY;
-            }
-            await_lanes();
-            EACH_LANE {
-                const unsigned row = lane >> 2;
-                UNROLL
-                for (int h = 0; h < 2; ++h) {
-                    const unsigned short* from = stage + 2 * (lane & 3) + 8 * h;
-                    const unsigned xy = times_halves(
-                        pair_at(from + ((row >> 1) & 1) * 16), pair_at(from + (2 + (row >> 2)) * 16));
-                    UNROLL
-                    for (int z = 0; z < 2; ++z) {
-                        const unsigned xyz = times_halves(xy, pair_at(from + (4 + z) * 16));
-                        UNROLL
-                        for (int i = 0; i < F / 2; ++i)
-                            right[z * (F / 2) + i][h][l] =
-                                times_halves(xyz, pair_at(from + (6 + 2 * i + (row & 1)) * 16));
-                    }
-                    const unsigned first = pair_at(from + (6 + F) * 16);
-                    UNROLL
-                    for (int r = 0; r < 2; ++r)
-                        left[2 * h + r][l] = ((first & 0xffffu) == row + 8 * r ? ONE : 0u)
-                            | ((first >> 16) == row + 8 * r ? ONE << 16 : 0u);
-                }
-            }
+# One step of the exchanges, each inside of the one before it: groups of points that are in one cell already.
+_STEP = """
+        {
+            const unsigned able = vote(whole);
+            int other[3][LANES];
             UNROLL
-            for (int t = 0; t < F; ++t) multiply_add(sum[t], left, right[t]);
-            UNROLL
-            for (int r = 0; r < 2; ++r) {
-                int source[LANES];
-                unsigned theirs[4][LANES];
-                EACH_LANE source[l] = 2 * ((lane >> 2) + 8 * r) + (lane & 1);
-                UNROLL
-                for (int j = 0; j < 4; ++j) take_from(slot[j], source, theirs[j]);
-                EACH_LANE {
-                    UNROLL
-                    for (int z = 0; z < 2; ++z) {
-                        wp::float32 part[F];
-                        bool any = false;
-                        UNROLL
-                        for (int f = 0; f < F; ++f) {
-                            part[f] = factor * sum[z * (F / 2) + f / 2][2 * r + (f & 1)][l];
-                            any |= part[f] != 0.0f;
-                        }
-                        const unsigned there = lane & 2 ? theirs[1 + 2 * z][l] : theirs[2 * z][l];
-                        if (any) add(sums + (size_t)there * F, part);
-                    }
-                }
+            for (int i = 0; i < 3; ++i) swap_lanes(cell[i], BIT, other[i]);
+            EACH_LANE {
+                const int same = cell[0][l] == other[0][l] && cell[1][l] == other[1][l] && cell[2][l] == other[2][l];
+                whole[l] = same && ((able >> lane) & (able >> (lane ^ BIT)) & 1u);
             }
+        }
+        if (any_lane(whole)) {
+            UNROLL
+            for (int k = 0; k < COUNT; ++k) {
+                wp::float32 given[LANES], got[LANES];
+                EXCHANGE
+            }
+            EACH_LANE if (whole[l]) { SHARE }
 """
+_HALVES = """
+                EACH_LANE given[l] = lane & BIT ? v[k][l] : v[k + COUNT][l];
+                swap_lanes(given, BIT, got);
+                EACH_LANE if (whole[l]) v[k][l] = (lane & BIT ? v[k + COUNT][l] : v[k][l]) + got[l];
+"""
+_SUM = """
+                EACH_LANE given[l] = v[k][l];
+                swap_lanes(given, BIT, got);
+                EACH_LANE if (whole[l]) v[k][l] += got[l];
+"""
+
+
+def _merge(features: int) -> str:
+    """Return the text of the exchanges: each step is inside of the one before it."""
+    text = "        if (any_lane(wide)) {"
+    for step, bit in enumerate(_BITS):
+        corners = 2 >> step  # that a lane is left with; none in the last two steps, where it already has but one
+        if corners:
+            share = f"held[l] = {corners};"
+            share += "".join(f" if (lane & {bit}) slot[{j}][l] = slot[{j + corners}][l];" for j in range(corners))
+        else:
+            share = f"if (lane & {bit}) held[l] = 0;"
+        names = {
+            "EXCHANGE": _HALVES if corners else _SUM,
+            "SHARE": share,
+            "BIT": str(bit),
+            "COUNT": str(max(corners, 1) * features),
+        }
+        part = _STEP
+        for name, value in names.items():
+            part = part.replace(name, value)
+        text += part
+    return text + "}" * (len(_BITS) + 1)
 
 
 SCATTER_THREADS = 128  # of a block
@@ -276,12 +254,9 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
     values = ", ".join(f'"f"(from[{f}])' for f in range(features))
     places = ", ".join(f"%{f + 1}" for f in range(features))
     text = _PROGRAM.replace("FEATURES", str(features)).replace("VALUES", values).replace("PLACES", places)
-    text = text.replace("MERGED", _MERGED)
+    text = text.replace("MERGE", _merge(features))
 
-    constants = f"    constexpr int F = {features}, THREADS = {SCATTER_THREADS}, NOBODY = 255;\n"
-    constants += "    constexpr unsigned ONE = 0x3c00u;\n"
-
-    @wp.func_native(PRELUDE + constants + text)
+    @wp.func_native(PRELUDE + f"    constexpr int F = {features};\n" + text)
     def scatter(
         thread: wp.int32,
         table: Halves,

@@ -34,7 +34,7 @@ from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
 
-GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup works on, where it can: a third of an H100's L2 cache
+GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
 
 
 class Shape(NamedTuple):
@@ -313,7 +313,7 @@ def _scatter(
 def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
     """Return the ranges of levels (first, end) that one launch of the backward lookup takes.
 
-    Launches of few levels keep the sums in the L2 cache, where atomics are four times as fast as in memory. The coarser
+    Launches of few levels keep the sums in the L2 cache, where atomics are much faster than in memory. The coarser
     half of the levels goes together, as little of their tables is used.
 
     Args:

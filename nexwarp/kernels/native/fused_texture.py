@@ -101,71 +101,44 @@ _PIXELS = """
 
 _LOOKUP = """
     const float focal_length = focal.data[0];
-    // 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..., of the negative coordinate.
-    auto map_negative = [](int i) { return ((unsigned)i << 1) ^ (unsigned)(i >> 31); };
-    // A point's features at one level, of the four corners of its cell at the lower x, or at the upper x.
-    auto look_up = [&](int level, const float* at, int side, wp::float32 (*sum)[LANES], int l) {
+    auto map_positive = [](int i) { return (unsigned)(i > 0 ? 2 * i - 1 : -2 * i); };
+    // Features of a point at one level, as words of two halves.
+    auto look_up = [&](int level, const float* at, float depth, unsigned* out) {
         const float scale = resolutions.data[level];
         const float x = at[0] * scale, y = at[1] * scale, z = at[2] * scale;
         const float bx = floorf(x), by = floorf(y), bz = floorf(z);
-        const float fx = x - bx, fy = y - by, fz = z - bz, wx = side ? fx : 1.0f - fx;
-        const float wy[2] = {1.0f - fy, fy}, wz[2] = {(1.0f - fz) * wx, fz * wx};
-        const int cy = (int)-by, cz = (int)-bz;
-        const unsigned hx = map_negative((int)-bx - side);
-        const unsigned hy[2] = {map_negative(cy) * 2654435761u, map_negative(cy - 1) * 2654435761u};
-        const unsigned hz[2] = {map_negative(cz) * 805459861u, map_negative(cz - 1) * 805459861u};
-        const unsigned* rows =
-            opaque(reinterpret_cast<const unsigned*>(table.data) + (size_t)level * (mask + 1u) * (F / 2));
-        unsigned word[4][F / 2];
+        const float ratio = focal_length / (scale * depth);
+        const float fade = 1.0f - power_of_e(-0.15915494309189535f * ratio * ratio);
+        const float wx[2] = {1.0f - (x - bx), x - bx}, wy[2] = {1.0f - (y - by), y - by};
+        const float wz[2] = {(1.0f - (z - bz)) * fade, (z - bz) * fade};
+        const int cx = (int)bx, cy = (int)by, cz = (int)bz;
+        const unsigned hx[2] = {map_positive(cx), map_positive(cx + 1)};
+        const unsigned hy[2] = {map_positive(cy) * 2654435761u, map_positive(cy + 1) * 2654435761u};
+        const unsigned hz[2] = {map_positive(cz) * 805459861u, map_positive(cz + 1) * 805459861u};
+        const unsigned* rows = reinterpret_cast<const unsigned*>(table.data) + (size_t)level * (mask + 1u) * (F / 2);
+        float sum[F] = {};
         UNROLL
-        for (int j = 0; j < 4; ++j) {
-            const unsigned slot = (hx ^ hy[j & 1] ^ hz[j >> 1]) & mask;
+        for (int j = 0; j < 8; ++j) {
+            const unsigned slot = (hx[j & 1] ^ hy[(j >> 1) & 1] ^ hz[j >> 2]) & mask;
             const unsigned* row = rows + (size_t)slot * (F / 2);
+            unsigned word[F / 2];
 #if defined(__CUDA_ARCH__)
             if (F == 4) {
                 const uint2 both = __ldg(reinterpret_cast<const uint2*>(row));
-                word[j][0] = both.x; word[j][F / 2 - 1] = both.y;
-            } else word[j][0] = __ldg(row);
+                word[0] = both.x; word[F / 2 - 1] = both.y;
+            } else word[0] = __ldg(row);
 #else
-            for (int f = 0; f < F / 2; ++f) word[j][f] = row[f];
+            for (int f = 0; f < F / 2; ++f) word[f] = row[f];
 #endif
-        }
-        UNROLL
-        for (int j = 0; j < 4; ++j) {
-            const float weight = wy[j & 1] * wz[j >> 1];
+            const float weight = wx[j & 1] * wy[(j >> 1) & 1] * wz[j >> 2];
             UNROLL
             for (int f = 0; f < F / 2; ++f) {
-                sum[2 * f][l] += weight * low_half(word[j][f]);
-                sum[2 * f + 1][l] += weight * high_half(word[j][f]);
-            }
-        }
-    };
-    // Features, as words of two halves, of the lanes' points at level `first` + lane % 4. Two neighbouring lanes share
-    // a point: each looks up one side of both lanes' cells, as rows that differ in x alone mostly lie in one line of
-    // 128 bytes, which a load then visits once.
-    auto look_up_level = [&](int first, const wp::float32 (*at)[LANES], const wp::float32* depth,
-                             unsigned (*out)[LANES]) {
-        wp::float32 part[2][F][LANES] = {}, given[LANES], got[LANES];
-        UNROLL
-        for (int e = 0; e < 2; ++e) {
-            EACH_LANE {
-                const float here[3] = {at[0][l], at[1][l], at[2][l]};
-                if (depth[l] > 0.0f) look_up(first + (lane & 2) + e, here, lane & 1, part[e], l);
+                sum[2 * f] += weight * low_half(word[f]);
+                sum[2 * f + 1] += weight * high_half(word[f]);
             }
         }
         UNROLL
-        for (int f = 0; f < F; ++f) {
-            EACH_LANE given[l] = lane & 1 ? part[0][f][l] : part[1][f][l];
-            swap_lanes(given, 1, got);
-            EACH_LANE part[0][f][l] = (lane & 1 ? part[1][f][l] : part[0][f][l]) + got[l];
-        }
-        EACH_LANE {
-            const float ratio = focal_length * reciprocal(resolutions.data[first + (lane & 3)] * depth[l]);
-            const float power = -0.15915494309189535f * 1.4426950408889634f * ratio * ratio;
-            const float fade = depth[l] > 0.0f ? 1.0f - exponential2(power) : 0.0f;
-            UNROLL
-            for (int f = 0; f < F / 2; ++f) out[f][l] = halves(part[0][2 * f][l] * fade, part[0][2 * f + 1][l] * fade);
-        }
+        for (int f = 0; f < F / 2; ++f) out[f] = halves(sum[2 * f], sum[2 * f + 1]);
     };
 """
 
@@ -198,27 +171,31 @@ PIXELS
         for (int hit = 0; hit < hits; ++hit) {
             unsigned x[2][4][LANES];
             int seen[LANES];
-            EACH_LANE seen[l] = 0;
-            UNROLL
-            for (int i = 0; i < 2; ++i) {
-                float at[3][LANES], depth[LANES];
-                EACH_LANE {
-                    const size_t point = (size_t)pixel[i][l] * hits + hit;
-                    depth[l] = pixel[i][l] < 0 ? 0.0f : depths.data[point];
-                    const bool here = depth[l] > 0.0f;
-                    seen[l] |= here;
-                    UNROLL
-                    for (int c = 0; c < 3; ++c) at[c][l] = here ? places[3 * point + c] : 0.0f;
-                }
+            EACH_LANE {
+                seen[l] = 0;
                 UNROLL
-                for (int t = 0; t < 2; ++t) {
-                    unsigned word[2][F / 2][LANES];
+                for (int i = 0; i < 2; ++i) {
+                    const size_t point = (size_t)pixel[i][l] * hits + hit;
+                    const float depth = pixel[i][l] < 0 ? 0.0f : depths.data[point];
                     UNROLL
-                    for (int u = 0; u < (F == 4 ? 1 : 2); ++u)
-                        look_up_level(F == 4 ? 4 * t : 8 * t + 4 * u, at, depth, word[u]);
-                    EACH_LANE {
-                        x[t][i][l] = word[0][0][l];
-                        x[t][2 + i][l] = F == 4 ? word[0][F / 2 - 1][l] : word[1][0][l];
+                    for (int t = 0; t < 2; ++t) x[t][i][l] = x[t][2 + i][l] = 0u;
+                    if (depth > 0.0f) {
+                        seen[l] = 1;
+                        const float at[3] = {places[3 * point], places[3 * point + 1], places[3 * point + 2]};
+                        UNROLL
+                        for (int t = 0; t < 2; ++t) {
+                            unsigned word[2];
+                            if (F == 4) {
+                                look_up(4 * t + (lane & 3), at, depth, word);
+                                x[t][i][l] = word[0];
+                                x[t][2 + i][l] = word[F / 2 - 1];
+                            } else {
+                                look_up(8 * t + (lane & 3), at, depth, word);
+                                x[t][i][l] = word[0];
+                                look_up(8 * t + 4 + (lane & 3), at, depth, word);
+                                x[t][2 + i][l] = word[0];
+                            }
+                        }
                     }
                 }
             }

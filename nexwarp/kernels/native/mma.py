@@ -60,22 +60,12 @@ PRELUDE = """
     auto swap_lanes = [](const auto* x, int bit, auto* to) {
         to[0] = __shfl_xor_sync(0xffffffffu, x[0], bit);
     };
-    auto take_from = [](const auto* x, const int* source, auto* to) {
-        to[0] = __shfl_sync(0xffffffffu, x[0], source[0]);
-    };
-    auto times_halves = [](unsigned a, unsigned b) {
-        unsigned y;
-        asm("mul.rn.f16x2 %0, %1, %2;" : "=r"(y) : "r"(a), "r"(b));
-        return y;
-    };
-    auto pair_at = [](const unsigned short* x) { return *reinterpret_cast<const unsigned*>(x); };
-    auto lowest_lane = [](unsigned lanes) { return __ffs(lanes) - 1; };
-    auto await_lanes = []() { __syncwarp(); };
     auto vote = [](const int* x) { return __ballot_sync(0xffffffffu, x[0]); };
     auto equal_lanes = [](const wp::int32 (*x)[1], unsigned* to) {
         const unsigned long long xy = ((unsigned long long)(unsigned)x[1][0] << 32) | (unsigned)x[0][0];
         to[0] = __match_any_sync(0xffffffffu, xy) & __match_any_sync(0xffffffffu, x[2][0]);
     };
+    auto power_of_e = [](float x) { return __expf(x); };
     auto exponential2 = [](float x) {
         float y;
         asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -144,18 +134,6 @@ PRELUDE = """
     auto swap_lanes = [](const auto* x, int bit, auto* to) {
         for (int lane = 0; lane < 32; ++lane) to[lane] = x[lane ^ bit];
     };
-    auto take_from = [](const auto* x, const int* source, auto* to) {
-        for (int lane = 0; lane < 32; ++lane) to[lane] = x[source[lane]];
-    };
-    auto times_halves = [&](unsigned a, unsigned b) {
-        return halves(low_half(a) * low_half(b), high_half(a) * high_half(b));
-    };
-    auto pair_at = [](const unsigned short* x) { return x[0] | ((unsigned)x[1] << 16); };
-    auto lowest_lane = [](unsigned lanes) {
-        for (int lane = 0; lane < 32; ++lane) if (lanes >> lane & 1u) return lane;
-        return -1;
-    };
-    auto await_lanes = []() {};
     auto vote = [](const int* x) {
         unsigned lanes = 0;
         for (int lane = 0; lane < 32; ++lane) lanes |= (unsigned)(x[lane] != 0) << lane;
@@ -168,6 +146,7 @@ PRELUDE = """
                 to[lane] |= (unsigned)(x[0][i] == x[0][lane] && x[1][i] == x[1][lane] && x[2][i] == x[2][lane]) << i;
         }
     };
+    auto power_of_e = [](float x) { return expf(x); };
     auto exponential2 = [](float x) { return exp2f(x); };
     auto reciprocal = [](float x) { return 1.0f / x; };
     auto opaque = [](const auto* x) { return x; };
