@@ -1,6 +1,7 @@
 """Texturing of an image's hits, K = 2, in the shape that training uses: hash lookup, MLP and SH, with detail limits.
 
-The second pair of figures includes the composition.
+The table's half-precision copy exists, as in training and in frames. The second pair of figures includes the
+composition.
 """
 
 import sys
@@ -26,6 +27,7 @@ def run(options: Options) -> list[Measurement]:
 def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
     """The hits are those of the scene, so that neighbouring ones lie as near each other as they do in use."""
     field, limits = trained_like(scene)
+    field.half_copy()
     g = geometry(scene)
     with torch.no_grad():
         hits = g.hits(max_hits)

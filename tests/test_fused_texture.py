@@ -128,6 +128,15 @@ def test_emulated_kernels_agree_with_the_reference(
     assert_agree(*fused_on_cpu(case), expected, list(references))
 
 
+def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
+    together = fused_on_cpu(case)[1]
+    monkeypatch.setattr(fused_texture, "GROUP_BYTES", 2**14)
+    assert len(fused_texture.level_groups(8, 2**14)) == 5
+    for name, apart, one in zip(NAMES, fused_on_cpu(case)[1], together, strict=True):
+        assert_close(apart, one, kind="value", name=name)
+
+
 CUDA_SIZES = [(200, 130, 2), (37, 1, 3), (129, 66, 1), (40, 30, 8)]
 
 
@@ -215,3 +224,16 @@ def test_shapes_that_the_kernels_take(shape: dict[str, int], usual: bool) -> Non
     texture = nw.NeuralTexture(table_size=2**4, **sizes)
     assert fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 1000) == usual
     assert not fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 2**27)
+
+
+@pytest.mark.parametrize(
+    ("levels", "level_bytes", "groups"),
+    [
+        (8, 2**24, [(0, 4), (4, 5), (5, 6), (6, 7), (7, 8)]),
+        (16, 2**23, [(0, 8), (8, 10), (10, 12), (12, 14), (14, 16)]),
+        (8, 2**19, [(0, 8)]),
+        (1, 2**30, [(0, 1)]),
+    ],
+)
+def test_levels_of_one_launch(levels: int, level_bytes: int, groups: list[tuple[int, int]]) -> None:
+    assert fused_texture.level_groups(levels, level_bytes) == groups

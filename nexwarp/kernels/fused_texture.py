@@ -14,7 +14,7 @@ last matrix.
     fused_backward   repeats the hidden layers from the features. Written: gradients of the features (L, places, F),
                      and of the matrices, in permuted order, a slot for each block. Four warps of a block share the
                      sums of matrix gradients: each holds a fourth of them and reads all four's activations
-    fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is 8 x 4 pixels, a thread a
+    fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is one unit, two threads a
                      point. On a CPU atomics are none: one thread launches it whole
 """
 

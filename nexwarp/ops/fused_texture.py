@@ -34,6 +34,8 @@ from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
 
+GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
+
 
 class Shape(NamedTuple):
     """An image's points, as the kernels order them.
@@ -57,12 +59,6 @@ class Shape(NamedTuple):
         """Number of tiles times hits."""
         wide, high = 1 << self.shift, 16 >> self.shift
         return -(-self.width // wide) * -(-self.height // high) * self.hits
-
-    @property
-    def blocks(self) -> int:
-        """Warps of `fused_scatter`: blocks of two tiles times hits."""
-        wide = 2 * self.shift - 3
-        return -(-self.width // (1 << wide)) * -(-self.height // (1 << (5 - wide))) * self.hits
 
 
 def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
@@ -290,30 +286,45 @@ def _scatter(
     """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
     table, positions, shape = inputs.table, inputs.positions, inputs.shape
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    count = shape.blocks * (32 if positions.is_cuda else 1)
+    count = shape.units * (32 if positions.is_cuda else 1)
     grad_points = positions.new_empty(len(positions) * need_points, 4)
-    launch(
-        positions,
-        fused_scatter_kernel(table.shape[2]),
-        count,
-        [
-            array(table.view(-1), wp.float16),
-            array(positions, wp.vec3),
-            array(inputs.depths, wp.float32),
-            array(inputs.resolutions, wp.float32),
-            array(inputs.focal, wp.float32),
-            wp.uint32(table.shape[1] - 1),
-            array(grad_encoded.view(-1), wp.float16),
-            shape.units * 16,
-            array(unscale, wp.float32),
-            *shape,
-            shape.shift,
-        ],
-        [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)],
-        block_dim=SCATTER_THREADS,
-        smallest=count,  # in one thread on a CPU
-    )
+    levels, size, features = table.shape
+    kernel = fused_scatter_kernel(features)
+    given = [
+        array(table.view(-1), wp.float16),
+        array(positions, wp.vec3),
+        array(inputs.depths, wp.float32),
+        array(inputs.resolutions, wp.float32),
+        array(inputs.focal, wp.float32),
+        wp.uint32(size - 1),
+        array(grad_encoded.view(-1), wp.float16),
+        shape.units * 16,
+        array(unscale, wp.float32),
+        *shape,
+        shape.shift,
+    ]
+    outputs = [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)]
+    for group in level_groups(levels, size * features * 4):
+        # In one thread on a CPU.
+        launch(positions, kernel, count, [*given, *group], outputs, block_dim=SCATTER_THREADS, smallest=count)
     return grad_grid, grad_points if need_points else None
+
+
+def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
+    """Return the ranges of levels (first, end) that one launch of the backward lookup takes.
+
+    Launches of few levels keep the sums in the L2 cache, where atomics are much faster than in memory. The coarser
+    half of the levels goes together, as little of their tables is used.
+
+    Args:
+        levels: L.
+        level_bytes: of the sums of one level.
+    """
+    if levels * level_bytes <= 2 * GROUP_BYTES:
+        return [(0, levels)]
+    half, each = levels // 2, max(GROUP_BYTES // level_bytes, 1)
+    starts = [0, *range(max(half, 1), levels, each)]
+    return list(zip(starts, [*starts[1:], levels], strict=True))
 
 
 def _launch(

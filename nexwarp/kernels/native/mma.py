@@ -57,7 +57,7 @@ PRELUDE = """
         x[0] += __shfl_xor_sync(0xffffffffu, x[0], 2);
     };
     auto any_lane = [](const int* x) { return __any_sync(0xffffffffu, x[0]); };
-    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+    auto swap_lanes = [](const auto* x, int bit, auto* to) {
         to[0] = __shfl_xor_sync(0xffffffffu, x[0], bit);
     };
     auto vote = [](const int* x) { return __ballot_sync(0xffffffffu, x[0]); };
@@ -66,6 +66,21 @@ PRELUDE = """
         to[0] = __match_any_sync(0xffffffffu, xy) & __match_any_sync(0xffffffffu, x[2][0]);
     };
     auto power_of_e = [](float x) { return __expf(x); };
+    auto exponential2 = [](float x) {
+        float y;
+        asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
+    auto reciprocal = [](float x) {
+        float y;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
+    // An address that the compiler adds an index to by one instruction, as it does not know how it came about.
+    auto opaque = [](const auto* x) {
+        asm volatile("" : "+l"(x));
+        return x;
+    };
 #else
 #define UNROLL
     constexpr int LANES = 32;
@@ -116,7 +131,7 @@ PRELUDE = """
         for (int lane = 0; lane < 32; ++lane) any |= x[lane];
         return any;
     };
-    auto swap_lanes = [](const wp::float32* x, int bit, wp::float32* to) {
+    auto swap_lanes = [](const auto* x, int bit, auto* to) {
         for (int lane = 0; lane < 32; ++lane) to[lane] = x[lane ^ bit];
     };
     auto vote = [](const int* x) {
@@ -132,6 +147,9 @@ PRELUDE = """
         }
     };
     auto power_of_e = [](float x) { return expf(x); };
+    auto exponential2 = [](float x) { return exp2f(x); };
+    auto reciprocal = [](float x) { return 1.0f / x; };
+    auto opaque = [](const auto* x) { return x; };
 #endif
 #define EACH_LANE for (int l = 0, lane = lane0; l < LANES; ++l, ++lane)
 """
