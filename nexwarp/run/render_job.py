@@ -19,7 +19,8 @@ from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
-from nexwarp.model.options import Exposure, Order, RenderChanges
+from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.ops.tiles import Order
 from nexwarp.run.contents import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, frame_name, picture_name
 from nexwarp.run.opened import OpenedModel
 from nexwarp.run.optics import PLAIN, Optics

@@ -8,6 +8,7 @@ from typing import Any
 from nexwarp.checks import check_range
 from nexwarp.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.tiles import check_order
 from nexwarp.render import MAX_JITTER
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
@@ -125,6 +126,9 @@ class Config:
     evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
+    order: str = "depth"
+    """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth, `distance`
+    by their distance from the camera, for scenes that are shown as panoramas."""
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
@@ -160,6 +164,7 @@ class Config:
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
+        check_order(self.order)
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

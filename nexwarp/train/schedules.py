@@ -3,11 +3,12 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from nexwarp.model.options import RenderOptions
+from nexwarp.ops.tiles import Order
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
@@ -141,6 +142,7 @@ def options_at(
         background=background,
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
         low_pass=config.low_pass,
+        order=cast(Order, config.order),
     )
 
 
