@@ -52,9 +52,7 @@ def sampled(model: nw.Model, viewmat: torch.Tensor, camera: nw.Camera, width: in
     latitude, longitude = torch.meshgrid(latitude, longitude, indexing="ij")
     across = latitude.cos()
     window = torch.stack([longitude.sin() * across, latitude.sin(), longitude.cos() * across], -1).to(viewmat)
-    image = model.render(
-        nw.RayCamera(viewmat, window, camera.near, width / (2 * math.pi)), exposure="mean"
-    ).image
+    image = model.render(nw.RayCamera(viewmat, window, camera.near, width / (2 * math.pi)), exposure="mean").image
     height, columns = image.shape[:2]
     at = torch.stack([(x - left) / columns, (y - top) / height], -1) * 2 - 1
     layers = image.permute(2, 0, 1)[None]
@@ -67,4 +65,3 @@ def places(rays: torch.Tensor, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     units = torch.nn.functional.normalize(rays, dim=-1)
     x = (torch.atan2(units[..., 0], units[..., 2]) / (2 * math.pi) + 0.5) * width
     return x, (torch.asin(units[..., 1].clamp(-1, 1)) / math.pi + 0.5) * (width // 2)
-

@@ -18,6 +18,7 @@ REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
 LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
+MOST_BLUR_POSES = 31
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class LearningRates:
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """First and last learning rate of the MLP."""
     poses: tuple[float, float] = (2e-4, 2e-6)
-    """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
+    """With `refine_poses` or `blur_poses`: first and last learning rate of the pose corrections and of the motions
+    during exposures, radians and scene scales."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):
@@ -121,14 +123,18 @@ class Config:
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
+    blur_poses: int = 1
+    """For photos with motion blur, an odd number above 1, such as 3: learn how each training camera moves during its
+    exposure, and compare the photo with the mean of renderings from this many poses on the way. Steps take that many
+    times as long; 1 is for sharp photos."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
     order: str = "depth"
-    """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth, `distance`
-    by their distance from the camera, for scenes that are shown as panoramas."""
+    """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
+    `distance` by their distance from the camera, for scenes that are shown as panoramas."""
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
@@ -165,6 +171,9 @@ class Config:
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
         check_order(self.order)
+        check_range("blur_poses", self.blur_poses, 1, MOST_BLUR_POSES)
+        if self.blur_poses % 2 == 0:
+            raise ValueError(f"blur_poses: expected an odd number, got {self.blur_poses}")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

@@ -1,10 +1,12 @@
 """Makes the initial surfels, on points of the cloud, and chooses the shape of the texture."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.data import Scene, View, initial_points
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
@@ -17,6 +19,7 @@ INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
+FIRST_BLUR = 0.5  # standard deviation of the first motions, pixels for each of their six numbers
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 
@@ -81,11 +84,28 @@ def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 
 def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCorrections | None:
-    """Return corrections of 0 for the training poses, on a device; None where poses are not refined."""
-    if not config.refine_poses:
+    """Return corrections of 0 for the training poses, and random motions; None where neither is learned."""
+    if not config.refine_poses and config.blur_poses == 1:
         return None
-    depths = [_typical_depth(view, scene) for view in scene.train]
-    return PoseCorrections([view.camera for view in scene.train], scene.scale, depths).to(device)
+    cameras, depths = [view.camera for view in scene.train], [_typical_depth(view, scene) for view in scene.train]
+    motions = None
+    if config.blur_poses > 1:
+        motions = _random_motions(cameras, scene.scale, depths, torch.Generator().manual_seed(config.seed))
+    return PoseCorrections(cameras, scene.scale, depths, refine=config.refine_poses, motions=motions).to(device)
+
+
+def _random_motions(
+    cameras: Sequence[Camera], scale: float, depths: Sequence[float], generator: torch.Generator
+) -> torch.Tensor:
+    """Return motions (V, 6) that move the pictures by about a pixel.
+
+    At no motion, gradients are 0: a motion and its reverse blur alike, so that the mean over the exposure has no first
+    derivative there.
+    """
+    pixels = torch.tensor(
+        [[1 / c.focal] * 3 + [z / (c.focal * scale)] * 3 for c, z in zip(cameras, depths, strict=True)]
+    )
+    return FIRST_BLUR * pixels * torch.randn(pixels.shape, generator=generator)
 
 
 def _typical_depth(view: View, scene: Scene) -> float:

@@ -17,8 +17,8 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses are
-# refined, "poses"; `lr`, the learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses or
+# motions are learned, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
@@ -42,7 +42,7 @@ def make_optimizer(
         scale: of the scene, world units, which the means' rates follow.
         make: makes an optimizer of one's own; None makes Adam, on CUDA a `FusedAdam` that regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
-        poses: pose corrections to train; None trains none.
+        poses: pose corrections and motions to train; None trains none.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -53,7 +53,7 @@ def make_optimizer(
     if config.max_hits:
         parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
     if poses is not None:
-        parts["poses"] = [poses.corrections]
+        parts["poses"] = [x for x in poses.parameters() if x.requires_grad]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):

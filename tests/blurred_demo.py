@@ -1,0 +1,64 @@
+"""The demo scene with motion blur of known motions, ray-traced from many poses in each exposure."""
+
+import dataclasses
+
+import numpy as np
+import torch
+
+import nexwarp as nw
+from nexwarp.data import demo_folder
+from nexwarp.data.demo import HEIGHT, VIEWS, WIDTH, demo_cameras
+from nexwarp.data.demo_room import LAMP, build_room
+from nexwarp.data.raytrace import render
+from nexwarp.representation.poses import PoseCorrections
+from nexwarp.train.motion_blur import decoded, encoded, moments
+
+
+def blurred_demo(
+    turn: float, shift: float, *, downscale: int = 1, instants: int = 9, seed: int = 11
+) -> tuple[nw.Scene, torch.Tensor]:
+    """The demo, whose training photos are blurred, and the true motions (V, 6) in units of `PoseCorrections`.
+
+    Args:
+        turn: length of the rotation during each exposure, radians; its axis is random.
+        shift: length of the shift, in scales of the scene; its direction is random.
+        downscale: factor on the photos' size.
+        instants: poses whose light is averaged.
+        seed: of the motions.
+    """
+    scene = nw.load_scene(demo_folder(), downscale=downscale)
+    cameras, count = [view.camera for view in scene.train], len(scene.train)
+    ways = torch.nn.functional.normalize(
+        torch.randn(2, count, 3, generator=torch.Generator().manual_seed(seed)), dim=-1
+    )
+    poses = initial_like(cameras, scene, torch.cat([turn * ways[0], shift * ways[1]], -1))
+    assert poses.motions is not None
+    room, rig = build_room(WIDTH), demo_cameras(WIDTH, HEIGHT, VIEWS)
+    views = []
+    for index, view in enumerate(scene.train):
+        light = torch.zeros(HEIGHT, WIDTH, 3)
+        for time in moments(instants):
+            with torch.no_grad():
+                viewmat = poses.moment(view.camera, index, time).viewmat.double().numpy()
+            sharp = render(room, viewmat.astype(np.float64), rig.K, rig.size, LAMP)
+            light += decoded(torch.from_numpy(sharp).float() / 255) / instants
+        small = torch.nn.functional.avg_pool2d(encoded(light).permute(2, 0, 1), downscale).permute(1, 2, 0)
+        image = (small * 255).round().clamp(0, 255).to(torch.uint8)
+        assert image.shape == view.image.shape
+        views.append(dataclasses.replace(view, image=image.contiguous()))
+    return dataclasses.replace(scene, train=views), poses.motions.detach()
+
+
+def initial_like(cameras: list[nw.Camera], scene: nw.Scene, motions: torch.Tensor) -> PoseCorrections:
+    """Poses with motions about the points about which a training turns its cameras."""
+    from nexwarp.train.initial import initial_poses
+
+    given = initial_poses(scene, nw.Config(blur_poses=3), torch.device("cpu"))
+    assert given is not None
+    return PoseCorrections(cameras, scene.scale, given.pivots.tolist(), motions=motions)
+
+
+def motion_errors(found: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
+    """Lengths (V,) of found motions minus true ones, in units of the true ones; a reversed motion is the same."""
+    both = torch.stack([(found - true).norm(dim=-1), (found + true).norm(dim=-1)])
+    return both.amin(0) / true.norm(dim=-1)
