@@ -1,6 +1,8 @@
 """The demo scene with motion blur of known motions, ray-traced from many poses in each exposure."""
 
 import dataclasses
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -34,14 +36,21 @@ def blurred_demo(
     poses = initial_like(cameras, scene, torch.cat([turn * ways[0], shift * ways[1]], -1))
     assert poses.motions is not None
     room, rig = build_room(WIDTH), demo_cameras(WIDTH, HEIGHT, VIEWS)
-    views = []
-    for index, view in enumerate(scene.train):
+
+    def light_of(index: int) -> torch.Tensor:
+        """Linear light (H, W, 3) of an exposure."""
         light = torch.zeros(HEIGHT, WIDTH, 3)
         for time in moments(instants):
             with torch.no_grad():
-                viewmat = poses.moment(view.camera, index, time).viewmat.double().numpy()
+                viewmat = poses.moment(cameras[index], index, time).viewmat.double().numpy()
             sharp = render(room, viewmat.astype(np.float64), rig.K, rig.size, LAMP)
             light += decoded(torch.from_numpy(sharp).float() / 255) / instants
+        return light
+
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        lights = list(pool.map(light_of, range(count)))
+    views = []
+    for view, light in zip(scene.train, lights, strict=True):
         small = torch.nn.functional.avg_pool2d(encoded(light).permute(2, 0, 1), downscale).permute(1, 2, 0)
         image = (small * 255).round().clamp(0, 255).to(torch.uint8)
         assert image.shape == view.image.shape

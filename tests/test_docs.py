@@ -78,6 +78,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "rates.grid": ("", "code"),
     "rates.mlp": ("", "code"),
     "rates.poses": ("", ""),
+    "rates.motions": ("", ""),
     "texture.levels": ("L", "5"),
     "texture.table_size": ("T", "5"),
     "texture.features": ("F", "5"),

@@ -183,9 +183,9 @@ def test_ranks_learn_the_same_motions(tiny_scene: Scene, tmp_path: Path):
 def test_motions_come_back_in_training(shown: Scene, model: nw.Model):  # noqa: F811
     """With surfels that are right, motions of about 5 pixels are found but for their direction in time."""
     still: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(RATES)}
-    still |= dict.fromkeys(("means", "grid", "mlp"), (0.0, 0.0))
+    still |= dict.fromkeys(("means", "grid", "mlp", "poses"), (0.0, 0.0))
     config = small(iterations=320, max_hits=0, blur_poses=5, exposures=False, sh_every=1, background=(0.0, 0.0, 0.0))
-    config = dataclasses.replace(config, rates=LearningRates(**still | {"poses": (4e-3, 2e-4)}))
+    config = dataclasses.replace(config, rates=LearningRates(**still | {"motions": (4e-3, 2e-4)}))
     config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False))
     cameras = [view.camera for view in shown.train]
     ways = torch.nn.functional.normalize(

@@ -44,8 +44,9 @@ class LearningRates:
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """First and last learning rate of the MLP."""
     poses: tuple[float, float] = (2e-4, 2e-6)
-    """With `refine_poses` or `blur_poses`: first and last learning rate of the pose corrections and of the motions
-    during exposures, radians and scene scales."""
+    """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
+    motions: tuple[float, float] = (1e-3, 1e-5)
+    """With `blur_poses`: first and last learning rate of the motions during exposures, radians and scene scales."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):

@@ -17,8 +17,8 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses or
-# motions are learned, "poses"; `lr`, the learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are
+# learned, "poses" and "motions"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
@@ -53,7 +53,8 @@ def make_optimizer(
     if config.max_hits:
         parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
     if poses is not None:
-        parts["poses"] = [x for x in poses.parameters() if x.requires_grad]
+        learned = {"poses": poses.corrections, "motions": poses.motions}
+        parts |= {name: [x] for name, x in learned.items() if x is not None and x.requires_grad}
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
@@ -102,6 +103,7 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "grid": rates.grid,
         "mlp": rates.mlp,
         "poses": rates.poses,
+        "motions": rates.motions,
     }
 
 
