@@ -54,34 +54,36 @@ def test_light_is_encoded_as_srgb_says():
     assert mean_light([black, white, white, black])[0, 0, 0].item() == pytest.approx(188 / 255, abs=0.002)
 
 
-def exposed(count: int, dtype: torch.dtype) -> tuple[nw.Model, Target, PoseCorrections]:
+def exposed(count: int, device: torch.device) -> tuple[nw.Model, Target, PoseCorrections]:
     """A model, a target and a camera that moves by some pixels."""
-    scene = scenes.random_scene(40, width=32, height=24, dtype=dtype)
-    drawn = nw.Model(scenes.make_surfels(scene), scenes.make_texture(dtype=dtype))
+    dtype = torch.float64
+    scene = scenes.random_scene(40, width=32, height=24, dtype=dtype, device=device)
+    drawn = nw.Model(scenes.make_surfels(scene), scenes.make_texture(dtype=dtype, device=device))
     given = scenes.make_camera(scene)
     camera = nw.Camera(given.viewmat.detach(), given.K, given.width, given.height, given.near)
     motions = torch.tensor([[0.06, -0.08, 0.05, 0.02, -0.03, 0.04]])
-    poses = PoseCorrections([camera], 2.0, [3.0], motions=motions).to(dtype)
+    poses = PoseCorrections([camera], 2.0, [3.0], motions=motions).to(device, dtype)
     photo = torch.rand(24, 32, 3, dtype=dtype, generator=torch.Generator().manual_seed(2))
-    return drawn, Target(camera, photo, (0.2, 0.3, 0.4), view=torch.tensor([0])), poses
+    view = torch.tensor([0], device=device)
+    return drawn, Target(camera, photo.to(device), (0.2, 0.3, 0.4), view=view), poses
 
 
-def test_an_exposure_is_the_mean_light_over_its_moments():
+def test_an_exposure_is_the_mean_light_over_its_moments(device: torch.device):
     """From poses at the middles of equal parts of the twist's time, and the same for the motion reversed."""
-    drawn, target, poses = exposed(5, torch.float64)
+    drawn, target, poses = exposed(5, device)
     motions = present(poses.motions)
     with torch.no_grad():
         middle, taken = render_target(drawn, target, poses, 5)
         ahead = torch.eye(4, dtype=torch.float64)
         ahead[2, 3] = 3.0
-        w, v = motions[0, :3], 2.0 * motions[0, 3:]
+        w, v = motions[0, :3].cpu(), 2.0 * motions[0, 3:].cpu()
         generator = torch.zeros(4, 4, dtype=torch.float64)
         generator[:3, :3] = torch.tensor([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
         generator[:3, 3] = v
         images = []
         for index in range(5):
             motion = ahead @ torch.linalg.matrix_exp((index - 2) / 5 * generator) @ torch.linalg.inv(ahead)
-            camera = dataclasses.replace(target.camera, viewmat=motion @ target.camera.viewmat)
+            camera = dataclasses.replace(target.camera, viewmat=motion.to(device) @ target.camera.viewmat)
             images.append(drawn.render(camera, background=target.background).image)
         assert_close(taken.image, mean_light(images), kind="value", name="image")
         assert_close(middle.image, images[2], kind="value", name="middle")
@@ -91,9 +93,10 @@ def test_an_exposure_is_the_mean_light_over_its_moments():
     assert moments(3) == pytest.approx([-1 / 3, 0, 1 / 3])
 
 
-def test_gradients_of_motions_and_poses_are_those_of_differences():
-    drawn, target, poses = exposed(3, torch.float64)
+def test_gradients_of_motions_and_poses_are_those_of_differences(device: torch.device):
+    drawn, target, poses = exposed(3, device)
     weights = torch.randn(2, 24, 32, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    weights = weights.to(device)
 
     def value() -> torch.Tensor:
         moved = dataclasses.replace(target, camera=poses.camera(target.camera, present(target.view)))
@@ -112,7 +115,7 @@ def test_gradients_of_motions_and_poses_are_those_of_differences():
                     parameter[0, k] -= sign * step
             slopes.append((ends[0] - ends[1]) / (2 * step))
         # As close as differences of this size are to slopes; a flip at an edge would be far off.
-        assert_close(present(parameter.grad)[0].float(), torch.tensor(slopes), kind="gradient", name="slopes")
+        assert_close(present(parameter.grad)[0].float().cpu(), torch.tensor(slopes), kind="gradient", name="slopes")
 
 
 def test_without_motion_it_is_the_sharp_training(tiny_scene: Scene):
