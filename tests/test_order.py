@@ -2,14 +2,19 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import nexwarp as nw
 from nexwarp.data import demo_folder
-from nexwarp.errors import FormatError
+from nexwarp.errors import FormatError, SettingError
+from nexwarp.io.pictures import to_uint8
 from nexwarp.model import frames
 from nexwarp.run.metrics import psnr
+from nexwarp.run.optics import Optics
+from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
 from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import with_settings
 from nexwarp.web.scene_data import SceneData
@@ -107,6 +112,23 @@ def test_the_order_is_kept_in_files_and_named_where_it_is_bad(tmp_path):
         nw.render(surfels, None, scenes.make_camera(scenes.random_scene(4)), order=1)  # type: ignore[arg-type]
     with pytest.raises(FormatError, match="order: expected depth, which the web page draws, got distance"):
         SceneData.of(model)
+
+
+def test_the_command_renders_by_the_order_asked_for(tmp_path):
+    scene = wide_scene(torch.float32, "cpu")
+    model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
+    camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
+    for order in ("depth", "distance"):
+        file = tmp_path / f"{order}.png"
+        RenderJob([PictureJob(file, camera, False, False)], None, 30.0, order=order).render(model)
+        expected = to_uint8(model.render(camera, order=order).image.detach())
+        assert (np.asarray(Image.open(file)) == expected.numpy()).all()
+    with pytest.raises(SettingError, match="--order: expected depth or distance, got 'near'"):
+        RenderOrder(None, views="test", order="near")
+    with pytest.raises(SettingError, match="--order: expected together with --camera pinhole, got --camera panorama"):
+        RenderOrder(None, views="test", order="distance", optics=Optics(kind="panorama"))
+    with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
+        with_settings(nw.Config(), {"order": "near"})
 
 
 @pytest.mark.slow
