@@ -88,7 +88,7 @@ def test_an_exposure_is_the_mean_light_over_its_moments(device: torch.device):
         assert_close(taken.image, mean_light(images), kind="value", name="image")
         assert_close(middle.image, images[2], kind="value", name="middle")
         assert (taken.image - middle.image).abs().mean() > 0.003
-        motions *= -1
+        motions.neg_()
         assert_close(render_target(drawn, target, poses, 5)[1].image, taken.image, kind="value", name="reversed")
     assert moments(3) == pytest.approx([-1 / 3, 0, 1 / 3])
 

@@ -12,6 +12,7 @@ from nexwarp.data import demo_folder
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import frames
+from nexwarp.ops.tiles import Order
 from nexwarp.run.metrics import psnr
 from nexwarp.run.optics import Optics
 from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
@@ -31,6 +32,8 @@ from tests.render_support import (
     twin,
 )
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
+
+ORDERS: tuple[Order, ...] = ("depth", "distance")
 
 
 def wide_scene(dtype: torch.dtype, device: torch.device | str, count: int = 60) -> scenes.Scene:
@@ -93,12 +96,12 @@ def test_captured_frames_keep_their_orders():
     scene = wide_scene(torch.float32, "cuda")
     model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
     with torch.no_grad(), frames.without_graphs():
-        expected = {order: model.render(camera, order=order).image for order in ("depth", "distance")}
+        expected = {order: model.render(camera, order=order).image for order in ORDERS}
     assert not torch.equal(expected["depth"], expected["distance"])
     with torch.no_grad():
         for _ in range(3):
-            for order, image in expected.items():
-                assert torch.equal(model.render(camera, order=order).image, image)
+            for order in ORDERS:
+                assert torch.equal(model.render(camera, order=order).image, expected[order])
     assert len(frames._graphs[model.surfels].frames) == 2
 
 
@@ -118,7 +121,7 @@ def test_the_command_renders_by_the_order_asked_for(tmp_path):
     scene = wide_scene(torch.float32, "cpu")
     model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
     camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
-    for order in ("depth", "distance"):
+    for order in ORDERS:
         file = tmp_path / f"{order}.png"
         RenderJob([PictureJob(file, camera, False, False)], None, 30.0, order=order).render(model)
         expected = to_uint8(model.render(camera, order=order).image.detach())
@@ -141,8 +144,8 @@ def test_crops_of_a_panorama_of_the_trained_demo_are_pinhole_views():
     with torch.no_grad():
         camera = crop(given, turn, width)
         found = sampled(model, given.viewmat, camera, width)
-        levels = {o: psnr(found, model.render(camera, order=o, exposure="mean").image) for o in ("distance", "depth")}
+        levels = {o: psnr(found, model.render(camera, order=o, exposure="mean").image) for o in ORDERS}
         assert levels["distance"] > 40 > levels["depth"]
         photos = [(v.camera, v.image / 255) for v in scene.test]
-        means = [sum(psnr(model.render(c, order=o).image, x) for c, x in photos) / len(photos) for o in levels]
+        means = [sum([psnr(model.render(c, order=o).image, x) for c, x in photos]) / len(photos) for o in ORDERS]
     assert abs(means[0] - means[1]) < 0.1
