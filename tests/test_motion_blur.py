@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from benchmarks.motion_blur import blurred_demo, motion_errors
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
@@ -27,7 +28,6 @@ from nexwarp.train.step_losses import step_losses
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from tests import scenes
-from tests.blurred_demo import blurred_demo, motion_errors
 from tests.cli.support import FLAGS, SMALL
 from tests.narrowing import present
 from tests.ranks_support import CPU, digest, run_ranks
@@ -58,7 +58,9 @@ def exposed(count: int, device: torch.device) -> tuple[nw.Model, Target, PoseCor
     """A model, a target and a camera that moves by some pixels."""
     dtype = torch.float64
     scene = scenes.random_scene(40, width=32, height=24, dtype=dtype, device=device)
-    drawn = nw.Model(scenes.make_surfels(scene), scenes.make_texture(dtype=dtype, device=device))
+    texture = scenes.make_texture(dtype=dtype, device=device)
+    texture.half_precision = False
+    drawn = nw.Model(scenes.make_surfels(scene), texture)
     given = scenes.make_camera(scene)
     camera = nw.Camera(given.viewmat.detach(), given.K, given.width, given.height, given.near)
     motions = torch.tensor([[0.06, -0.08, 0.05, 0.02, -0.03, 0.04]])

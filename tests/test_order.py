@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
+from benchmarks.panoramas import crop, sampled, turned
 from nexwarp.data import demo_folder
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.io.pictures import to_uint8
@@ -20,7 +21,6 @@ from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import with_settings
 from nexwarp.web.scene_data import SceneData
 from tests import scenes
-from tests.panoramas import crop, sampled, turned
 from tests.render_support import (
     BACKGROUND,
     BUFFERS,
@@ -51,6 +51,7 @@ def test_rendering_by_distance_agrees_with_the_reference(device, dtype, low_pass
     scene = wide_scene(dtype, device)
     surfels, camera = scenes.make_surfels(scene), scenes.make_camera(scene)
     texture = scenes.make_texture(dtype=dtype, device=device)
+    texture.half_precision = False
     options: dict[str, Any] = {"max_hits": 2, "background": BACKGROUND, "low_pass": low_pass, "order": "distance"}
     out = nw.render(surfels, texture, camera, **options)
     surfels64, texture64 = twin(surfels), twin(texture)
@@ -76,6 +77,7 @@ def test_turning_the_camera_changes_no_ray(device):
     scene = wide_scene(torch.float64, device)
     camera = scenes.make_camera(scene)
     texture = scenes.make_texture(dtype=torch.float64, device=device)
+    texture.half_precision = False
     model = nw.Model(scenes.make_surfels(scene), texture, options=nw.RenderOptions(order="distance"))
     away = turned(camera.viewmat.detach(), 0.5, -0.2)
     rays = nw.RayCamera.pinhole(camera).rays @ camera.viewmat.detach()[:3, :3] @ away[:3, :3].T

@@ -1,7 +1,13 @@
-"""The demo scene with motion blur of known motions, ray-traced from many poses in each exposure."""
+"""Trainings on the demo with motion blur of known motions, ray-traced from many poses in each exposure.
 
+Usage: `python -m benchmarks.motion_blur [--poses 1 3 5] [--rates 1e-3] [--turn 0.04] [--shift 0.01] [--downscale 1]
+[--iterations 1200] [--device cuda]`. Each number of poses is trained once and judged on the sharp test views.
+"""
+
+import argparse
 import dataclasses
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -13,7 +19,11 @@ from nexwarp.data.demo import HEIGHT, VIEWS, WIDTH, demo_cameras
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.raytrace import render
 from nexwarp.representation.poses import PoseCorrections
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train.initial import initial_poses
 from nexwarp.train.motion_blur import decoded, encoded, moments
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
 
 
 def blurred_demo(
@@ -40,9 +50,9 @@ def blurred_demo(
     def light_of(index: int) -> torch.Tensor:
         """Linear light (H, W, 3) of an exposure."""
         light = torch.zeros(HEIGHT, WIDTH, 3)
-        for time in moments(instants):
+        for moment in moments(instants):
             with torch.no_grad():
-                viewmat = poses.moment(cameras[index], index, time).viewmat.double().numpy()
+                viewmat = poses.moment(cameras[index], index, moment).viewmat.double().numpy()
             sharp = render(room, viewmat.astype(np.float64), rig.K, rig.size, LAMP)
             light += decoded(torch.from_numpy(sharp).float() / 255) / instants
         return light
@@ -60,8 +70,6 @@ def blurred_demo(
 
 def initial_like(cameras: list[nw.Camera], scene: nw.Scene, motions: torch.Tensor) -> PoseCorrections:
     """Poses with motions about the points about which a training turns its cameras."""
-    from nexwarp.train.initial import initial_poses
-
     given = initial_poses(scene, nw.Config(blur_poses=3), torch.device("cpu"))
     assert given is not None
     return PoseCorrections(cameras, scene.scale, given.pivots.tolist(), motions=motions)
@@ -71,3 +79,38 @@ def motion_errors(found: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
     """Lengths (V,) of found motions minus true ones, in units of the true ones; a reversed motion is the same."""
     both = torch.stack([(found - true).norm(dim=-1), (found + true).norm(dim=-1)])
     return both.amin(0) / true.norm(dim=-1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print PSNR, SSIM and the errors of the motions of each training."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--poses", type=int, nargs="+", default=[1, 3, 5])
+    parser.add_argument("--rates", type=float, nargs="+", default=[1e-3], help="first rates of the motions")
+    parser.add_argument("--refine-poses", action="store_true")
+    parser.add_argument("--turn", type=float, default=0.04, help="radians")
+    parser.add_argument("--shift", type=float, default=0.01, help="scales of the scene")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--iterations", type=int, default=1200)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    options = parser.parse_args(argv)
+    scene, true = blurred_demo(options.turn, options.shift, downscale=options.downscale)
+    trials = [(count, rate) for count in options.poses for rate in (options.rates if count > 1 else options.rates[:1])]
+    for count, rate in trials:
+        settings = {"iterations": options.iterations, "refine_poses": options.refine_poses}
+        settings |= {"blur_poses": count, "rates.motions": [rate, rate / 100]}
+        config = with_settings(preset("default"), DEMO_SETTINGS | settings)
+        start = time.perf_counter()
+        trainer = nw.Trainer(scene, config, options.device)
+        trainer.run()
+        seconds = time.perf_counter() - start
+        scores = evaluate(trainer.finish(), scene.test)
+        line = f"blur_poses={count}, rate {rate:g}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {seconds:.0f} s"
+        if trainer.poses is not None and trainer.poses.motions is not None:
+            found = trainer.poses.motions.detach().cpu()
+            line += f", motions off by {motion_errors(found, true).median():.2f} (median)"
+        print(line, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
