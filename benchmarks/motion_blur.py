@@ -1,6 +1,6 @@
 """Trainings on the demo with motion blur of known motions, ray-traced from many poses in each exposure.
 
-Usage: `python -m benchmarks.motion_blur [--poses 1 3 5] [--rates 1e-3] [--turn 0.04] [--shift 0.01] [--downscale 1]
+Usage: `python -m benchmarks.motion_blur [--poses 1 3 5] [--rates 0.5] [--turn 5] [--shift 1] [--downscale 1]
 [--iterations 1200] [--device cuda]`. Each number of poses is trained once and judged on the sharp test views.
 """
 
@@ -32,8 +32,8 @@ def blurred_demo(
     """The demo, whose training photos are blurred, and the true motions (V, 6) in units of `PoseCorrections`.
 
     Args:
-        turn: length of the rotation during each exposure, radians; its axis is random.
-        shift: length of the shift, in scales of the scene; its direction is random.
+        turn: length of the rotation during each exposure, pixels; its axis is random.
+        shift: length of the shift, pixels; its direction is random.
         downscale: factor on the photos' size.
         instants: poses whose light is averaged.
         seed: of the motions.
@@ -85,10 +85,10 @@ def main(argv: list[str] | None = None) -> int:
     """Print PSNR, SSIM and the errors of the motions of each training."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, nargs="+", default=[1, 3, 5])
-    parser.add_argument("--rates", type=float, nargs="+", default=[1e-3], help="first rates of the motions")
+    parser.add_argument("--rates", type=float, nargs="+", default=[0.5], help="first rates of the motions, pixels")
     parser.add_argument("--refine-poses", action="store_true")
-    parser.add_argument("--turn", type=float, default=0.04, help="radians")
-    parser.add_argument("--shift", type=float, default=0.01, help="scales of the scene")
+    parser.add_argument("--turn", type=float, default=5.0, help="pixels")
+    parser.add_argument("--shift", type=float, default=1.0, help="pixels")
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--iterations", type=int, default=1200)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     trials = [(count, rate) for count in options.poses for rate in (options.rates if count > 1 else options.rates[:1])]
     for count, rate in trials:
         settings = {"iterations": options.iterations, "refine_poses": options.refine_poses}
-        settings |= {"blur_poses": count, "rates.motions": [rate, rate / 100]}
+        settings |= {"blur_poses": count, "rates.motions": [rate, rate / 25]}
         config = with_settings(preset("default"), DEMO_SETTINGS | settings)
         start = time.perf_counter()
         trainer = nw.Trainer(scene, config, options.device)

@@ -87,16 +87,19 @@ class PoseCorrections(nn.Module):
     Attributes:
         corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`. It takes
             no gradient where only motions are learned.
-        motions: (V, 6) parameter in the same units; None where cameras stand still.
+        motions: (V, 6) parameter, pixels that the turn moves the picture, and pixels that the shift moves the point
+            about which it turns; None where cameras stand still.
         scale: world units.
 
     Buffers, not saved:
         gauge: (6 V, G) orthonormal directions that change no rendering, G <= 7.
         pivots: (V,) z-depths of the points about which the corrections turn, world units.
+        pixels: (V,) angles of a pixel, radians.
     """
 
     gauge: torch.Tensor
     pivots: torch.Tensor
+    pixels: torch.Tensor
 
     motions: nn.Parameter | None
 
@@ -116,7 +119,7 @@ class PoseCorrections(nn.Module):
             scale: of the scene, world units > 0.
             depths: V typical z-depths of what the cameras see, world units > 0; None is `scale`.
             refine: whether corrections are learned.
-            motions: (V, 6) to start with; None lets the cameras stand still.
+            motions: (V, 6) pixels, to start with; None lets the cameras stand still.
         """
         super().__init__()
         check_range("scale", scale, 1e-30, 1e30)
@@ -127,6 +130,7 @@ class PoseCorrections(nn.Module):
         pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
         self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float().contiguous(), persistent=False)
         self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
+        self.register_buffer("pixels", torch.tensor([1 / camera.focal for camera in cameras]), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
         """Return the corrected viewmat (4, 4) of a view; differentiable.
@@ -135,7 +139,8 @@ class PoseCorrections(nn.Module):
             given: (4, 4) the given viewmat.
             view: index of the camera, a number or a (1,) int64 tensor.
         """
-        return self._moved(given, self.corrections, view, 1.0)
+        twist = _row(self.corrections, view)
+        return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), _row(self.pivots, view))
 
     def moment(self, middle: Camera, view: int | torch.Tensor, time: float) -> Camera:
         """Return the camera of a view at a moment of its exposure; differentiable.
@@ -147,20 +152,10 @@ class PoseCorrections(nn.Module):
         """
         if self.motions is None:
             return middle
+        twist, pivot = _row(self.motions, view) * _row(self.pixels, view), _row(self.pivots, view)
+        viewmat = corrected(middle.viewmat, time * torch.cat([twist[:3], pivot * twist[3:]]), pivot)
         checked = (middle.fx, middle.fy, middle.cx, middle.cy)
-        return dataclasses.replace(
-            middle, viewmat=self._moved(middle.viewmat, self.motions, view, time), checked=checked
-        )
-
-    def _moved(
-        self, viewmat: torch.Tensor, twists: torch.Tensor, view: int | torch.Tensor, share: float
-    ) -> torch.Tensor:
-        """Return a viewmat after a share of the twist (V, 6) of its view."""
-        if isinstance(view, int):
-            twist, pivot = twists[view], self.pivots[view]
-        else:
-            twist, pivot = twists.index_select(0, view)[0], self.pivots.index_select(0, view)[0]
-        return corrected(viewmat, share * torch.cat([twist[:3], self.scale * twist[3:]]), pivot)
+        return dataclasses.replace(middle, viewmat=viewmat, checked=checked)
 
     def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
         """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
@@ -174,8 +169,10 @@ class PoseCorrections(nn.Module):
 
     def prior(self, view: torch.Tensor) -> torch.Tensor:
         """Return the squared length of a view's correction and motion, a scalar: what keeps both small."""
-        learned = [x for x in (self.corrections, self.motions) if x is not None]
-        return torch.stack([x.index_select(0, view).square().sum() for x in learned]).sum()
+        prior = self.corrections.index_select(0, view).square().sum()
+        if self.motions is None:
+            return prior
+        return prior + (self.motions.index_select(0, view) * self.pixels.index_select(0, view)).square().sum()
 
     @torch.no_grad()
     def keep_gauge(self) -> None:
@@ -192,6 +189,11 @@ class PoseCorrections(nn.Module):
                 raise ValueError("motions: expected those of the exposures, got None")
             check_tensors({"motions": (motions, tuple(self.motions.shape))})
             self.motions.data.copy_(motions)
+
+
+def _row(values: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
+    """Return the values of a view, whose index is a number or a (1,) tensor."""
+    return values[view] if isinstance(view, int) else values.index_select(0, view)[0]
 
 
 def _gauge_directions(viewmats: torch.Tensor, pivots: torch.Tensor, scale: float) -> torch.Tensor:

@@ -1,12 +1,10 @@
 """Makes the initial surfels, on points of the cloud, and chooses the shape of the texture."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
 from nexwarp.data import Scene, View, initial_points
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
@@ -90,22 +88,10 @@ def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCor
     cameras, depths = [view.camera for view in scene.train], [_typical_depth(view, scene) for view in scene.train]
     motions = None
     if config.blur_poses > 1:
-        motions = _random_motions(cameras, scene.scale, depths, torch.Generator().manual_seed(config.seed))
+        # Not 0: a motion and its reverse blur alike, so that the mean over an exposure has no first derivative there.
+        generator = torch.Generator().manual_seed(config.seed)
+        motions = FIRST_BLUR * torch.randn(len(cameras), 6, generator=generator)
     return PoseCorrections(cameras, scene.scale, depths, refine=config.refine_poses, motions=motions).to(device)
-
-
-def _random_motions(
-    cameras: Sequence[Camera], scale: float, depths: Sequence[float], generator: torch.Generator
-) -> torch.Tensor:
-    """Return motions (V, 6) that move the pictures by about a pixel.
-
-    At no motion, gradients are 0: a motion and its reverse blur alike, so that the mean over the exposure has no first
-    derivative there.
-    """
-    pixels = torch.tensor(
-        [[1 / c.focal] * 3 + [z / (c.focal * scale)] * 3 for c, z in zip(cameras, depths, strict=True)]
-    )
-    return FIRST_BLUR * pixels * torch.randn(pixels.shape, generator=generator)
 
 
 def _typical_depth(view: View, scene: Scene) -> float:
