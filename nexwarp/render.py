@@ -13,6 +13,7 @@ from nexwarp.checks import check_finite, check_range, check_tensors
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.memory import keep_freed_memory, needed_memory
+from nexwarp.ops.tiles import Order, check_order
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
@@ -158,6 +159,7 @@ def render(
     *,
     exposures: Exposures | None = None,
     detail_limits: DetailLimits | None = None,
+    order: Order = "depth",
 ) -> Rendering:
     """Render surfels from a camera (paper Sec. 4.2). `Model.render` renders a trained scene.
 
@@ -179,12 +181,15 @@ def render(
         generator: random generator of the jitter, on the surfels' device; None is torch's default.
         exposures: multiply the image by the camera's gains and lens falloff; None is the mean exposure.
         detail_limits: detail limits of the N surfels; None limits nothing.
+        order: blend surfels by their centres' z-depth, as the paper, or by their distance, which turning the camera
+            does not change.
 
     Raises:
         TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
         OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
     _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
+    check_order(order)
     try:
         background = color_tensor(background, surfels.means)
         _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
@@ -192,7 +197,7 @@ def render(
         ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
         options = (max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, generator)
         with torch.autocast(surfels.device.type, enabled=False):
-            return _render(surfels, texture, camera, *options, exposures, detail_limits)
+            return _render(surfels, texture, camera, *options, exposures, detail_limits, order)
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
             raise
@@ -213,13 +218,14 @@ def _render(
     generator: torch.Generator | None,
     exposures: Exposures | None,
     detail_limits: DetailLimits | None,
+    order: Order,
 ) -> Rendering:
     """Render with arguments that have been checked; see `render`."""
     shape = antialiased(surfels, camera, detail_limits)
     pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
     colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
     projection = ops.project(*shape, colors, camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass)
+    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass, blending=order)
     hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
     texels = None
     if texture is not None:

@@ -143,6 +143,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         (True, {"max_hits": 0}),
         (True, {"exposure": "mean"}),
         (True, {"detail_limits": False}),
+        (True, {"order": "distance"}),
         (None, {}),  # without a texture
     ):
         if residual is None:

@@ -138,7 +138,7 @@ def shown(model: nw.Model) -> Scene:
 def test_disturbed_poses_come_back_in_training(shown, model):
     """With surfels that are right, the training poses return to the true ones, up to the gauge."""
     still: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(RATES)}
-    still |= dict.fromkeys(("means", "grid", "mlp"), (0.0, 0.0))
+    still |= dict.fromkeys(("means", "grid", "mlp", "motions"), (0.0, 0.0))
     rates = LearningRates(**still | {"poses": (3e-3, 1e-4)})
     config = small(iterations=240, max_hits=0, refine_poses=True, exposures=False, rates=rates)
     config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False), sh_every=1)

@@ -1,12 +1,12 @@
 """Cameras of rays: what they render is what pinholes render, and no surfel is lost."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 
 import nexwarp as nw
+from benchmarks.panoramas import places, turned
 from nexwarp.model import render_rays as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
@@ -74,15 +74,6 @@ def test_lists_lose_no_surfel(device, kind, seed, monkeypatch):
         assert torch.equal(getattr(culled, name), getattr(whole, name)), name
 
 
-def turned(viewmat, yaw, pitch):
-    c, s, d, e = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
-    around = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
-    up = torch.tensor([[1, 0, 0], [0, d, e], [0, -e, d]], dtype=torch.float64)
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3] = up @ around
-    return (motion @ viewmat.double()).to(viewmat)
-
-
 def crowd():
     """Surfels of all directions all around a camera."""
     generator = torch.Generator().manual_seed(3)
@@ -98,7 +89,7 @@ VIEWMAT = scenes.rigid((0.9, 0.1, 0.2, -0.1), (0.1, -0.2, 0.1)).float()
 
 
 def test_crops_of_a_panorama_are_pinhole_views():
-    """Each pixel of a pinhole view, blended in the panorama's order, looked up in a fine panorama."""
+    """Each pixel of a pinhole view by distance, looked up in a fine panorama."""
     model = crowd()
     wide = model.render(nw.RayCamera.panorama(VIEWMAT, 1024)).image
     K = torch.tensor([[40.0, 0, 24], [0, 40.0, 20], [0, 0, 1]])
@@ -106,11 +97,10 @@ def test_crops_of_a_panorama_are_pinhole_views():
         view = turned(VIEWMAT, yaw, pitch)
         camera = nw.Camera(view, K, 48, 40)
         rays = nw.RayCamera.pinhole(camera)
-        expected = model.render(dataclasses.replace(rays, radial=True)).image
-        found = torch.nn.functional.normalize(rays.rays @ view[:3, :3] @ VIEWMAT[:3, :3].T, dim=-1)
-        x, y = torch.atan2(found[..., 0], found[..., 2]) / math.pi, torch.asin(found[..., 1]) * 2 / math.pi
+        expected = model.render(camera, order="distance").image
+        x, y = places(rays.rays @ view[:3, :3] @ VIEWMAT[:3, :3].T, 1024)
         around = torch.cat([wide[:, -1:], wide, wide[:, :1]], 1).permute(2, 0, 1)[None]
-        place = torch.stack([x * 1024 / 1026, y], -1)[None]
+        place = torch.stack([(x + 1) / 1026, y / 512], -1)[None] * 2 - 1
         sample = torch.nn.functional.grid_sample(around, place, padding_mode="border", align_corners=False)
         assert psnr(sample[0].permute(1, 2, 0).clamp(0, 1), expected.clamp(0, 1)) > 40, (yaw, pitch)
 

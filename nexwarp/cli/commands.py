@@ -73,6 +73,9 @@ class Render:
     exposure: Annotated[str | None, option("{photos,mean}", "that of the model, photos after a training")] = None
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
+    order: Annotated[str | None, option("{depth,distance}", "that of the model, depth after a training")] = None
+    """Order in which surfels are blended: by their z-depth, as in training, or by their distance from the camera, so
+    that pictures from one place agree where they overlap, and with panoramas (docs/cameras.md)."""
     device: Device_ = None
     """Device to render on."""
 
@@ -90,6 +93,7 @@ class Render:
             size=self.size,
             scale=self.scale,
             exposure=self.exposure,
+            order=self.order,
             optics=Optics(cast(Kind, self.camera), self.fov, self.aperture, self.focus, self.shutter, self.samples),
         )
         device = pick_device(self.device)

@@ -188,7 +188,8 @@ class TrainingSession:
         given = scene.cameras
         cameras = trainer.views.refined_cameras(trainer.poses)
         refined = {TRAIN: dict(zip(given[TRAIN], cameras, strict=True))}
-        save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given=given)
+        ends = trainer.views.exposure_ends(trainer.poses)
+        save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given, ends)
         model = load(run).to(device)
         rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
         facts: dict[str, Json] = {

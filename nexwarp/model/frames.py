@@ -352,7 +352,7 @@ def render_by_graph(
         if graphs is None or graphs.stream.device != device:
             graphs = _graphs[parts.surfels] = FrameGraphs(device)
     there = tuple(part is not None for part in parts)
-    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture, there)
+    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture, options.order, there)
     return graphs.render(camera, background, work, kind, parts.state(tensors), parts.exposures)
 
 

@@ -194,6 +194,7 @@ class Model(nn.Module):
                 *jitter,
                 exposures=parts.exposures,
                 detail_limits=parts.detail_limits,
+                order=options.order,
             )
 
         if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:

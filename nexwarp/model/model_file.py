@@ -45,7 +45,7 @@ FIXED_NAMES = {
 }
 CODE_NAMES = code_names()
 # Options that files of nexwarp 0.1 do not have.
-LATER_OPTIONS = ("exposure", "detail_limits")
+LATER_OPTIONS = ("exposure", "detail_limits", "order")
 LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 

@@ -10,6 +10,7 @@ from typing_extensions import Unpack
 from nexwarp.checks import check_range
 from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.tiles import Order, check_order
 
 Exposure = Literal["photos", "mean"]
 LARGEST_COLOR = 1e6
@@ -24,6 +25,7 @@ class RenderChanges(TypedDict, total=False):
     clamp_texture: bool
     exposure: Exposure
     detail_limits: bool
+    order: Order
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class RenderOptions:
             lens; "mean" renders every camera at the photos' mean exposure.
         detail_limits: limit the texture's detail closer than the training views, and also blur surfels farther than
             them (see `DetailLimits`).
+        order: "depth" blends surfels by their centres' z-depth, as in training; "distance" by their distance, so that
+            pictures from one place agree where they overlap, and with panoramas.
 
     Raises:
         TypeError, ValueError: the message names the field.
@@ -52,6 +56,7 @@ class RenderOptions:
     clamp_texture: bool = False
     exposure: Exposure = "photos"
     detail_limits: bool = True
+    order: Order = "depth"
 
     def __post_init__(self) -> None:
         for name, high in (("max_hits", MAX_HITS), ("sh_degree", 3)):
@@ -64,6 +69,7 @@ class RenderOptions:
                 raise TypeError(f"{name}: expected True or False, got {getattr(self, name)!r:.60}")
         if self.exposure not in get_args(Exposure):
             raise ValueError(f"exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r:.60}")
+        check_order(self.order)
         if not isinstance(self.background, tuple) or len(self.background) != 3:
             raise ValueError(f"background: expected three numbers, got {self.background!r:.60}")
         for value in self.background:

@@ -62,7 +62,8 @@ def render_rays(
         surfels: the N surfels.
         texture: the neural texture; None leaves all hits their plain colours.
         camera: the camera, on the surfels' device.
-        options: of the rendering; `low_pass` must be False.
+        options: of the rendering; `low_pass` must be False. Their order does not change that of panoramas and fisheye
+            lenses, which is by distance, or of parallel rays, which is by z-depth.
         background: (3,) colour behind the surfels.
         exposures: multiply the image by the gains predicted for the camera's pose; None is the mean exposure.
         detail_limits: of the surfels; None limits nothing.
@@ -89,6 +90,8 @@ def render_rays(
     projection = ops.project(*shape, colors, viewmat)
     records = ray_records(projection, _axes(shape, viewmat) if camera.parallel else None)
     keys = distances if camera.radial else projection.centers[:, 2]
+    if options.order == "distance" and not camera.parallel and not camera.radial:
+        keys = projection.centers.norm(dim=-1)
     tiles = intersect_rays(records, reaches_of(shape.opacities, shape.gammas), keys, camera.rays)
     hits = collect_rays(records, projection.limits, tiles, camera.rays, camera.near, viewmat, max_hits=max_hits)
     image, textured = _composed(hits, texture, camera, options, background, detail_limits)

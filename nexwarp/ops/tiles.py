@@ -1,6 +1,7 @@
 """Tile lists: which surfels may be seen in which tile of the image, near to far."""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 import warp as wp
@@ -28,6 +29,14 @@ SHARING = 8
 # Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
+Order = Literal["depth", "distance"]
+
+
+def check_order(order: object) -> None:
+    """Raise ValueError unless `order` is one of `Order`."""
+    if order not in get_args(Order):
+        raise ValueError(f"order: expected {' or '.join(get_args(Order))}, got {order!r:.60}")
+
 
 @dataclass(frozen=True)
 class ListCapacity:
@@ -49,7 +58,7 @@ class Tiles:
     """Lists of (tile, surfel) entries. Integers, so nothing here is differentiable.
 
     Attributes:
-        order: (N,) int32, surfels by signed z-depth of their centres (as float32), ties by index.
+        order: (N,) int32, surfels by signed z-depth, or by distance, of their centres (as float32), ties by index.
         ends: (N,) int32, end of the entries of the surfel order[rank] in emission order.
         surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
         entries: (M,) int32, emission index of each of those; empty unless `exact`.
@@ -90,6 +99,7 @@ def intersect_tiles(
     camera: Pinhole,
     *,
     low_pass: bool = False,
+    blending: Order = "depth",
     tile_size: int = TILE_SIZE,
     room: int | None = None,
 ) -> Tiles:
@@ -105,6 +115,7 @@ def intersect_tiles(
         viewmat: (4, 4) world to camera.
         camera: the image plane.
         low_pass: whether supports include the screen-space low-pass.
+        blending: whether `Tiles.order` is by the centres' z-depths or by their distances from the camera.
         tile_size: pixels along a tile's side, a multiple of 8.
         room: number of entries that the lists can hold. By default, on a CPU, the exact number; on CUDA, where the
             exact number would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
@@ -118,7 +129,8 @@ def intersect_tiles(
     tensors = [x.detach().contiguous() for x in (means, quats, scales, opacities, gammas)]
     real, count = real_of(means), len(means)
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
-    order = _depth_order(projection.centers.detach())
+    centers = projection.centers.detach()
+    order = _depth_order(_with_distances(centers) if blending == "distance" else centers)
     kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
     sharing = 1 if uses_simd(means) else SHARING
@@ -184,6 +196,11 @@ def _sorted_entries(
     surfel_ids = order.new_empty(room)
     launch(order, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     return surfel_ids, values[:room], tile_ids[:room]
+
+
+def _with_distances(centers: torch.Tensor) -> torch.Tensor:
+    """Return centres (N, 3) with their distances from the camera in place of their z-depths."""
+    return torch.cat([centers[:, :2], centers.norm(dim=-1, keepdim=True)], dim=-1)
 
 
 def _depth_order(centers: torch.Tensor) -> torch.Tensor:

@@ -20,6 +20,7 @@ from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.ops.tiles import Order
 from nexwarp.run.contents import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, frame_name, picture_name
 from nexwarp.run.opened import OpenedModel
 from nexwarp.run.optics import PLAIN, Optics
@@ -58,7 +59,7 @@ class RenderJob:
         pictures: the images, in the order of rendering.
         video: video file to write; None writes none.
         fps: frames per second.
-        exposure: see `RenderOptions`; None is that of the model.
+        exposure, order: see `RenderOptions`; None is that of the model.
         optics: what the pictures are taken with.
     """
 
@@ -67,6 +68,7 @@ class RenderJob:
     fps: float
     exposure: Exposure | None = None
     optics: Optics = PLAIN
+    order: Order | None = None
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -86,6 +88,8 @@ class RenderJob:
         """
         frames = [picture for picture in self.pictures if picture.is_frame]
         changes: RenderChanges = {} if self.exposure is None else {"exposure": self.exposure}
+        if self.order is not None:
+            changes["order"] = self.order
         with ExitStack() as stack:
             append = None
             if self.video is not None:  # before any rendering, which would be lost if the file cannot be written
@@ -121,7 +125,7 @@ class RenderOrder:
         buffers: also write the buffers of the still views or, without still views, of the frames.
         size: "WIDTHxHEIGHT" in pixels; None keeps the size of the cameras.
         scale: factor on the size of the cameras.
-        exposure: see `RenderOptions`; None is that of the model.
+        exposure, order: see `RenderOptions`; None is that of the model.
         optics: what the pictures are taken with.
 
     Raises:
@@ -138,6 +142,7 @@ class RenderOrder:
     scale: float = 1.0
     exposure: str | None = None
     optics: Optics = PLAIN
+    order: str | None = None
 
     def __post_init__(self) -> None:
         if self.views not in SETS:
@@ -154,6 +159,10 @@ class RenderOrder:
             raise SettingError("--fps: expected together with --video, got no --video")
         if self.exposure not in (None, *get_args(Exposure)):
             raise SettingError(f"--exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r}")
+        if self.order not in (None, *get_args(Order)):
+            raise SettingError(f"--order: expected {' or '.join(get_args(Order))}, got {self.order!r}")
+        if self.order is not None and self.optics.kind != "pinhole":
+            raise SettingError(f"--order: expected together with --camera pinhole, got --camera {self.optics.kind}")
         if self.buffers and not self.optics.plain:
             raise SettingError("--buffers: expected without --camera, --aperture and --shutter, got one of them")
         if self.optics.shutter > 0 and self.path is None:
@@ -194,7 +203,8 @@ class RenderOrder:
                 f"{opened.folder / CAMERAS_FILE}: expected {self.views} views to render, found none; see --path"
             )
         fps = fps if self.fps is None else self.fps
-        return RenderJob(pictures, self.video, fps, cast(Exposure | None, self.exposure), self.optics)
+        chosen = (cast(Exposure | None, self.exposure), self.optics, cast(Order | None, self.order))
+        return RenderJob(pictures, self.video, fps, *chosen)
 
     def _path(self, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""

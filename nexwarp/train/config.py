@@ -8,6 +8,7 @@ from typing import Any
 from nexwarp.checks import check_range
 from nexwarp.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
 from nexwarp.kernels.types import MAX_HITS
+from nexwarp.ops.tiles import check_order
 from nexwarp.render import MAX_JITTER
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
@@ -17,6 +18,7 @@ REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
 LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
+MOST_BLUR_POSES = 31
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class LearningRates:
     """First and last learning rate of the MLP."""
     poses: tuple[float, float] = (2e-4, 2e-6)
     """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
+    motions: tuple[float, float] = (0.5, 0.02)
+    """With `blur_poses`: first and last learning rate of the motions during exposures, pixels."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):
@@ -120,11 +124,18 @@ class Config:
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
+    blur_poses: int = 1
+    """For photos with motion blur, an odd number above 1, such as 3: learn how each training camera moves during its
+    exposure, and compare the photo with the mean of renderings from this many poses on the way. Steps take that many
+    times as long; 1 is for sharp photos."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
     low_pass: bool = False
     """Screen-space low-pass for surfels smaller than a pixel."""
+    order: str = "depth"
+    """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
+    `distance` by their distance from the camera, for scenes that are shown as panoramas."""
     clamp_image: bool = False
     """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
@@ -160,6 +171,10 @@ class Config:
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
+        check_order(self.order)
+        check_range("blur_poses", self.blur_poses, 1, MOST_BLUR_POSES)
+        if self.blur_poses % 2 == 0:
+            raise ValueError(f"blur_poses: expected an odd number, got {self.blur_poses}")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

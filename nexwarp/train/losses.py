@@ -36,7 +36,8 @@ class LossWeights:
     depth: float = 0.1
     """Factor of the relative depth error at the points that were triangulated from the photo."""
     poses: float = 0.1
-    """With `refine_poses`: factor of the squared pose correction, which keeps poses near the given ones."""
+    """With `refine_poses` or `blur_poses`: factor of the squared pose correction, which keeps poses near the given
+    ones, and of the squared motion during the exposure, which keeps it short."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)

@@ -3,11 +3,12 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from nexwarp.model.options import RenderOptions
+from nexwarp.ops.tiles import Order
 from nexwarp.representation.merged_texture import MergedTexture
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
@@ -17,8 +18,8 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where poses are
-# refined, "poses"; `lr`, the learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are
+# learned, "poses" and "motions"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
@@ -42,7 +43,7 @@ def make_optimizer(
         scale: of the scene, world units, which the means' rates follow.
         make: makes an optimizer of one's own; None makes Adam, on CUDA a `FusedAdam` that regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
-        poses: pose corrections to train; None trains none.
+        poses: pose corrections and motions to train; None trains none.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -54,7 +55,8 @@ def make_optimizer(
     if config.max_hits:
         parts |= {"grid": [x.grid for x in textures], "mlp": [w for x in textures for w in x.mlp.parameters()]}
     if poses is not None:
-        parts["poses"] = [poses.corrections]
+        learned = {"poses": poses.corrections, "motions": poses.motions}
+        parts |= {name: [x] for name, x in learned.items() if x is not None and x.requires_grad}
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
@@ -103,6 +105,7 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "grid": rates.grid,
         "mlp": rates.mlp,
         "poses": rates.poses,
+        "motions": rates.motions,
     }
 
 
@@ -143,6 +146,7 @@ def options_at(
         background=background,
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
         low_pass=config.low_pass,
+        order=cast(Order, config.order),
     )
 
 

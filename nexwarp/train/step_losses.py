@@ -42,11 +42,23 @@ def as_taken(out: Rendering, target: Target) -> Rendering:
     Where the photo is saturated, a brighter image counts as equal to it: it has no error and no gradient there.
     Clipped photos of different exposures would otherwise ask for different colours of the same bright surface.
     """
+    return clipped(exposed(out, target), target)
+
+
+def exposed(out: Rendering, target: Target) -> Rendering:
+    """Return a rendering times the gains and the falloff of the photo that it is compared with."""
     if target.exposure is None:
         return out
     image, plain, textured = (x * target.exposure for x in (out.image, out.plain, out.textured))
-    clipped = (target.photo >= SATURATION) & (image > target.photo)
-    return dataclasses.replace(out, image=torch.where(clipped, target.photo, image), plain=plain, textured=textured)
+    return dataclasses.replace(out, image=image, plain=plain, textured=textured)
+
+
+def clipped(out: Rendering, target: Target) -> Rendering:
+    """Return a rendering at the photo's exposure without what is brighter than a saturated photo; see `as_taken`."""
+    if target.exposure is None:
+        return out
+    brighter = (target.photo >= SATURATION) & (out.image > target.photo)
+    return dataclasses.replace(out, image=torch.where(brighter, target.photo, out.image))
 
 
 def step_losses(
@@ -72,7 +84,7 @@ def step_losses(
         cells_unit: world units in which the grid's loss counts its cells.
         own: losses of one's own, added as they are.
         grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
-        poses: corrections of the training poses, which have a prior; None where they are not learned.
+        poses: corrections and motions, which have a prior; None where neither is learned.
 
     Raises:
         TypeError, ValueError: an own loss returned no scalar; the message names it.

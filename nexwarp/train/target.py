@@ -28,7 +28,7 @@ class Target:
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.render` takes it.
-        view: (1,) int64, index of the training view; None where poses are not refined.
+        view: (1,) int64, index of the training view; None where neither poses nor motions are learned.
     """
 
     camera: Camera
@@ -72,7 +72,7 @@ class TargetMaker:
             background: the colour behind everything, where it is not random.
             generator: of random backgrounds, on the CPU.
             noise: of the depth jitter, on the device.
-            poses: corrections of the training poses that are learned; None where they are not.
+            poses: corrections and motions that are learned; None where neither is.
         """
         self.poses = poses
         self.scene, self.config, self.views = scene, config, views

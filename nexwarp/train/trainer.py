@@ -31,6 +31,7 @@ from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
+from nexwarp.train.motion_blur import render_target
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
@@ -47,7 +48,7 @@ from nexwarp.train.state import (
     restore_random,
     scene_digest,
 )
-from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
+from nexwarp.train.step_losses import OwnLoss, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker, refined
 from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 
@@ -72,7 +73,7 @@ class Trainer:
         densifier: density control.
         views: the training views on the device.
         exposures: of the training photos; None where they have one exposure.
-        poses: corrections of the training poses; None where they are not refined.
+        poses: corrections and motions of the training poses; None where neither is learned.
         background: colour behind everything, three numbers.
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
@@ -214,8 +215,7 @@ class Trainer:
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             target = refined(target, self.poses)
-            out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
-            taken = as_taken(out, target)
+            out, taken = render_target(self.model(), target, self.poses, self.config.blur_poses)
             given = (taken, target, self.surfels, self.texture, self.config)
             own, poses, grid = self.own_losses, self.poses, fused is None
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
@@ -378,7 +378,7 @@ class Trainer:
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
         if self.poses is not None:
-            self.poses.load(tensors["poses.corrections"])
+            self.poses.load(tensors["poses.corrections"], tensors.get("poses.motions"))
         self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)

@@ -103,11 +103,13 @@ class SceneData:
         """Take the values of a model; the texture's grid becomes half precision, as in model files.
 
         Raises:
-            ValueError: the model has more surfels than a scene file may have.
+            ValueError: the model has more surfels than a scene file may have, or blends them by distance.
         """
         surfels = model.surfels
         if len(surfels) > LARGEST_SURFELS:
             raise FormatError(f"model: expected at most {LARGEST_SURFELS:,} surfels, got {len(surfels):,}")
+        if model.options.order != "depth":
+            raise FormatError(f"order: expected depth, which the web page draws, got {model.options.order}")
         active = surfels.activated()
         limits = None
         if model.detail_limits is not None and model.options.detail_limits:

@@ -120,6 +120,7 @@ def collect(
     near: float,
     max_hits: int,
     low_pass: bool = False,
+    order: str = "depth",
 ) -> Hits:
     """Blend every pixel; differentiable with respect to every float tensor.
 
@@ -140,11 +141,12 @@ def collect(
         near: hits count beyond this z-depth.
         max_hits: K.
         low_pass: let no surfel be smaller on screen than a Gaussian of standard deviation sqrt(1/2) pixel.
+        order: "depth" or "distance" of the surfels' centres, which sorts them.
     """
     walked = walk(
-        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, low_pass
+        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, low_pass, order
     )  # fmt: skip
-    order, t, alphas = walked.order, walked.t, walked.alphas
+    ranked, t, alphas = walked.order, walked.t, walked.alphas
     weights = alphas * walked.before
     alpha = 1 - torch.prod(1 - alphas, dim=-1)
 
@@ -152,8 +154,8 @@ def collect(
     heaviest = torch.sort(weights.detach(), dim=-1, descending=True, stable=True).indices[:, :max_hits]
     filled = weights.detach().gather(-1, heaviest) > 0
     kept = torch.zeros_like(weights, dtype=torch.bool).scatter(-1, heaviest, filled)
-    plain = torch.where(kept, 0.0, weights) @ colors[order]
-    base = torch.where(kept, weights, 0.0) @ colors[order]
+    plain = torch.where(kept, 0.0, weights) @ colors[ranked]
+    base = torch.where(kept, weights, 0.0) @ colors[ranked]
 
     def slots(values: torch.Tensor, empty: float) -> torch.Tensor:
         values = torch.where(filled, values, empty)
@@ -163,7 +165,7 @@ def collect(
     return Hits(
         plain=plain.reshape(height, width, 3),
         base=base.reshape(height, width, 3),
-        ids=slots(order[heaviest], -1),
+        ids=slots(ranked[heaviest], -1),
         depths=slots(t.gather(-1, heaviest), 0.0),
         weights=slots(weights.gather(-1, heaviest), 0.0),
         alpha=alpha.reshape(height, width),
@@ -185,6 +187,7 @@ def walk(
     height: int,
     near: float,
     low_pass: bool,
+    order: str = "depth",
 ) -> Walk:
     """Meet every pixel's ray with every surfel; arguments as of `collect`."""
     rotation = viewmat[:3, :3]
@@ -202,10 +205,11 @@ def walk(
     alphas = torch.where(counts, alphas, 0.0)
 
     # Front to back: transmittance before each hit, up to and including the hit that makes the pixel opaque.
-    order = torch.sort(centers[:, 2].detach().float(), stable=True).indices
-    alphas, t = alphas[:, order], t[:, order]
+    keys = centers.norm(dim=-1) if order == "distance" else centers[:, 2]
+    ranked = torch.sort(keys.detach().float(), stable=True).indices
+    alphas, t = alphas[:, ranked], t[:, ranked]
     before = transmittance_before(alphas)
-    return Walk(order, t, torch.where(before >= TRANSMITTANCE_MIN, alphas, 0.0), before)
+    return Walk(ranked, t, torch.where(before >= TRANSMITTANCE_MIN, alphas, 0.0), before)
 
 
 def transmittance_before(alphas: torch.Tensor) -> torch.Tensor:

@@ -70,9 +70,11 @@ def render(
     low_pass: bool = False,
     clamp_texture: bool = False,
     shares: torch.Tensor | None = None,
+    order: str = "depth",
 ) -> Rendering:
     """Render; differentiable with respect to every float tensor, those of `texture` included.
 
+    `order`: "depth" or "distance" of the surfels' centres, which sorts them.
     `shares` (H, W, K), a constant: depth at which each hit's texture is looked up, over the hit's own.
     """
     rotation = viewmat[:3, :3]
@@ -80,7 +82,7 @@ def render(
     colors = plain_colors(sh, means, position, sh_degree)
     hits = collect(
         means, quats, scales, opacities, gammas, colors, viewmat,
-        fx, fy, cx, cy, width, height, near, max_hits, low_pass,
+        fx, fy, cx, cy, width, height, near, max_hits, low_pass, order,
     )  # fmt: skip
 
     filled = hits.ids >= 0
