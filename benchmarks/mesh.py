@@ -5,14 +5,19 @@
 
 Accuracy is the distance from points of the mesh to the nearest rectangle of the scene, completeness that from the
 points that the demo's cameras see to the mesh. A bad mesh has a large mean of one or the other; the chamfer distance is
-the mean of both. The picture shows the mesh from a camera of the scene: colours and normals.
+the mean of both. The picture shows the mesh from a camera of the scene: colours and normals. A mesh of another scene
+has no known geometry, and is only drawn:
+
+    python -m benchmarks.mesh runs/fox/export/mesh.ply --picture mesh.png --run runs/fox --view 0001.jpg
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
+import torch
 
+import nexwarp as nw
 from nexwarp.data.demo import HEIGHT, VIEWS, WIDTH, demo_cameras
 from nexwarp.data.demo_room import build_room
 from nexwarp.data.raytrace import Rectangle, first_hits
@@ -74,45 +79,73 @@ def seen_points(rectangles: list[Rectangle]) -> np.ndarray:
     return np.concatenate(points)
 
 
-def draw(points: dict[str, np.ndarray], path: Path, view: int = 3, factor: int = 3) -> None:
-    """Write a picture of sampled points from a camera of the demo: their colours, and their normals."""
+def draw(points: dict[str, np.ndarray], camera: nw.Camera, path: Path) -> None:
+    """Write a picture of sampled points: their colours, and their normals in the camera's frame."""
     from PIL import Image
 
-    rig = demo_cameras(factor * WIDTH, factor * HEIGHT, VIEWS)
-    viewmat = rig.viewmats[view]
+    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
     local = points["vertices"] @ viewmat[:3, :3].T + viewmat[:3, 3]
     normals = points["normals"] / np.linalg.norm(points["normals"], axis=1, keepdims=True).clip(1e-9)
-    pixels = (local / local[:, 2:]) @ rig.K.T
+    z = local[:, 2:]
+    pixels = (local / np.where(z > camera.near, z, 1.0)) @ K.T
     column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
-    inside = (local[:, 2] > 0.05) & (column >= 0) & (row >= 0) & (column < rig.size[0]) & (row < rig.size[1])
+    inside = (z[:, 0] > camera.near) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     order = np.flatnonzero(inside)[np.argsort(-local[inside, 2])]  # far to near
     place = (row[order].astype(int), column[order].astype(int))
     pictures = []
     for values in (points["colors"], 127.5 * (1 + normals @ viewmat[:3, :3].T)):
-        image = np.zeros((rig.size[1], rig.size[0], 3), np.uint8)
+        image = np.zeros((camera.height, camera.width, 3), np.uint8)
         image[place] = np.clip(values[order], 0, 255).astype(np.uint8)
         pictures.append(image)
     Image.fromarray(np.concatenate(pictures, 1)).save(path)
 
 
-def main() -> None:
-    """Print the distances, and draw the mesh."""
+def demo_camera(view: int = 3, factor: int = 3) -> nw.Camera:
+    """Return a camera of the demo, with more pixels."""
+    rig = demo_cameras(factor * WIDTH, factor * HEIGHT, VIEWS)
+    return nw.Camera(torch.from_numpy(rig.viewmats[view]), torch.from_numpy(rig.K), *map(int, rig.size))
+
+
+def chamfer(mesh: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the mean, median and 95th percentile of accuracy and completeness of a demo's mesh, and their mean."""
     from scipy.spatial import cKDTree
 
+    room, points = build_room(16), sample(mesh, SAMPLES)
+    found: dict[str, float] = {}
+    accuracy = distance_to(room, points["vertices"])
+    completeness = cKDTree(points["vertices"]).query(seen_points(room))[0]
+    for name, values in (("accuracy", accuracy), ("completeness", completeness)):
+        found |= {f"{name} mean": values.mean(), f"{name} median": np.median(values)}
+        found |= {f"{name} 95 %": np.quantile(values, 0.95)}
+    return found | {"chamfer distance": (accuracy.mean() + completeness.mean()) / 2}
+
+
+def main() -> None:
+    """Print the distances, and draw the mesh."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--run", type=Path, help="run folder of another scene, whose mesh is only drawn")
+    parser.add_argument("--view", help="name of a photo of that run, whose camera draws; the first test view without")
     args = parser.parse_args()
-    mesh, room = read_mesh(args.mesh), build_room(16)
-    points = sample(mesh, SAMPLES)
-    accuracy = distance_to(room, points["vertices"])
-    completeness = cKDTree(points["vertices"]).query(seen_points(room))[0]
+    mesh = read_mesh(args.mesh)
     print(f"{len(mesh['vertices']):,} vertices, {len(mesh['triangles']):,} triangles")
-    for name, values in (("accuracy", accuracy), ("completeness", completeness)):
-        print(f"{name}: mean {values.mean():.4f}, median {np.median(values):.4f}, 95 % {np.quantile(values, 0.95):.4f}")
-    print(f"chamfer distance: {(accuracy.mean() + completeness.mean()) / 2:.4f} world units")
+    if args.run is None:
+        for name, value in chamfer(mesh).items():
+            print(f"{name}: {value:.4f} world units")
     if args.picture is not None:
-        draw(sample(mesh, 10 * SAMPLES), args.picture)
+        draw(
+            sample(mesh, 10 * SAMPLES),
+            demo_camera() if args.run is None else run_camera(args.run, args.view),
+            args.picture,
+        )
+
+
+def run_camera(run: Path, name: str | None) -> nw.Camera:
+    """Return the camera of a photo of a run; of the first test view without a name."""
+    groups = nw.load_cameras(run)
+    cameras = groups.get("test", {}) | groups["train"]
+    return cameras[name or next(iter(cameras))]
 
 
 if __name__ == "__main__":

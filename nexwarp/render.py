@@ -54,8 +54,10 @@ class Intermediates:
 class Rendering:
     """The buffers of one rendering.
 
-    All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals`, `blended_normals`,
-    `distortion` and `colors` are computed on first access, without a second rendering, and are as differentiable.
+    All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals`,
+    `blended_normals`, `distortion` and `colors` are computed on first access, without a second rendering, and are
+    differentiable, too. The gradient of `median_depth` and `top_depth` is that of the depth of the hit that they are
+    taken from.
 
     Attributes:
         image: (H, W, 3) plain + textured + (1 - alpha) background (paper Eq. 7, with a background); not clamped.
@@ -85,41 +87,27 @@ class Rendering:
 
     @property
     def median_depth(self) -> torch.Tensor:
-        """(H, W) z-depth of the hit at which the transmittance falls to 1/2, world units.
-
-        If the transmittance stays above 1/2, it is that of the last hit; 0 where nothing is hit. Its gradient is that
-        of this hit's depth: which hit it is, is piecewise constant.
-        """
+        """(H, W) z-depth of the hit at which the transmittance falls to 1/2; of the last one if it stays above."""
         return self._surface.median_depth
 
     @property
     def top_depth(self) -> torch.Tensor:
-        """(H, W) z-depth of the heaviest hit, whatever K is, world units; 0 where nothing is hit.
-
-        Its gradient is that of this hit's depth.
-        """
+        """(H, W) z-depth of the heaviest hit, whatever K is, world units; 0 where nothing is hit."""
         return self._surface.top_depth
 
     @property
     def normals(self) -> torch.Tensor:
-        """(H, W, 3) unit normals, world frame: mean of all hits' normals, weighted by their blending weights.
-
-        Each hit's normal is oriented to face the camera; 0 where nothing is hit.
-        """
+        """(H, W, 3) unit normals, world frame: `blended_normals` normalised; 0 where nothing is hit."""
         return self._surface.normals
 
     @property
     def blended_normals(self) -> torch.Tensor:
-        """(H, W, 3) sum over all hits of weight * unit normal, each towards the camera, world frame; not normalised."""
+        """(H, W, 3) sum over all hits of weight * unit normal, on the side that faces the camera; world frame."""
         return self._surface.blended_normals
 
     @property
     def distortion(self) -> torch.Tensor:
-        """(H, W) sum over pairs of hits of w_i w_j |z_i - z_j| (depth distortion of 2DGS), world units.
-
-        In linear time: where hits do not come in the order of their depths, each is compared with the mean depth of
-        those before it, which is less than the sum over pairs.
-        """
+        """(H, W) depth distortion of 2DGS: sum over pairs of hits of w_i w_j |z_i - z_j|; see `kernels.surface`."""
         return self._surface.distortion
 
     @cached_property

@@ -47,7 +47,9 @@ def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gradients_agree_with_the_reference(dtype: torch.dtype, name: str, low_pass: bool, device: torch.device) -> None:
+def test_gradients_agree_with_the_reference(
+    dtype: torch.dtype, name: str, low_pass: bool, device: torch.device
+) -> None:
     """With respect to every parameter and the camera; in float64 of each buffer by itself, too."""
     scene = make_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
@@ -89,7 +91,9 @@ def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) 
 
     def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         given = dict(zip((name for name, _ in named), tensors, strict=True))
-        out = torch.func.functional_call(_Drawn(surfels, camera, low_pass), {f"surfels.{k}": x for k, x in given.items()})
+        out = torch.func.functional_call(
+            _Drawn(surfels, camera, low_pass), {f"surfels.{k}": x for k, x in given.items()}
+        )
         return tuple(out)
 
     assert torch.autograd.gradcheck(buffers, [x for _, x in named], fast_mode=True)

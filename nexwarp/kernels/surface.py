@@ -9,9 +9,10 @@ read. Written, with w = alpha * transmittance the weight (paper Sec. 4.2), t the
     normals     sum of w n, camera frame, each n on the side that faces the camera; not normalised
     distortion  sum over i of w_i |A_i t_i - D_i|, where A_i = sum of w_j and D_i = sum of w_j t_j over j < i
 
-All are 0 where nothing is hit. The distortion is the sum over pairs of w_i w_j |t_i - t_j| (2DGS), in linear time, where
-hits come in the order of their depths; elsewhere it is less. `surface_backward` differentiates all five; for it, where
-they are asked for, `totals` and `picks` are written.
+All are 0 where nothing is hit. The distortion is the sum over pairs of w_i w_j |t_i - t_j| (2DGS), in linear time,
+where hits come in the order of their depths; elsewhere it is less. `surface_backward` differentiates all five. It needs
+`totals`, (sum of w, sum of w s, sum of w s t) with s the sign of A t - D and t less that of the first hit, and `picks`,
+the places in the list of the hits of the median and the top depth, -1 where nothing is hit; both may be left out.
 """
 
 import functools

@@ -4,8 +4,8 @@ A thread is a pixel (see `walk`). Read: what `surface` read and wrote, and the g
 
     grad_records, grad_centers    gradients of the surfels' records and, with the low-pass, centres
 
-in the slots of `collect_backward`. With q_i = dL/dw_i, E the expected depth, W the sum of weights, N the blended normal,
-S the distortion and s_i the sign of A_i t_i - D_i, the terms of a hit are
+in the slots of `collect_backward`. With q_i = dL/dw_i, E the expected depth, W the sum of weights, N the blended
+normal, S the distortion and s_i the sign of A_i t_i - D_i, the terms of a hit are
 
     q_i       gE (t_i - E) / W + gN . n_i + gS (|A_i t_i - D_i| + sum over j > i of w_j s_j (t_j - t_i))
     dL/dt_i   gE w_i / W + gS w_i (s_i A_i - sum over j > i of w_j s_j), and the gradients of the median and of the top
@@ -188,7 +188,11 @@ def surface_backward_kernel(real: type, low_pass: bool, tile_size: int, fixed_po
                             side = ZERO
                         signs -= side * weight
                         signed_depths -= side * weight * z
-                        q = ge * (depth - mean) + facing * wp.dot(gn, n) + gs * (wp.abs(gap) + signed_depths - z * signs)
+                        q = (
+                            ge * (depth - mean)
+                            + facing * wp.dot(gn, n)
+                            + gs * (wp.abs(gap) + signed_depths - z * signs)
+                        )
                         grad_depth = ge * weight + gs * weight * (side * weights - signs)
                         if k == picks[p][0]:
                             grad_depth += grad_median[p]
