@@ -23,6 +23,7 @@ from nexwarp.data.demo_room import build_room
 from nexwarp.data.raytrace import Rectangle, first_hits
 
 SAMPLES = 400_000  # points on the mesh
+POINTS_A_PIXEL = 8  # of the picture of a mesh
 PIXELS = 3  # every third pixel of the demo's cameras sees a point
 
 
@@ -79,23 +80,35 @@ def seen_points(rectangles: list[Rectangle]) -> np.ndarray:
     return np.concatenate(points)
 
 
-def draw(points: dict[str, np.ndarray], camera: nw.Camera, path: Path) -> None:
-    """Write a picture of sampled points: their colours, and their normals in the camera's frame."""
+def draw(mesh: dict[str, np.ndarray], camera: nw.Camera, path: Path) -> None:
+    """Write a picture of a mesh: its colours, and its normals in the camera's frame; dark where the back is seen."""
     from PIL import Image
 
     viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
-    local = points["vertices"] @ viewmat[:3, :3].T + viewmat[:3, 3]
-    normals = points["normals"] / np.linalg.norm(points["normals"], axis=1, keepdims=True).clip(1e-9)
-    z = local[:, 2:]
-    pixels = (local / np.where(z > camera.near, z, 1.0)) @ K.T
-    column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
-    inside = (z[:, 0] > camera.near) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    order = np.flatnonzero(inside)[np.argsort(-local[inside, 2])]  # far to near
-    place = (row[order].astype(int), column[order].astype(int))
+    local = mesh["vertices"] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    pixels = (local / np.maximum(local[:, 2:], camera.near)) @ K.T
+    triangles = mesh["triangles"][(local[:, 2] > camera.near)[mesh["triangles"]].all(1)]
+    corners = pixels[triangles, :2]
+    seen = ((corners.max(1) >= 0) & (corners.min(1) < (camera.width, camera.height))).all(1)
+    triangles, corners = triangles[seen], corners[seen]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2  # pixels; below 0 where counter-clockwise, y being down
+    counts = np.ceil(np.minimum(np.abs(area), camera.width * camera.height) * POINTS_A_PIXEL).astype(int)
+    chosen = np.repeat(np.arange(len(triangles)), counts)
+    u, v = np.random.default_rng(0).random((2, len(chosen), 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    weights = (1 - u - v, u, v)
+    depth = sum(w[:, 0] * local[triangles[chosen, k], 2] for k, w in enumerate(weights))
+    place = sum(w * corners[chosen, k] for k, w in enumerate(weights)).astype(int)
+    inside = ((place >= 0) & (place < (camera.width, camera.height))).all(1)
+    order = np.flatnonzero(inside)[np.argsort(-depth[inside])]  # far to near
+    normals = 127.5 * (1 + mesh["normals"] @ viewmat[:3, :3].T)
     pictures = []
-    for values in (points["colors"], 127.5 * (1 + normals @ viewmat[:3, :3].T)):
+    for values in (mesh["colors"], normals):
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
-        image[place] = np.clip(values[order], 0, 255).astype(np.uint8)
+        drawn = sum(w[order] * values[triangles[chosen[order], k]] for k, w in enumerate(weights))
+        drawn = drawn * np.where(area[chosen[order]] < 0, 1.0, 0.3)[:, None]
+        image[place[order, 1], place[order, 0]] = np.clip(drawn, 0, 255).astype(np.uint8)
         pictures.append(image)
     Image.fromarray(np.concatenate(pictures, 1)).save(path)
 
@@ -134,11 +147,7 @@ def main() -> None:
         for name, value in chamfer(mesh).items():
             print(f"{name}: {value:.4f} world units")
     if args.picture is not None:
-        draw(
-            sample(mesh, 10 * SAMPLES),
-            demo_camera() if args.run is None else run_camera(args.run, args.view),
-            args.picture,
-        )
+        draw(mesh, demo_camera() if args.run is None else run_camera(args.run, args.view), args.picture)
 
 
 def run_camera(run: Path, name: str | None) -> nw.Camera:
