@@ -22,7 +22,8 @@ GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
 def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera, low_pass: bool) -> Surface:
     """Hand tensors in float64 on the CPU to the reference."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    return surface(*(tensors[name] for name in GEOMETRY), tensors["viewmat"], *intrinsics, low_pass)
+    means, quats, scales, opacities, gammas, viewmat = (tensors[name] for name in (*GEOMETRY, "viewmat"))
+    return surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics, low_pass)
 
 
 def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
@@ -50,14 +51,15 @@ def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
 def test_gradients_agree_with_the_reference(
     dtype: torch.dtype, name: str, low_pass: bool, device: torch.device
 ) -> None:
-    """With respect to every parameter and the camera; in float64 of each buffer by itself, too."""
+    """With respect to every parameter and the camera; of the random scene in float64 for each buffer by itself, too."""
     scene = make_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     expected, viewmat = twin(surfels), camera.viewmat.detach().double().cpu().requires_grad_()
     tensors = {key: getattr(expected, key) for key in GEOMETRY} | {"viewmat": viewmat}
     out, right = nw.render(surfels, None, camera, low_pass=low_pass), reference(tensors, camera, low_pass)
     leaves = (surfels, camera.viewmat), (expected, viewmat)
-    for buffers in (BUFFERS,) if dtype == torch.float32 else (*((buffer,) for buffer in BUFFERS), BUFFERS):
+    apart = dtype == torch.float64 and name == "random"
+    for buffers in (*((buffer,) for buffer in BUFFERS if apart), BUFFERS):
         for module, matrix in leaves:
             module.zero_grad()
             matrix.grad = None
@@ -186,7 +188,12 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
     launched: list[str] = []
     module = importlib.import_module("nexwarp.ops.surface")
     plain = module.launch_walk
-    monkeypatch.setattr(module, "launch_walk", lambda *given: (launched.append("walk"), plain(*given)))
+
+    def noted(*given: Any) -> None:
+        launched.append("walk")
+        plain(*given)
+
+    monkeypatch.setattr(module, "launch_walk", noted)
     scene = random_scene()
     surfels = make_surfels(scene)
     out = nw.render(surfels, make_texture(), make_camera(scene))

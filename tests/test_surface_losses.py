@@ -113,14 +113,9 @@ def test_descent_makes_a_loss_smaller_and_masked_pixels_have_no_gradient(loss, d
     with torch.no_grad():
         for name, x in surfels.named_parameters():
             if x.grad is not None and not name.startswith("sh"):
-                x -= 1e-3 * x.grad
-        moved = nw.render(surfels, None, nw.Camera(**_camera_of(device)))
+                x.add_(x.grad, alpha=-1e-3)
+        moved = nw.render(surfels, None, make_camera(layered_scene(dtype=torch.float64, device=device)))
     assert loss(moved) < value
-
-
-def _camera_of(device: torch.device) -> dict[str, object]:
-    scene = layered_scene(dtype=torch.float64, device=device)
-    return {key: scene[key] for key in ("viewmat", "K", "width", "height", "near")}
 
 
 def test_nothing_of_a_rendering_without_hits(device: torch.device) -> None:
