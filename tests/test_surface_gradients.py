@@ -13,6 +13,7 @@ from tests.narrowing import present
 from tests.reference.surface import Surface, surface
 from tests.render_support import assert_gradients, rigid_gradient, twin
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.test_laws import awkward_scene
 from tests.tolerances import FLIPS, assert_close
 
 BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals", "distortion")
@@ -156,6 +157,17 @@ def test_distortion_vanishes_where_all_hits_have_one_depth(device: torch.device)
     scene = layered_scene(1, dtype=torch.float64, device=device)
     out = nw.render(make_surfels(scene), None, make_camera(scene))
     assert out.alpha.any() and not out.distortion.any()
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_awkward_surfels_have_finite_gradients(low_pass: bool, device: torch.device) -> None:
+    """Behind, at, around and across the camera, edge-on, enormous and tiny."""
+    scene = awkward_scene(device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    loss(nw.render(surfels, None, camera, low_pass=low_pass)).backward()
+    for name, x in surfels.named_parameters():
+        assert x.grad is None or x.grad.isfinite().all(), name
+    assert present(camera.viewmat.grad).isfinite().all()
 
 
 def test_gradients_add_to_those_of_the_image(device: torch.device) -> None:
