@@ -116,7 +116,7 @@ def draw(mesh: dict[str, np.ndarray], camera: nw.Camera, path: Path) -> None:
 def demo_camera(view: int = 3, factor: int = 3) -> nw.Camera:
     """Return a camera of the demo, with more pixels."""
     rig = demo_cameras(factor * WIDTH, factor * HEIGHT, VIEWS)
-    return nw.Camera(torch.from_numpy(rig.viewmats[view]), torch.from_numpy(rig.K), *map(int, rig.size))
+    return nw.Camera(torch.from_numpy(rig.viewmats[view]).float(), torch.from_numpy(rig.K).float(), *map(int, rig.size))
 
 
 def chamfer(mesh: dict[str, np.ndarray]) -> dict[str, float]:
