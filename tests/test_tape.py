@@ -68,8 +68,10 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, dev
     viewmat = scene["viewmat"].clone().requires_grad_()
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    projection = ops.project(*leaves.values(), torch.zeros_like(scene["means"]), viewmat)
-    tiles = ops.intersect_tiles(*leaves.values(), projection, viewmat, pinhole, low_pass=low_pass)
+    means, quats, scales, opacities, gammas = leaves.values()
+    given = (means, quats, scales, opacities, gammas)
+    projection = ops.project(*given, torch.zeros_like(means), viewmat)
+    tiles = ops.intersect_tiles(*given, projection, viewmat, pinhole, low_pass=low_pass)
     hits = ops.collect(projection, tiles, pinhole, low_pass=low_pass)
     found = ops.surface(projection, tiles, hits, pinhole, viewmat.detach(), low_pass=low_pass)
     normals = found.blended_normals @ viewmat[:3, :3].detach().T  # back to the camera's frame
@@ -78,8 +80,13 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, dev
     torch.autograd.backward(buffers, cotangents)
 
     t, tape = types(REAL), wp.Tape()
-    kinds = (t.vec3, t.vec4, t.vec2, REAL, t.vec2)
-    shape = [to_warp(x, kind) for x, kind in zip(leaves.values(), kinds, strict=True)]
+    shape = (
+        to_warp(means, t.vec3),
+        to_warp(quats, t.vec4),
+        to_warp(scales, t.vec2),
+        to_warp(opacities, REAL),
+        to_warp(gammas, t.vec2),
+    )
     view, colors = to_warp(viewmat[None], t.mat44), to_warp(torch.zeros_like(scene["means"]), t.vec3)
     image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
     records, centers, limits = passes.project(tape, *shape, colors, view)
