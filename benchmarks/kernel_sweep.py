@@ -182,11 +182,13 @@ def _render(
         made, texture, camera, max_hits, background, degree, low_pass, clamp, 0.1, detail_limits=limits
     )  # fmt: skip
     request = out.request_splat_error(out.alpha) if errors else None
-    total = sum(x.square().sum() for x in (out.image, out.plain, out.textured, out.depths, out.weights, out.alpha))
+    surface = (out.expected_depth, out.median_depth, out.top_depth, out.normals, out.distortion)
+    buffers = (out.image, out.plain, out.textured, out.depths, out.weights, out.alpha, *surface)
+    total = sum(x.square().sum() for x in buffers)
     assert isinstance(total, torch.Tensor)
     total.backward()
     parameters = [*made.parameters(), *texture.parameters(), camera.viewmat, background]
-    found = [total, out.normals, out.expected_depth, out.median_depth, out.colors, out.splat_error(out.alpha.detach())]
+    found = [total, *surface, out.colors, out.splat_error(out.alpha.detach())]
     found += [x.grad for x in parameters if x.grad is not None]
     if request is not None and request.sums_after_backward is not None:
         found.append(request.sums_after_backward)

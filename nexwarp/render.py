@@ -55,8 +55,10 @@ class Intermediates:
 class Rendering:
     """The buffers of one rendering.
 
-    All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals` and `colors` are
-    computed on first access, without a second rendering; the first four are not differentiable.
+    All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals`,
+    `blended_normals`, `distortion` and `colors` are computed on first access, without a second rendering, and are
+    differentiable, too. The gradient of `median_depth` and `top_depth` is that of the depth of the hit that they are
+    taken from.
 
     Attributes:
         image: (H, W, 3) plain + textured + (1 - alpha) background (paper Eq. 7, with a background); not clamped.
@@ -86,10 +88,7 @@ class Rendering:
 
     @property
     def median_depth(self) -> torch.Tensor:
-        """(H, W) z-depth of the hit at which the transmittance falls to 1/2, world units.
-
-        If the transmittance stays above 1/2, it is that of the last hit; 0 where nothing is hit.
-        """
+        """(H, W) z-depth of the hit at which the transmittance falls to 1/2; of the last one if it stays above."""
         return self._surface.median_depth
 
     @property
@@ -99,11 +98,18 @@ class Rendering:
 
     @property
     def normals(self) -> torch.Tensor:
-        """(H, W, 3) unit normals, world frame: mean of all hits' normals, weighted by their blending weights.
-
-        Each hit's normal is oriented to face the camera; 0 where nothing is hit.
-        """
+        """(H, W, 3) unit normals, world frame: `blended_normals` normalised; 0 where nothing is hit."""
         return self._surface.normals
+
+    @property
+    def blended_normals(self) -> torch.Tensor:
+        """(H, W, 3) sum over all hits of weight * unit normal, on the side that faces the camera; world frame."""
+        return self._surface.blended_normals
+
+    @property
+    def distortion(self) -> torch.Tensor:
+        """(H, W) depth distortion of 2DGS: sum over pairs of hits of w_i w_j |z_i - z_j|; see `kernels.surface`."""
+        return self._surface.distortion
 
     @cached_property
     def colors(self) -> torch.Tensor:
@@ -117,11 +123,12 @@ class Rendering:
         return colors.masked_fill(empty, 0.0)
 
     @cached_property
-    def _surface(self) -> ops.Surface:
+    def _surface(self) -> ops.DifferentiableSurface:
         stages = self.intermediates
-        return ops.surface(
-            stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat, low_pass=stages.low_pass
-        )
+        given = (stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat)
+        # It is kept for later uses, so that its gradients must not depend on where the first one is.
+        with torch.set_grad_enabled(stages.projection.records.requires_grad):
+            return ops.surface(*given, low_pass=stages.low_pass)
 
     def request_splat_error(self, errors: torch.Tensor) -> ops.SplatErrorRequest:
         """Request `splat_error(errors)` from the backward pass, which computes it at almost no cost.

@@ -21,6 +21,8 @@ from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
+from nexwarp.kernels.surface import surface_kernel
+from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tiles import (
     LARGEST_INT,
     MAX_CORNERS,
@@ -72,6 +74,16 @@ class Hits(NamedTuple):
     weights: wp.array
     alphas: wp.array
     stops: wp.array
+
+
+class Surface(NamedTuple):
+    """Depths, normals in the camera frame, not normalised, and distortion of the P pixels, see `kernels.surface`."""
+
+    expected: wp.array
+    median: wp.array
+    top: wp.array
+    normals: wp.array
+    distortion: wp.array
 
 
 def _real(array: wp.array) -> type:
@@ -266,6 +278,37 @@ def collect(
 
     tape.record_func(backward, [records, centers, hits.plain, hits.base, hits.depths, hits.weights, hits.alphas])
     return hits
+
+
+def surface(
+    tape: wp.Tape,
+    records: wp.array,
+    centers: wp.array,
+    limits: wp.array,
+    lists: Lists,
+    image: Image,
+    stops: wp.array,
+    low_pass: bool = False,
+) -> Surface:
+    """Depths and normals over all hits; all outputs differentiate to records and, with low_pass, centers."""
+    real = _real(records)
+    t = types(real)
+    pixels = image.size[0] * image.size[1]
+    found = Surface(*(_new(records, pixels, dtype) for dtype in (real, real, real, t.vec3, real)))
+    totals, picks = (_new(records, pixels, dtype, requires_grad=False) for dtype in (t.vec3, wp.vec2i))
+    threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
+    view = [wp.vec2i(*image.size), lists.columns, image.matrices(records), image.near]
+    walked = [lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
+    inputs = [records, centers, limits, *walked, *view, lists.reaches, stops]
+    _silent(surface_kernel(real, low_pass, lists.tile_size), threads, inputs, [*found, totals, picks], BLOCK_DIM)
+
+    def backward() -> None:
+        known = [None, found.expected, found.normals, found.distortion, totals, picks, *(x.grad for x in found)]
+        kernel = surface_backward_kernel(real, low_pass, lists.tile_size)
+        _silent(kernel, threads, [*inputs, *known], [records.grad, centers.grad, None], BLOCK_DIM)
+
+    tape.record_func(backward, [records, centers, *found])
+    return found
 
 
 def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) -> tuple[wp.array, wp.array]:

@@ -67,6 +67,8 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "losses.grid": ("λ_grid", "4.3"),
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
+    "losses.normals": ("", ""),
+    "losses.distortion": ("", ""),
     "losses.poses": ("", ""),
     "rates.means": ("", "code"),
     "rates.quats": ("", "code"),

@@ -52,6 +52,24 @@ def sphere(device: torch.device) -> Mesh:
     return _without_crumbs(_surface(field, lambda *_: None))
 
 
+@pytest.mark.parametrize(("past", "kept"), [(6, True), (20, False)])
+def test_a_surface_outlasts_some_views_that_see_past_it_but_not_many(past, kept, device):
+    """Two views see a sheet at depth 2, the others what is at 2.9: a thin surface stays, a floater goes."""
+    camera = cameras_around(device)[0]
+    depths = [torch.full((128, 128), z, device=device) for z in [2.0] * 2 + [2.9] * past]
+    field = DistanceField(VOXEL, 4 * VOXEL, device)
+    for depth in depths:
+        field.reserve(camera, depth, 10_000)
+    field.allocate()
+    for depth in depths:
+        field.fuse(camera, depth, torch.zeros(128, 128, 3, device=device))
+    mesh = _without_crumbs(_surface(field, lambda *_: None))
+    viewmat = camera.viewmat.double().cpu().numpy()
+    z = mesh.vertices @ viewmat[2, :3] + viewmat[2, 3]
+    assert (np.abs(z - 2.9) < VOXEL).sum() > 1000
+    assert ((np.abs(z - 2) < 4 * VOXEL).sum() > 1000) == kept
+
+
 def test_a_sphere_is_a_sphere(sphere):
     """Within a fifth of a voxel, with normals and triangles that face outwards, and the photos' colour."""
     radii = np.linalg.norm(sphere.vertices, axis=1)

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 import nexwarp as nw
+from nexwarp import ops
 from nexwarp import tape as passes
 from nexwarp.kernels.types import types
 from tests.narrowing import present
@@ -58,6 +59,49 @@ def test_tape_and_torch_give_the_same_gradients(residual: bool, device: torch.de
         assert_close(gradients[f"mlp{index}"], present(matrix.grad), kind="gradient", name=f"mlp{index}")
     position = torch.autograd.grad(camera.position, viewmat, gradients["position"])[0]
     assert_close(gradients["viewmat"] + position, present(viewmat.grad), kind="gradient", name="viewmat")
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
+    leaves = {key: scene[key].clone().requires_grad_() for key in SURFEL_KEYS[:5]}
+    viewmat = scene["viewmat"].clone().requires_grad_()
+    camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
+    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+    means, quats, scales, opacities, gammas = leaves.values()
+    given = (means, quats, scales, opacities, gammas)
+    projection = ops.project(*given, torch.zeros_like(means), viewmat)
+    tiles = ops.intersect_tiles(*given, projection, viewmat, pinhole, low_pass=low_pass)
+    hits = ops.collect(projection, tiles, pinhole, low_pass=low_pass)
+    found = ops.surface(projection, tiles, hits, pinhole, viewmat.detach(), low_pass=low_pass)
+    normals = found.blended_normals @ viewmat[:3, :3].detach().T  # back to the camera's frame
+    buffers = [found.expected_depth, found.median_depth, found.top_depth, normals, found.distortion]
+    cotangents = [torch.randn_like(x) for x in buffers]
+    torch.autograd.backward(buffers, cotangents)
+
+    t, tape = types(REAL), wp.Tape()
+    shape = (
+        to_warp(means, t.vec3),
+        to_warp(quats, t.vec4),
+        to_warp(scales, t.vec2),
+        to_warp(opacities, REAL),
+        to_warp(gammas, t.vec2),
+    )
+    view, colors = to_warp(viewmat[None], t.mat44), to_warp(torch.zeros_like(scene["means"]), t.vec3)
+    image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
+    records, centers, limits = passes.project(tape, *shape, colors, view)
+    lists = passes.intersect_tiles(*shape, centers, view, image, low_pass)
+    stops = passes.collect(tape, records, centers, limits, lists, image, HITS, low_pass).stops
+    surface = passes.surface(tape, records, centers, limits, lists, image, stops, low_pass)
+    for buffer, expected in zip(surface, buffers, strict=True):
+        assert_close(wp.to_torch(buffer).view_as(expected), expected, kind="value", name="buffer")
+    grads = {
+        buffer: to_warp(x.view(-1, *x.shape[2:]), buffer.dtype) for buffer, x in zip(surface, cotangents, strict=True)
+    }
+    tape.backward(grads=grads)
+    for array, (name, leaf) in zip(shape, leaves.items(), strict=True):
+        assert_close(wp.to_torch(array.grad), present(leaf.grad), kind="gradient", name=name)
+    assert_close(wp.to_torch(view.grad)[0], present(viewmat.grad), kind="gradient", name="viewmat")
 
 
 def launch(tape: wp.Tape, kernel: wp.Kernel, shape: tuple[int, int], inputs: "list[wp.array[Any]]") -> "wp.array[Any]":

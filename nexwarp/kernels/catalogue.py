@@ -30,6 +30,7 @@ from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
 from nexwarp.kernels.surface import surface_kernel
+from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tiles import (
     depth_keys_kernel,
     list_kernels,
@@ -53,9 +54,11 @@ def all_kernels(
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
     if not cpu:
         yield from (kernel for kernel, _ in fused_kernel_builds())
-    # What training itself has no use for: the antialiasing of trained surfels, depths and normals.
+    # What a default training has no use for: the antialiasing of trained surfels, depths and normals.
     yield antialias_kernels(real).backward
-    yield from (surface_kernel(real, low_pass, tile_size) for low_pass in (False, True))
+    for low_pass in (False, True):
+        yield surface_kernel(real, low_pass, tile_size)
+        yield from (surface_backward_kernel(real, low_pass, tile_size, fixed) for fixed in {False, not cpu})
 
 
 def thread_kernels(

@@ -1,14 +1,18 @@
 """Depths and normals over all hits that `collect` blended, not only the K heaviest (not in the paper).
 
 A thread is a pixel (see `walk`). It takes the walk that `collect` took, as far as `stops` says. Read: what `collect`
-read. Written, with weight = alpha * transmittance (paper Sec. 4.2), t the z-depth and n the normal of a hit:
+read. Written, with w = alpha * transmittance the weight (paper Sec. 4.2), t the z-depth and n the normal of a hit:
 
-    expected    sum of weight * t / sum of weights
+    expected    sum of w t / sum of w
     median      t of the hit that takes the transmittance to 1/2 or below; of the last hit where it stays above
     top         t of the heaviest hit, on a tie of the nearer one
-    normals     sum of weight * n, camera frame, each n on the side that faces the camera; not normalised
+    normals     sum of w n, camera frame, each n on the side that faces the camera; not normalised
+    distortion  sum over i of w_i |A_i t_i - D_i|, where A_i = sum of w_j and D_i = sum of w_j t_j over j < i
 
-All are 0 where nothing is hit. Nothing is differentiable.
+All are 0 where nothing is hit. The distortion is the sum over pairs of w_i w_j |t_i - t_j| (2DGS), in linear time,
+where hits come in the order of their depths; elsewhere it is less. `surface_backward` differentiates all five. It needs
+`totals`, (sum of w, sum of w s, sum of w s t) with s the sign of A t - D and t less that of the first hit, and `picks`,
+the places in the list of the hits of the median and the top depth, -1 where nothing is hit; both may be left out.
 """
 
 import functools
@@ -59,6 +63,9 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         median: wp.array(dtype=real),
         top: wp.array(dtype=real),
         normals: wp.array(dtype=vec3),
+        distortion: wp.array(dtype=real),
+        totals: wp.array(dtype=vec3),
+        picks: wp.array(dtype=wp.vec2i),
     ):
         thread = first + wp.tid()
         xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
@@ -74,6 +81,13 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         heaviest = real(0.0)
         top_depth = real(0.0)
         normal = vec3()
+        # Depths that are compared count from the first hit's: differences of near ones keep their digits.
+        start = real(0.0)
+        shifted = real(0.0)
+        spread = real(0.0)
+        signs = real(0.0)
+        signed_depths = real(0.0)
+        pick = wp.vec2i(-1, -1)
         overflow = overflowed(ends, surfel_ids)
         bounds = walk(thread // pixels, tile_offsets, ends, overflow)
         width = warp_size()
@@ -115,9 +129,22 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
                         weight = alpha * transmittance
                         if transmittance > HALF:
                             median_depth = depth
+                            pick[0] = batch + source
                         if weight > heaviest:
                             heaviest = weight
                             top_depth = depth
+                            pick[1] = batch + source
+                        if weights == ZERO:
+                            start = depth
+                        z = depth - start
+                        gap = weights * z - shifted
+                        side = wp.sign(gap) * weight
+                        if gap == ZERO:
+                            side = ZERO
+                        spread += weight * wp.abs(gap)
+                        signs += side
+                        signed_depths += side * z
+                        shifted += weight * z
                         n = vec3(rn[0], rn[1], rn[2])
                         if n[0] * d[0] + n[1] * d[1] + n[2] > ZERO:
                             n = -n
@@ -134,5 +161,9 @@ def surface_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel:
         median[p] = median_depth
         top[p] = top_depth
         normals[p] = normal
+        distortion[p] = spread
+        if picks:
+            totals[p] = vec3(weights, signs, signed_depths)
+            picks[p] = pick
 
     return surface

@@ -5,7 +5,9 @@ into the image, and is not farther behind the surface than the truncation, takes
 
     min(depth - z, truncation) / truncation
 
-and near the surface its colour, into running means. Nothing is differentiated.
+and near the surface its colour, into running means. A view for which the voxel is free space, nearer than the
+truncation, counts with a smaller weight: beside thin surfaces and where depths disagree, such views would otherwise
+outvote those that see a surface. Nothing is differentiated.
 """
 
 import functools
@@ -15,6 +17,7 @@ import warp as wp
 from nexwarp.kernels.types import types
 
 BLOCK_SIDE = 16  # voxels
+FREE_WEIGHT = 0.2  # of a view for which a voxel is free space, beside 1 of one that sees a surface there
 
 
 @functools.cache
@@ -64,19 +67,19 @@ def fuse_kernel() -> wp.Kernel:
         distance = depth - c[2]
         if distance < -truncation:
             return
-        weight = weights[b, local]
-        weights[b, local] = weight + 1.0
+        share = wp.where(distance < truncation, 1.0, wp.static(FREE_WEIGHT))
+        weight = weights[b, local] + share
+        weights[b, local] = weight
         seen = wp.min(distance / truncation, 1.0)
-        distances[b, local] += (seen - distances[b, local]) / (weight + 1.0)
+        distances[b, local] += (seen - distances[b, local]) * share / weight
         if distance < truncation:
             color = colors[int(row), int(column)]
             mean = means[b, local]
             count = mean[3] + 1.0
-            share = 1.0 / count
             means[b, local] = vec4(
-                mean[0] + (color[0] - mean[0]) * share,
-                mean[1] + (color[1] - mean[1]) * share,
-                mean[2] + (color[2] - mean[2]) * share,
+                mean[0] + (color[0] - mean[0]) / count,
+                mean[1] + (color[1] - mean[1]) / count,
+                mean[2] + (color[2] - mean[2]) / count,
                 count,
             )
 

@@ -10,12 +10,13 @@ from nexwarp.ops.memory import check_image
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
-from nexwarp.ops.surface import Surface, surface
+from nexwarp.ops.surface import DifferentiableSurface, Surface, surface
 from nexwarp.ops.texture import texture
 from nexwarp.ops.tiles import ListCapacity, Tiles, fits, held, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
+    "DifferentiableSurface",
     "Hits",
     "ListCapacity",
     "Pinhole",

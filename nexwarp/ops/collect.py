@@ -122,7 +122,7 @@ def splat_error(
     check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
     records = projection.records.detach()
     real = real_of(records)
-    sums = _SlotSums(records, tiles)
+    sums = SlotSums(records, tiles)
     slots = sums.new()
     errors = errors.detach().to(records.dtype).contiguous()
     inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
@@ -163,7 +163,7 @@ def walk_inputs(
     ]
 
 
-class _SlotSums:
+class SlotSums:
     """Where a walk adds up what it finds for each surfel.
 
     On a CPU each (tile, surfel) entry has a slot, which one thread owns, and `reduce` adds up each surfel's slots in a
@@ -262,7 +262,7 @@ class _Collect(torch.autograd.Function):
         tiles, camera, max_hits, low_pass, request = ctx.rest
         real = real_of(records)
         t = types(real)
-        sums = _SlotSums(records, tiles)
+        sums = SlotSums(records, tiles)
         inputs = [
             *walk_inputs(records, centers, limits, tiles, camera),
             array(tiles.reaches, t.vec2),

@@ -23,7 +23,7 @@ class DistanceField:
     Attributes:
         blocks: (B, 3) int32, sorted; block (i, j, k) starts at voxel 16 * (i, j, k).
         distances: (B, 4096) signed distances over the truncation, at most 1, positive in front of surfaces.
-        weights: (B, 4096) number of views of each voxel; 0 is unknown.
+        weights: (B, 4096) number of views of each voxel, free space counting with FREE_WEIGHT; 0 is unknown.
         means: (B, 4096, 4) mean colours of the voxels near surfaces, and their number of views.
     """
 

@@ -20,9 +20,9 @@ from nexwarp.ops.tsdf import DistanceField
 PIXELS_A_VOXEL = 1.5  # side of a voxel, in pixels of the photos at their median depth
 TRUNCATION = 4.0  # voxels
 FAR = 3.0  # scene scales
-LEAST_ALPHA = 0.5  # of a pixel whose depth counts
-LEAST_VIEWS = 2  # of a voxel that counts
-LEAST_SHARE = 2e-3  # of all triangles: smaller components are removed
+LEAST_ALPHA = 0.25  # of a pixel whose depth counts
+LEAST_WEIGHT = 1.1  # of a voxel that counts: two views, of which one sees a surface there
+LEAST_SHARE = 5e-4  # of all triangles: smaller components are removed
 MOST_BLOCKS = 2_000_000
 WELD = 1e4  # vertices that agree to a part of this many of a voxel are one
 
@@ -55,7 +55,7 @@ def extract_mesh(
     far: float | None = None,
     observe: Progress = lambda *_: None,
 ) -> Mesh:
-    """Return the surface of a model as a mesh, without components of less than 0.2 % of the triangles.
+    """Return the surface of a model as a mesh, without components of less than 0.05 % of the triangles.
 
     Args:
         model: the model, on the device to work on.
@@ -188,7 +188,7 @@ def _with_borders(
 
     return (
         lambda b: gathered(distances, b, 0.0),
-        lambda b: gathered(weights, b, 0.0) >= LEAST_VIEWS,
+        lambda b: gathered(weights, b, 0.0) >= LEAST_WEIGHT,
         lambda b: np.moveaxis(gathered(means, b, 0.0)[..., :3], -1, 0),
     )
 

@@ -35,13 +35,19 @@ class LossWeights:
     """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.1
     """Factor of the relative depth error at the points that were triangulated from the photo."""
+    normals: float = 0.0
+    """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
+    Counts from 7/30 of the run on; smoother meshes."""
+    distortion: float = 0.0
+    """Factor of the depth distortion of 2DGS, relative to the depth: how far apart the hits of a pixel are. Counts from
+    a tenth of the run on."""
     poses: float = 0.1
     """With `refine_poses` or `blur_poses`: factor of the squared pose correction, which keeps poses near the given
     ones, and of the squared motion during the exposure, which keeps it short."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "poses"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses"):
             check_range(name, getattr(self, name), 0.0)
 
 

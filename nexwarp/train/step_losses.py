@@ -11,12 +11,13 @@ from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.losses import depth_loss, training_losses
+from nexwarp.train.surface_losses import distortion_loss, normal_loss
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "poses")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -108,6 +109,11 @@ def step_losses(
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
         losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
+    normals, distortion = target.surface
+    if normals > 0:
+        losses["normals"] = normals * normal_loss(out, target.counts)
+    if distortion > 0:
+        losses["distortion"] = distortion * distortion_loss(out, target.counts)
     if poses is not None and target.view is not None and factors.poses > 0:
         losses["poses"] = factors.poses * poses.prior(target.view)
     for name, loss in (own or {}).items():

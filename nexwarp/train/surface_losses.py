@@ -1,0 +1,67 @@
+"""Losses of the surface itself, as 2DGS has them (Huang et al., 2024): normal consistency and depth distortion."""
+
+import torch
+
+from nexwarp import ops
+from nexwarp.render import Rendering
+from nexwarp.train.config import REFERENCE_ITERATIONS, Config
+
+# Iterations, of a run of 30,000, from which the losses count: those of 2DGS.
+NORMALS_FROM = 7_000
+DISTORTION_FROM = 3_000
+
+
+def surface_factors(config: Config, iteration: int) -> tuple[float, float]:
+    """Return the factors of `normal_loss` and `distortion_loss` at an iteration: 0 before the losses start."""
+    done, factors = iteration / config.iterations, config.losses
+    return (
+        factors.normals if done >= NORMALS_FROM / REFERENCE_ITERATIONS else 0.0,
+        factors.distortion if done >= DISTORTION_FROM / REFERENCE_ITERATIONS else 0.0,
+    )
+
+
+def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
+    """Mean over pixels of sum over hits of weight * (1 - n . N), with N the normal of the depth map.
+
+    The depth map is that of the median depths, from which meshes are made. Pixels whose N is not known do not count.
+
+    Args:
+        out: a rendering.
+        counts: (H, W) bool, the pixels that count; None is all.
+    """
+    stages = out.intermediates
+    normals = depth_normals(out.median_depth, stages.viewmat, stages.pinhole)
+    errors = out.alpha * normals.detach().any(-1) - (out.blended_normals * normals).sum(-1)
+    return (errors if counts is None else errors * counts).mean()
+
+
+def distortion_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
+    """Mean over pixels of the depth distortion over the expected depth, which gets no gradient.
+
+    Args:
+        out: a rendering.
+        counts: (H, W) bool, the pixels that count; None is all.
+    """
+    depths = out.expected_depth.detach()
+    relative = out.distortion / torch.where(depths > 0, depths, 1.0)
+    return (relative if counts is None else relative * counts).mean()
+
+
+def depth_normals(depths: torch.Tensor, viewmat: torch.Tensor, pinhole: ops.Pinhole) -> torch.Tensor:
+    """Return the normals of a depth map by central differences; differentiable with respect to both tensors.
+
+    Args:
+        depths: (H, W) z-depths, world units; 0 where there is no surface.
+        viewmat: (4, 4) world to camera.
+        pinhole: the image plane.
+
+    Returns:
+        (H, W, 3) unit normals that face the camera, world frame; 0 on the border and beside pixels without a surface.
+    """
+    points = ops.unproject(depths[..., None], viewmat, pinhole)[0][:, :, 0]
+    across = points[1:-1, 2:] - points[1:-1, :-2]
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    normals = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    known = depths > 0
+    known = known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1] & known[:-2, 1:-1]
+    return torch.nn.functional.pad(normals.where(known[..., None], 0.0), (0, 0, 1, 1, 1, 1))
