@@ -95,6 +95,6 @@ def plots(count: int, height: float = 2.6, width: float = WIDTH) -> list[Axes]:
     return list(axes.flat)
 
 
-def legend(axis: Axes) -> None:
-    """Add a legend beside a plot, where it covers no curve."""
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.3, fontsize=7)
+def legend(axis: Axes, left: float = 1.0) -> None:
+    """Add a legend beside a plot, where it covers no curve; `left` is where it begins, in widths of the plot."""
+    axis.legend(loc="upper left", bbox_to_anchor=(left, 1.0), borderaxespad=0.3, fontsize=7)

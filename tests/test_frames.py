@@ -97,6 +97,7 @@ def test_a_cpu_has_no_graphs() -> None:
     assert not any(isinstance(out, frames.CapturedRendering) for out in outs)
 
 
+@pytest.mark.filterwarnings("ignore:You are using `torch.load`:FutureWarning")  # torch 2.4.0 unpickles with it
 def test_buffers_are_copied_when_they_are_asked_for() -> None:
     """With a stand-in for the graph: what it overwrites later does not show."""
     model, camera = finished("cpu"), cameras("cpu")[0]

@@ -73,16 +73,17 @@ def _parse(arguments: list[str]) -> Callable[[Console], None]:
     except SystemExit as stop:
         if stop.code:
             help_of = f"nexwarp {arguments[0]}" if arguments and arguments[0] in COMMANDS else "nexwarp"
-            _complain(f"error: {_unboxed(message.getvalue())}; see {help_of} --help", None)
+            _complain(f"error: {_unboxed(message.getvalue(), help_of)}; see {help_of} --help", None)
         raise
 
 
-def _unboxed(text: str) -> str:
-    """Reduce an error message of tyro, a box of several paragraphs, to one sentence."""
+def _unboxed(text: str, command: str) -> str:
+    """Reduce an error message of tyro, a box of several paragraphs, on a command to one sentence."""
     lines = [line.strip("│╭╮╰╯|+ ") for line in text.splitlines()]
     # The first line is the title. Terminals without box characters get lines of "-".
     parts = [part for part in re.split(r"\n[─-]*\n", "\n".join(["", *lines[1:]])) if part]
-    fault = " ".join(parts[0].split()).removesuffix(".")
+    fault = " ".join(parts[0].split()).removesuffix(".").replace(" or misplaced", "")
+    fault = fault.replace(f" (applied to {command}) ", ", ").removesuffix(f" (applied to {command})")
     value = re.fullmatch(
         r"Error parsing (\S+): (?:no type matching \S*(INT|FLOAT)\b|invalid literal for (int)|"
         r"could not convert string to (float)).*?'(.*)'.*",
@@ -92,8 +93,11 @@ def _unboxed(text: str) -> str:
         option, *kinds, given = value.groups()
         kind = "an integer" if "int" in [(k or "").lower() for k in kinds] else "a number"
         return f"{option}: expected {kind}, got {given!r}"
-    meant = next((part.split("\n")[1] for part in parts if part.startswith("Perhaps you meant:")), None)
-    return fault if meant is None else f"{fault}; perhaps you meant {meant}"
+    meant = next((part for part in parts if part.startswith("Perhaps you meant:")), None)
+    if meant is None:
+        return fault
+    option, owners = meant.split("\n")[1], re.findall(r"^in (nexwarp \w+) --help$", meant, re.M)
+    return f"{fault}; perhaps you meant {option if command in owners or not owners else f'{owners[0]} {option}'}"
 
 
 def main(arguments: list[str] | None = None) -> int:

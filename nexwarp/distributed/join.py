@@ -1,6 +1,7 @@
 """How a process learns of the other ranks of its training, and meets them."""
 
 import hashlib
+import math
 import os
 import socket
 import time
@@ -82,7 +83,7 @@ def open_store(seconds: float, *, host: bool) -> Store:
     """
     served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-    wait = timedelta(seconds=seconds)
+    wait = timedelta(seconds=math.ceil(seconds))  # torch 2.4 counts whole seconds
     host = host and not served
     store = TCPStore(address, port, None, host, wait, wait_for_workers=False, multi_tenant=host)
     return PrefixStore(f"nexwarp/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)

@@ -155,6 +155,7 @@ def test_negative_frames(finished, capsys):
         (["render", "x", "--fps", "3O"], ["--fps: expected a number, got '3o'; see nexwarp render --help"]),
         (["train", "x", "--colour", "red"], ["unrecognized options: --colour, red"]),
         (["train", "x", "--itertions", "3"], ["options: --itertions, 3; perhaps you meant --iterations n; see"]),
+        (["render", "x", "--out", "r"], ["options: --out, r; perhaps you meant nexwarp export --out folder; see nexw"]),
         (["train", "x", "--run"], ["missing value for argument '--run'. expected 1 values; see nexwarp train"]),
         (["sfm", "x", "y", "--matching", "no"], ["invalid choice 'no' for argument '--matching'. expected one of"]),
     ],
