@@ -118,7 +118,8 @@ def _train(results: Results) -> str:
 
 
 def _megabytes(results: Results) -> str:
-    lines, sums = [], {name: [] for name in BUDGETS}
+    lines: list[list[str]] = []
+    sums: dict[str, list[list[float]]] = {name: [] for name in BUDGETS}
     for scene in SCENES:
         cells = [scene]
         for name, place in BUDGETS.items():
