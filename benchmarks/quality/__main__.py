@@ -100,9 +100,10 @@ def table(given: argparse.Namespace) -> int:
 
 def curve(given: argparse.Namespace) -> int:
     """Draw a metric over the number of primitives, and print the curves' points."""
-    results = read_results(given.results)
-    if given.commit is not None:
-        results = of_one_default(results, given.commit)
+    if given.commit is None:
+        results = read_results(given.results)
+    else:
+        results = of_one_default([read_results([file]) for file in given.results], given.commit)
     curves = curves_of(results, given.scene, given.metric, given.iterations)
     if not curves:
         print(f"--scene: expected one with results of {given.iterations:,} iterations, got {given.scene}")
@@ -115,7 +116,8 @@ def curve(given: argparse.Namespace) -> int:
 
 def publish(given: argparse.Namespace) -> int:
     """Fill the marked blocks of pages with the tables of one default."""
-    results = of_one_default(read_results(given.results), given.commit, given.same.split(",") if given.same else ())
+    files = [read_results([file]) for file in given.results]
+    results = of_one_default(files, given.commit, given.same.split(",") if given.same else ())
     tables = blocks(results)
     filled = {page: fill(page.read_text(encoding="utf-8"), tables) for page in given.page or ()}
     for page, text in filled.items():

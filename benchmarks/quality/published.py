@@ -1,7 +1,7 @@
 """The documents' tables of today's default: which results they may hold, and the blocks of a page that they fill."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from benchmarks.quality.jobs import TrainingJob, config_of
 from benchmarks.quality.results import Results
@@ -13,14 +13,14 @@ PEER_NAMES = tuple(row.name for row in PEERS)
 ITERATIONS = 30_000
 
 
-def of_one_default(results: Results, commit: str | None = None, same: Collection[str] = ()) -> Results:
+def of_one_default(files: Iterable[Results], commit: str | None = None, same: Collection[str] = ()) -> Results:
     """Return the results that may stand in one table: those of known rows at full size, our presets' from one commit.
 
     gsplat and the paper's preset, which change less than the default, may have been trained at other commits; the
     tables name them.
 
     Args:
-        results: by job.
+        files: results of each file; of one job in several files, the later one counts.
         commit: of the default's trainings; None takes the only one that there is.
         same: further commits with the same arithmetic of the default.
 
@@ -28,20 +28,20 @@ def of_one_default(results: Results, commit: str | None = None, same: Collection
         ValueError: the default's results are of several commits and none is named, there is none of the named commit,
             or one was trained with other settings than today's.
     """
-    full = {job: x for job, x in results.items() if job.row in ROWS and _at_full_size(job)}
-    own = {job: x for job, x in full.items() if _is_default(job)}
-    commits = sorted({x["commit"] for x in own.values()})
+    full = [(job, x) for file in files for job, x in file.items() if job.row in ROWS and _at_full_size(job)]
+    own = [(job, x) for job, x in full if _is_default(job)]
+    commits = sorted({x["commit"] for _, x in own})
     if commit is None and len(commits) > 1:
         raise ValueError(f"--commit: expected one of {', '.join(commits)}: the default's results are not of one commit")
     allowed = {*same, *(commits if commit is None else [commit])}
-    chosen = {job: x for job, x in own.items() if x["commit"] in allowed}
+    chosen = {job: x for job, x in own if x["commit"] in allowed}
     if commit is not None and not any(x["commit"] == commit for x in chosen.values()):
         raise ValueError(f"--commit: expected one of {', '.join(commits) or 'none'}, got {commit}")
     for job, result in chosen.items():
         if result.get("config") != config_name(config_of(job, ROWS[job.row])):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
             raise ValueError(f"{told}: expected the settings of today, got others")
-    return chosen | {job: x for job, x in full.items() if not _is_default(job)}
+    return chosen | {job: x for job, x in full if not _is_default(job)}
 
 
 def _at_full_size(job: TrainingJob) -> bool:
