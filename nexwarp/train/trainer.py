@@ -254,14 +254,9 @@ class Trainer:
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
-        densify = self.densifier.config
-        due = self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
-        return (
-            (due or self.iteration == self.config.iterations)
-            and densify.floaters
-            and self.iteration >= densify.stop
-            and any(self._nearest)
-        )
+        densify, last = self.densifier.config, self.iteration == self.config.iterations
+        due = last or self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
+        return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
     def _nearest(self) -> list[float]:
