@@ -97,6 +97,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "densify.fraction": ("", "4.3"),
     "densify.prune_opacity": ("", "4.3"),
     "densify.prune_at_cap": ("", "code"),
+    "densify.relocate": ("", ""),
     "densify.floaters": ("", ""),
 }
 

@@ -9,7 +9,9 @@ from pathlib import Path
 
 from benchmarks import quality
 from benchmarks.quality.curve import curves_of, draw_curves
+from benchmarks.quality.documents import MISSING, blocks
 from benchmarks.quality.jobs import SCENES, TABLES, TrainingJob, config_of, table_jobs
+from benchmarks.quality.published import fill, of_one_default
 from benchmarks.quality.results import DIGITS, METRICS, Results, drop_unfinished, read_results
 from benchmarks.quality.rows import DEFAULT, ROWS, Row
 from benchmarks.quality.run import config_name
@@ -98,7 +100,11 @@ def table(given: argparse.Namespace) -> int:
 
 def curve(given: argparse.Namespace) -> int:
     """Draw a metric over the number of primitives, and print the curves' points."""
-    curves = curves_of(read_results(given.results), given.scene, given.metric, given.iterations)
+    if given.commit is None:
+        results = read_results(given.results)
+    else:
+        results = of_one_default([read_results([file]) for file in given.results], given.commit)
+    curves = curves_of(results, given.scene, given.metric, given.iterations)
     if not curves:
         print(f"--scene: expected one with results of {given.iterations:,} iterations, got {given.scene}")
         return 2
@@ -108,11 +114,27 @@ def curve(given: argparse.Namespace) -> int:
     return 0
 
 
+def publish(given: argparse.Namespace) -> int:
+    """Fill the marked blocks of pages with the tables of one default."""
+    files = [read_results([file]) for file in given.results]
+    results = of_one_default(files, given.commit, given.same.split(",") if given.same else ())
+    tables = blocks(results)
+    filled = {page: fill(page.read_text(encoding="utf-8"), tables) for page in given.page or ()}
+    for page, text in filled.items():
+        page.write_text(text, encoding="utf-8")
+    for name in given.show.split(",") if given.show else ():
+        print(tables[name])
+    missing = {name: text.count(MISSING) for name, text in tables.items()}
+    print("cells not run: " + ", ".join(f"{name} {count}" for name, count in missing.items() if count))
+    return 0
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     description = (quality.__doc__ or "").splitlines()[0]
     parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description=description)
     commands = parser.add_subparsers(required=True)
+    _add_publish(commands.add_parser("publish", help="fill the tables of the documents with results of one default"))
     _add_train(commands.add_parser("train", help="do the trainings of some tables that are not there yet"))
     tables = commands.add_parser("table", help="make Markdown of results")
     tables.set_defaults(run=table)
@@ -126,8 +148,20 @@ def make_parser() -> argparse.ArgumentParser:
     curves.add_argument("--scene", default="fox", help="default: %(default)s")
     curves.add_argument("--metric", default="flip", choices=METRICS, help="default: %(default)s")
     curves.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
+    curves.add_argument("--commit", help="of the default's trainings; default: all of them")
     curves.add_argument("--out", type=Path, required=True, help="picture to write")
     return parser
+
+
+def _add_publish(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `publish`."""
+    add = parser.add_argument
+    parser.set_defaults(run=publish)
+    add("results", type=Path, nargs="+")
+    add("--commit", help="of the default's trainings; default: the only one in the results")
+    add("--same", help="comma-separated: further commits whose default computes the same")
+    add("--page", type=Path, action="append", help="file with lines <!-- results: NAME --> to fill; several times")
+    add("--show", help="comma-separated blocks to print: short, readme, peers-40000, peers-10000, sizes, train, ...")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:

@@ -4,26 +4,28 @@ import statistics
 from pathlib import Path
 
 from benchmarks.quality.results import UNITS, Results
-from benchmarks.quality.rows import DEFAULT, GSPLAT
+from benchmarks.quality.rows import DEFAULT, PEERS
 
 Curves = dict[str, list[tuple[int, float, float]]]
 
 
 def curves_of(results: Results, scene: str, metric: str, iterations: int) -> Curves:
-    """Return the curves of our default and of gsplat, with photos at full size.
+    """Return the curves of our default and of gsplat's rows, with photos at full size.
 
     Returns:
         By row, for those that have results: (primitives, mean over seeds, their standard deviation), by size.
     """
-    found: dict[str, dict[int, list[float]]] = {}
+    rows = (DEFAULT.name, *(row.name for row in PEERS))
+    found: dict[str, dict[int, list[float]]] = {row: {} for row in rows}
     for job, result in results.items():
         which = (job.scene, job.variant, job.iterations, job.downscale)
-        named = job.row in (DEFAULT.name, GSPLAT) and which == (scene, "", iterations, 1)
+        named = job.row in found and which == (scene, "", iterations, 1)
         if named and result[metric] is not None:
-            found.setdefault(job.row, {}).setdefault(job.size, []).append(result[metric])
+            found[job.row].setdefault(job.size, []).append(result[metric])
     return {
         row: [(n, statistics.fmean(x), statistics.stdev(x) if len(x) > 1 else 0.0) for n, x in sorted(sizes.items())]
         for row, sizes in found.items()
+        if sizes
     }
 
 

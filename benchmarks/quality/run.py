@@ -257,7 +257,10 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 @lru_cache
 def _commit() -> str:
-    """Return the commit of this checkout; NEXWARP_COMMIT names it where the files come without their history."""
+    """Return the commit of this checkout.
+
+    Where the files come without their history, NEXWARP_COMMIT names it; otherwise it is a digest of the sources.
+    """
     if name := os.environ.get("NEXWARP_COMMIT"):
         return name
     try:
@@ -265,4 +268,12 @@ def _commit() -> str:
             ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        return f"sources {sources_digest()}"
+
+
+def sources_digest(package: Path = ROOT / "nexwarp") -> str:
+    """Return a digest of a package's Python files, 12 digits: equal ones train alike."""
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        digest.update(file.relative_to(package.parent).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()[:12]

@@ -8,6 +8,10 @@ from torch import nn
 from nexwarp.checks import check_range
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 
+RELOCATE_EVERY = 10  # rounds: their places are taken within three rounds, and the new surfels have to settle
+RELOCATE_UNTIL = 0.6  # share of the densification's iterations
+FULL = 0.98  # share of the budget from which it counts as used up: pruning always leaves some room
+
 
 @dataclass(frozen=True)
 class DensifyConfig:
@@ -25,6 +29,9 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    relocate: float = 0.0
+    """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
+    that contribute least to the training views. The next rounds split others in their place. 0 removes none."""
     floaters: bool = True
     """Remove floaters: surfels that are visible, in training views or views between them, at less than 0.6 times the
     depth of the nearest points."""
@@ -33,6 +40,7 @@ class DensifyConfig:
         check_range("every", self.every, 1)
         check_range("fraction", self.fraction, 0.0, 1.0)
         check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
+        check_range("relocate", self.relocate, 0.0, 0.5)
 
 
 class Densifier:
@@ -59,6 +67,12 @@ class Densifier:
         """Whether a round follows a step that ends with this iteration (counted from 1) and has so many views."""
         c, late = self.config, iteration % self.config.every
         return c.start < iteration - late < c.stop and late < views
+
+    def relocates(self, iteration: int, count: int) -> bool:
+        """Whether a round after this iteration, with so many surfels, begins by removing some of them."""
+        c = self.config
+        rare = iteration // c.every % RELOCATE_EVERY == 0
+        return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and count >= FULL * self.max_surfels
 
     def accumulate(self, errors: torch.Tensor) -> None:
         """Add the blended errors (N,) of one view."""

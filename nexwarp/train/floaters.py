@@ -18,6 +18,7 @@ LEAST_SHARE = 3e-4  # share of an image that a floater covers, at least
 HEIGHT = 80  # of the images, pixels: the share is two or three of them
 LAST_SHARE = 3e-3  # share in the last search: the surfels behind a removed floater can no longer be trained
 NEARER = 0.6  # share of the nearest points' depth: real surfaces may be somewhat nearer than these points
+FLOATERS_EVERY = 10  # rounds of densification from one search to the next
 FEWEST_POINTS = 20  # points in a view that give its nearest depth, at least
 
 

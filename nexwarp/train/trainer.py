@@ -27,11 +27,12 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
-from nexwarp.train.floaters import floaters, nearest_depth
+from nexwarp.train.floaters import FLOATERS_EVERY, floaters, nearest_depth
 from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.motion_blur import render_target
+from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
@@ -55,9 +56,6 @@ from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
 CHECK_EVERY = 100
 SNAPSHOTS = 10
-
-# Rounds of densification from one search for floaters to the next.
-FLOATERS_EVERY = 10
 
 
 class Trainer:
@@ -182,6 +180,10 @@ class Trainer:
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
+                if self.densifier.relocates(self.iteration, len(self.surfels)):
+                    cameras, share = self.views.refined_cameras(self.poses), self.config.densify.relocate
+                    chosen = least_contributing(self.model(), cameras, share, self.ranks)
+                    self.densifier.remove(self.surfels, self.optimizer, chosen)
                 self.densifier.step(self.surfels, self.optimizer, self.generator)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
@@ -253,9 +255,8 @@ class Trainer:
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
-        densify = self.densifier.config
-        due = self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
-        due |= self.iteration == self.config.iterations
+        densify, last = self.densifier.config, self.iteration == self.config.iterations
+        due = last or self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
         return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
 
     @cached_property
@@ -289,8 +290,7 @@ class Trainer:
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
-        config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
+        settings = FinishSettings(self.config.smooth_sh, self.config.footprints, self.config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             cameras = self.views.refined_cameras(self.poses)
             views = with_cameras(self.scene.train, cameras)

@@ -1,0 +1,192 @@
+"""Markdown of the documents' tables, by the names of the blocks that they fill."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+
+from benchmarks.quality.jobs import CURVE, SCENES
+from benchmarks.quality.published import PEER_NAMES, best_peer, mean, seeds_of
+from benchmarks.quality.results import Results
+from benchmarks.quality.rows import DEFAULT, MEGABYTES, PAPER, ROWS, SUSPECTS
+
+MISSING = "not run"
+SIZES = (40_000, 10_000)  # of the comparison with gsplat
+BUDGETS = {"5 MB": 0, "10 MB": 1}  # of compact files: our row, and which of gsplat's sizes
+COUNTS = {row.name: count for row, count in MEGABYTES if row.preset is not None}
+PEER_COUNTS = sorted({count for row, count in MEGABYTES if row.preset is None})
+PUBLISHED = {("train", 400_000): "21.50, 0.802"}  # arXiv:2512.13796, table of Tanks and Temples
+HEADINGS = {
+    "gsplat MCMC": "gsplat MCMC as in its example",
+    "gsplat MCMC, background": "and background",
+    "gsplat MCMC, exposures": "and background, exposures",
+    "gsplat MCMC, even start": "and background, exposures, initial points",
+    "gsplat default": "gsplat default, background",
+    "gsplat 2DGS": "gsplat 2DGS, background",
+}
+Cell = list[Mapping[str, float]]
+
+
+def blocks(results: Results) -> dict[str, str]:
+    """Return the Markdown of each block, from results `of_one_default`."""
+    found = {f"peers-{size}": _peers(results, size) for size in SIZES}
+    found |= {"sizes": _sizes(results), "train": _train(results), "megabytes": _megabytes(results)}
+    found |= {"suspects": _suspects(results), "short": _short(results), "readme": _readme(results)}
+    return found
+
+
+def figures(found: Cell) -> str:
+    """Return PSNR of each seed, mean SSIM and mean FLIP."""
+    if not found:
+        return MISSING
+    each = " and ".join(f"{x['psnr']:.2f}" for x in found)
+    return f"{each}, {mean(found, 'ssim'):.4f}, {mean(found, 'flip'):.4f}"
+
+
+def difference(one: Cell, other: Cell) -> str:
+    """Return the differences of the means of PSNR, SSIM and FLIP."""
+    if not one or not other:
+        return MISSING
+    psnr, ssim, flip = (mean(one, metric) - mean(other, metric) for metric in ("psnr", "ssim", "flip"))
+    return f"{psnr:+.2f} dB, {ssim:+.4f}, {flip:+.4f}"
+
+
+def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    rows = [header, ["---"] * len(header), *lines]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+
+
+def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterable[str]) -> str:
+    """Return the line below a table: command, devices, dates, commits and seeds of what it shows."""
+    sizes, rows = set(sizes), set(rows)
+    shown = {job: x for job, x in results.items() if job.size in sizes and job.row in rows}
+    if not shown:
+        return f"*To be measured by* `python -m benchmarks.quality train --tables {tables}`."
+    kinds = {"nexwarp": DEFAULT.preset, "paper's preset": PAPER.preset, "gsplat": None}
+    facts = []
+    for kind, preset in kinds.items():
+        of = {job: x for job, x in shown.items() if ROWS[job.row].preset == preset}
+        if of:
+            what = [sorted({str(x[key]) for x in of.values()}) for key in ("device", "date", "commit")]
+            seeds = sorted({job.seed for job in of})
+            named = ", ".join(" and ".join(part) for part in what)
+            facts.append(f"{kind} {named}, seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}")
+    return f"*Measured by* `python -m benchmarks.quality train --tables {tables}`: {'; '.join(facts)}."
+
+
+def _peers(results: Results, size: int) -> str:
+    shown = [name for name in PEER_NAMES if any(seeds_of(results, scene, name, size) for scene in SCENES)]
+    lines = []
+    for scene in SCENES:
+        cells = {name: seeds_of(results, scene, name, size) for name in (DEFAULT.name, *shown)}
+        own, best = cells[DEFAULT.name], best_peer(results, scene, size)
+        margin = MISSING if best is None else difference(own, best[1])
+        lines.append([scene, figures(own), *(figures(cells[name]) for name in shown), margin])
+    header = ["scene", "nexwarp", *(HEADINGS[name] for name in shown), "nexwarp less the best gsplat"]
+    absent = [HEADINGS[name] for name in PEER_NAMES if name not in shown]
+    told = [f"Not run with {size:,}: {'; '.join(absent)}.", ""] if absent else []
+    caption = _measured(results, "peers", [size], (DEFAULT.name, *PEER_NAMES))
+    return "\n".join([_table(header, lines), "", *told, caption])
+
+
+def _falls(results: Results, scene: str) -> float | None:
+    """Return the largest fall of PSNR from one size to the next that was run, dB; None with fewer than two."""
+    known = [mean(found, "psnr") for n in CURVE if (found := seeds_of(results, scene, DEFAULT.name, n))]
+    return max((a - b for a, b in pairwise(known)), default=None)
+
+
+def _sizes(results: Results) -> str:
+    lines = []
+    for scene in SCENES:
+        fall = _falls(results, scene)
+        cells = [figures(seeds_of(results, scene, DEFAULT.name, size)) for size in CURVE]
+        lines.append([scene, *cells, MISSING if fall is None else f"{max(fall, 0.0):.2f} dB"])
+    header = ["scene", *(f"{size:,}" for size in CURVE), "largest fall of PSNR"]
+    return f"{_table(header, lines)}\n\n{_measured(results, 'sizes', CURVE, [DEFAULT.name])}"
+
+
+def _train(results: Results) -> str:
+    sizes, lines = (400_000, 100_000, 40_000, 10_000), []
+    for size in sizes:
+        cells = {name: seeds_of(results, "train", name, size) for name in (DEFAULT.name, PAPER.name)}
+        best = best_peer(results, "train", size)
+        peer = MISSING if best is None else f"{figures(best[1])} ({best[0]})"
+        own = [figures(cells[name]) for name in (DEFAULT.name, PAPER.name)]
+        lines.append([f"{size:,}", *own, PUBLISHED.get(("train", size), "not given"), peer])
+    header = ["primitives", "default", "`--preset paper`", "publication: PSNR, SSIM", "best gsplat"]
+    of_train = {job: x for job, x in results.items() if job.scene == "train"}
+    caption = _measured(of_train, "paper,peers --scenes train", sizes, (DEFAULT.name, PAPER.name, *PEER_NAMES))
+    return f"{_table(header, lines)}\n\n{caption}"
+
+
+def _megabytes(results: Results) -> str:
+    lines: list[list[str]] = []
+    sums: dict[str, list[list[float]]] = {name: [] for name in BUDGETS}
+    for scene in SCENES:
+        cells = [scene]
+        for name, place in BUDGETS.items():
+            own = seeds_of(results, scene, name, COUNTS[name], part="compact")
+            best = best_peer(results, scene, PEER_COUNTS[place], part="compact")
+            peer = [] if best is None else best[1]
+            if own and peer:
+                sums[name].append([mean(own, m) - mean(peer, m) for m in ("psnr", "ssim", "flip")])
+            cells += [figures(own), figures(peer), difference(own, peer)]
+        lines.append(cells)
+    means = ["mean of the scenes that have both"]
+    for name in BUDGETS:
+        each = [sum(x) / len(x) for x in zip(*sums[name], strict=True)]
+        means += ["", "", f"{each[0]:+.2f} dB, {each[1]:+.4f}, {each[2]:+.4f}" if each else MISSING]
+    header = ["scene", *(f"{n}: {x}" for n in BUDGETS for x in ("nexwarp", "best gsplat", "difference"))]
+    rows = (*BUDGETS, *PEER_NAMES)
+    caption = _measured(results, "megabytes", (*COUNTS.values(), *PEER_COUNTS), rows)
+    return f"{_table(header, [*lines, means])}\n\n{caption}"
+
+
+def _suspects(results: Results) -> str:
+    scenes = [s for s in SCENES if any(seeds_of(results, s, row.name, 40_000) for row in (PAPER, *SUSPECTS))] or ["fox"]
+    rows = [(row.name, row.name, "") for row in (PAPER, *SUSPECTS)] + [("paper, near plane 0.2", PAPER.name, "near")]
+    lines = [
+        [told, *(figures(seeds_of(results, s, row, 40_000, variant)) for s in scenes)] for told, row, variant in rows
+    ]
+    caption = _measured(results, "suspects", [40_000], (row.name for row in (PAPER, *SUSPECTS)))
+    return f"{_table(['40,000 surfels', *scenes], lines)}\n\n{caption}"
+
+
+def _margins(results: Results, size: int) -> dict[str, float]:
+    """Return the margins over the best gsplat row, dB, of the scenes that have both."""
+    found = {}
+    for scene in SCENES:
+        own = seeds_of(results, scene, DEFAULT.name, size)
+        best = best_peer(results, scene, size)
+        if own and best is not None:
+            found[scene] = mean(own, "psnr") - mean(best[1], "psnr")
+    return found
+
+
+def _short(results: Results) -> str:
+    """Return the short answers of the page."""
+    lines = []
+    for size in SIZES:
+        margins = _margins(results, size)
+        told = ", ".join(f"{scene} {margin:+.2f} dB" for scene, margin in margins.items()) or MISSING
+        lines.append(f"* {size:,} primitives, default less the best gsplat row of the scene: {told}.")
+    falls = {scene: fall for scene in SCENES if (fall := _falls(results, scene)) is not None}
+    told = ", ".join(f"{scene} {max(fall, 0.0):.2f} dB" for scene, fall in falls.items()) or MISSING
+    lines.append(
+        f"* Largest fall of PSNR from one number of surfels to the next, of {CURVE[0]:,} to {CURVE[-1]:,}: {told}."
+    )
+    return "\n".join(lines)
+
+
+def _readme(results: Results) -> str:
+    """Return the table of README.md: 40,000 primitives, beside the best gsplat row of each scene."""
+    columns = ["PSNR [dB]", "SSIM", "FLIP", "MB"]
+    lines = []
+    for scene in SCENES:
+        own = seeds_of(results, scene, DEFAULT.name, SIZES[0])
+        best = best_peer(results, scene, SIZES[0])
+        cells = [scene]
+        for found in (own, [] if best is None else best[1]):
+            size = f"{mean(found, 'megabytes'):.1f}" if found else ""
+            cells += [*figures(found).split(", "), size] if found else [MISSING, "", "", ""]
+        lines.append(cells)
+    header = ["scene", f"nexwarp: {columns[0]}", *columns[1:], f"gsplat: {columns[0]}", *columns[1:]]
+    return f"{_table(header, lines)}\n\n{_measured(results, 'peers', SIZES[:1], (DEFAULT.name, *PEER_NAMES))}"

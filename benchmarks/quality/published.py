@@ -1,0 +1,102 @@
+"""The documents' tables of today's default: which results they may hold, and the blocks of a page that they fill."""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+
+from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.results import Results
+from benchmarks.quality.rows import DEFAULT, PEERS, ROWS
+from benchmarks.quality.run import config_name
+
+BLOCK = re.compile(r"(<!-- results: ([\w-]+) -->\n)(.*?)(<!-- end of results -->)", re.DOTALL)
+PEER_NAMES = tuple(row.name for row in PEERS)
+ITERATIONS = 30_000
+
+
+def of_one_default(files: Iterable[Results], commit: str | None = None, same: Collection[str] = ()) -> Results:
+    """Return the results that may stand in one table: those of known rows at full size, our presets' from one commit.
+
+    gsplat and the paper's preset, which change less than the default, may have been trained at other commits; the
+    tables name them.
+
+    Args:
+        files: results of each file; of one job in several files, the later one counts.
+        commit: of the default's trainings; None takes the only one that there is.
+        same: further commits with the same arithmetic of the default.
+
+    Raises:
+        ValueError: the default's results are of several commits and none is named, there is none of the named commit,
+            or one was trained with other settings than today's.
+    """
+    full = [(job, x) for file in files for job, x in file.items() if job.row in ROWS and _at_full_size(job)]
+    own = [(job, x) for job, x in full if _is_default(job)]
+    commits = sorted({x["commit"] for _, x in own})
+    if commit is None and len(commits) > 1:
+        raise ValueError(f"--commit: expected one of {', '.join(commits)}: the default's results are not of one commit")
+    allowed = {*same, *(commits if commit is None else [commit])}
+    chosen = {job: x for job, x in own if x["commit"] in allowed}
+    if commit is not None and not any(x["commit"] == commit for x in chosen.values()):
+        raise ValueError(f"--commit: expected one of {', '.join(commits) or 'none'}, got {commit}")
+    for job, result in chosen.items():
+        if result.get("config") != config_name(config_of(job, ROWS[job.row])):
+            told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
+            raise ValueError(f"{told}: expected the settings of today, got others")
+    return chosen | {job: x for job, x in full if not _is_default(job)}
+
+
+def _at_full_size(job: TrainingJob) -> bool:
+    return job.downscale == 1 and job.iterations == ITERATIONS and job.variant in ("", "near")
+
+
+def _is_default(job: TrainingJob) -> bool:
+    return ROWS[job.row].preset == DEFAULT.preset
+
+
+def fill(page: str, blocks: Mapping[str, str]) -> str:
+    """Return a page with its marked blocks replaced.
+
+    A block stands between the lines `<!-- results: NAME -->` and `<!-- end of results -->`.
+
+    Raises:
+        ValueError: the page has no block, or one that is unknown.
+    """
+    names = [found[2] for found in BLOCK.finditer(page)]
+    if unknown := [name for name in names if name not in blocks]:
+        raise ValueError(f"results: expected blocks named {', '.join(blocks)}, got {', '.join(unknown)}")
+    if not names:
+        raise ValueError("expected a page with a line <!-- results: NAME -->, got none")
+    return BLOCK.sub(lambda found: f"{found[1]}{blocks[found[2]]}\n{found[4]}", page)
+
+
+def seeds_of(
+    results: Results, scene: str, row: str, size: int, variant: str = "", part: str | None = None
+) -> list[Mapping[str, float]]:
+    """Return the results of a cell, one for each seed, by seed.
+
+    Args:
+        results: by job.
+        scene: of the cell.
+        row: of the cell.
+        size: budget of primitives.
+        variant: of the scene.
+        part: "compact" takes the figures of the compact file.
+    """
+    found = {
+        job.seed: x
+        for job, x in results.items()
+        if (job.scene, job.row, job.size, job.variant) == (scene, row, size, variant) and (part is None or part in x)
+    }
+    return [found[seed] if part is None else found[seed][part] for seed in sorted(found)]
+
+
+def best_peer(
+    results: Results, scene: str, size: int, part: str | None = None
+) -> tuple[str, list[Mapping[str, float]]] | None:
+    """Return the gsplat row with the best mean PSNR, and its cell as of `seeds_of`; None where there is none."""
+    cells = [(name, seeds_of(results, scene, name, size, part=part)) for name in PEER_NAMES]
+    return max((pair for pair in cells if pair[1]), key=lambda pair: mean(pair[1], "psnr"), default=None)
+
+
+def mean(found: Collection[Mapping[str, float]], metric: str) -> float:
+    """Return the mean over seeds."""
+    return sum(x[metric] for x in found) / len(found)

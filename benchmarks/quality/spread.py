@@ -1,0 +1,173 @@
+"""Runs the trainings that the documents' tables need on all GPUs of a machine, in the order of their value.
+
+    python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR
+
+On each GPU one training of ours, which the GPU limits, runs beside three of gsplat, which the host limits; seconds are
+not comparable then. Each result is appended to OUT at once. Trainings that OUT holds are passed over, and none is begun
+that would not end in time. CUDA MPS, where it runs, lets kernels of several processes overlap.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.quality.jobs import TrainingJob
+from benchmarks.quality.results import drop_unfinished, read_results, result_line
+from benchmarks.quality.rows import DEFAULT, MEGABYTES, PEERS, ROWS
+from benchmarks.timing import ROOT
+
+# Seconds of our training with 40,000 surfels alone on an H200, about; the spread corrects them by what it sees.
+SECONDS = {"kitchen25": 150, "train": 95, "fox": 85, "saharov": 95}
+PEER_SECONDS = 230
+SLOTS = {"ours": 1, "gsplat": 3}  # trainings at once on a GPU
+EXPOSED, EVEN = PEERS[2].name, PEERS[3].name
+
+
+@dataclass
+class Running:
+    """A training that runs.
+
+    Attributes:
+        job: which.
+        gpu: its number.
+        process: runs it.
+        folder: its results and its log.
+        begun: by `time.monotonic`.
+    """
+
+    job: TrainingJob
+    gpu: int
+    process: subprocess.Popen[bytes]
+    folder: Path
+    begun: float
+
+
+def wanted_jobs() -> list[TrainingJob]:
+    """Return all trainings, those of the most value first."""
+    default, sizes = DEFAULT.name, (40_000, 10_000)
+    pairs = [(scene, default, size) for size in sizes for scene in SECONDS]
+    pairs += [(scene, EXPOSED, 10_000) for scene in SECONDS]
+    pairs += [("train", default, 400_000), ("train", EXPOSED, 400_000)]
+    pairs += [(scene, default, size) for size in (100_000, 20_000, 5_000) for scene in SECONDS]
+    pairs += [(scene, EVEN, 10_000) for scene in SECONDS]
+    pairs += [(scene, row.name, size) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN]
+    return [TrainingJob(scene, "", row, size, 0, 30_000) for scene, row, size in dict.fromkeys(pairs)]
+
+
+def kind_of(job: TrainingJob) -> str:
+    """Return whose training it is: "ours" or "gsplat"."""
+    return "gsplat" if ROWS[job.row].preset is None else "ours"
+
+
+def expected_seconds(job: TrainingJob) -> float:
+    """Return how long a training takes alone on an H200, about."""
+    if kind_of(job) == "gsplat":
+        return PEER_SECONDS * (1.0 if job.size < 200_000 else 1.5)
+    return SECONDS[job.scene] * (0.55 + 0.45 * (job.size / 40_000) ** 0.5)
+
+
+def next_job(jobs: Sequence[TrainingJob], kind: str, slowness: Mapping[str, float], left: float) -> TrainingJob | None:
+    """Return the first job of a kind that ends within the seconds that are left; None without any."""
+    fitting = (job for job in jobs if kind_of(job) == kind and expected_seconds(job) * slowness[kind] < left)
+    return next(fitting, None)
+
+
+def command_of(job: TrainingJob, data: Path, out: Path) -> list[str]:
+    """Return the command of one training."""
+    row = ROWS[job.row]
+    named = f"{row.name}:{row.preset or 'gsplat'}:{json.dumps(row.settings)}"
+    command = [sys.executable, "-m", "benchmarks.quality", "train", "--row", named, "--scenes", job.scene]
+    command += ["--seeds", str(job.seed), "--size", str(job.size), "--iterations", str(job.iterations)]
+    return [*command, "--data", str(data), "--out", str(out)]
+
+
+def spread(out: Path, data: Path, seconds: float, gpus: int, jobs: list[TrainingJob]) -> int:
+    """Run the jobs; return how many ended without a result, those that were cut off included."""
+    end, failed = time.monotonic() + seconds, 0
+    slowness = {"ours": 1.15, "gsplat": 1.1}
+    running: list[Running] = []
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            while (left := end - time.monotonic()) > 0:
+                for one in [x for x in running if x.process.poll() is not None]:
+                    running.remove(one)
+                    failed += not _collect(one, out, slowness)
+                for gpu in range(gpus):
+                    for kind, slots in SLOTS.items():
+                        while sum(x.gpu == gpu and kind_of(x.job) == kind for x in running) < slots:
+                            job = next_job(jobs, kind, slowness, left)
+                            if job is None:
+                                break
+                            jobs.remove(job)
+                            running.append(_begin(job, gpu, data, Path(tempfile.mkdtemp(dir=folder))))
+                if not running:
+                    break
+                time.sleep(0.5)
+        finally:
+            for one in running:
+                os.killpg(one.process.pid, signal.SIGKILL)
+                one.process.wait()
+                print(f"cut off: {one.job.scene} {one.job.row} {one.job.size}", flush=True)
+    return failed + len(running)
+
+
+def _begin(job: TrainingJob, gpu: int, data: Path, folder: Path) -> Running:
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": str(gpu), "OMP_NUM_THREADS": "2"}
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(
+            command_of(job, data, folder / "out.jsonl"),
+            cwd=ROOT,
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    return Running(job, gpu, process, folder, time.monotonic())
+
+
+def _collect(one: Running, out: Path, slowness: dict[str, float]) -> bool:
+    """Append a training's result; return whether there is one."""
+    kind, took = kind_of(one.job), time.monotonic() - one.begun
+    file = one.folder / "out.jsonl"
+    if one.process.returncode != 0 or not file.exists():
+        last = " ".join((one.folder / "log").read_text(errors="replace").split()[-40:])
+        print(f"failed: {one.job.scene} {one.job.row} {one.job.size}: {last[-300:]}", flush=True)
+        return False
+    with out.open("a") as results:
+        results.write(file.read_text())
+    slowness[kind] = (slowness[kind] + took / expected_seconds(one.job)) / 2
+    print(result_line(one.job, read_results([file])[one.job]), flush=True)
+    return True
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.quality.spread", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seconds", type=float, required=True, help="of wall time")
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
+    given = parser.parse_args(arguments)
+    have = {}
+    if given.out.exists():
+        drop_unfinished(given.out)
+        have = read_results([given.out])
+    jobs = [job for job in wanted_jobs() if job not in have]
+    failed = spread(given.out, given.data, given.seconds, torch.cuda.device_count(), jobs)
+    print(f"{len(jobs)} trainings were not begun, {failed} have no result")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

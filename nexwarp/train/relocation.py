@@ -1,0 +1,40 @@
+"""Finds the surfels that the training views need least, so that density control can use their place. Not in the paper.
+
+Once the budget is used up, the paper's density control splits a surfel only where another becomes transparent. Few do,
+so that the surfels stay where the first iterations put them.
+"""
+
+from collections.abc import Iterable
+
+import torch
+
+from nexwarp.camera import Camera, reduced
+from nexwarp.distributed.ranks import Ranks
+from nexwarp.model.model import Model
+
+
+@torch.no_grad()
+def least_contributing(
+    model: Model, cameras: Iterable[Camera], share: float, ranks: Ranks | None = None
+) -> torch.Tensor:
+    """Return (N,) bool, True for the share of the surfels that contribute least to any image.
+
+    A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image to
+    which it contributes most. Images are rendered at half the size, each weighing all its pixels alike.
+
+    Args:
+        model: its N surfels and options are used.
+        cameras: of the training views, on any device.
+        share: of the surfels, 0 to 1; rounded down to whole surfels.
+        ranks: return the same on all of them; None is this process alone.
+    """
+    bare = model.bare(max_hits=0)
+    most = torch.zeros_like(bare.surfels.logit_opacities)
+    for camera in cameras:
+        out = bare.render(reduced(camera, max(camera.height // 2, 1)))
+        most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
+    if ranks is not None:
+        ranks.share_tensors([most])
+    chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
+    chosen[most.argsort(stable=True)[: int(share * len(most))]] = True
+    return chosen

@@ -1,0 +1,63 @@
+"""Trainings spread over GPUs: by value, within the time, each result kept at once."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.quality import spread as module
+from benchmarks.quality.jobs import TrainingJob
+from benchmarks.quality.results import read_results
+from benchmarks.quality.rows import ROWS
+from benchmarks.quality.spread import expected_seconds, kind_of, next_job, spread, wanted_jobs
+
+FAILS, HANGS = 10_000, 20_000  # sizes
+
+STAND_IN = """
+import json, sys, time
+words = sys.argv[1:]
+size = int(words[words.index("--size") + 1])
+time.sleep(1000 if size == 20_000 else 0.2)
+row, scene, out = (words[words.index(name) + 1] for name in ("--row", "--scenes", "--out"))
+line = {"scene": scene, "variant": "", "row": row.split(":")[0], "size": size, "seed": 0, "iterations": 30000}
+line |= {"downscale": 1, "psnr": 30.0, "ssim": 0.9, "flip": None, "lpips": None, "seconds": 1.0}
+if size == 10_000:
+    sys.exit("no memory")
+open(out, "w").write(json.dumps(line) + "\\n")
+"""
+
+
+def test_the_tables_trainings_come_by_value() -> None:
+    jobs = wanted_jobs()
+    assert len(jobs) == len(set(jobs)) and all(job.row in ROWS and expected_seconds(job) > 0 for job in jobs)
+    assert [(job.row, job.size) for job in jobs[:8]] == [("default", 40_000)] * 4 + [("default", 10_000)] * 4
+    even = {"ours": 1.0, "gsplat": 1.0}
+    assert next_job(jobs, "ours", even, 1e9) == jobs[0]
+    first = next_job(jobs, "gsplat", even, 1e9)
+    assert first is not None and kind_of(first) == "gsplat"
+    quick = next_job(jobs, "ours", even, 100.0)
+    assert quick is not None and expected_seconds(quick) < 100 < expected_seconds(jobs[0])
+    assert next_job(jobs, "ours", even | {"ours": 1e6}, 1000.0) is None
+
+
+def test_results_are_kept_failures_told_and_the_rest_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = module.command_of
+    script = tmp_path / "stand_in.py"
+    script.write_text(STAND_IN)
+    monkeypatch.setattr(module, "command_of", lambda *given: [sys.executable, str(script), *real(*given)[4:]])
+    monkeypatch.setattr(module, "expected_seconds", lambda job: 0.5)
+    sizes = (40_000, FAILS, HANGS, 5_000)
+    jobs = [TrainingJob("fox", "", "default", size, 0, 30_000) for size in sizes]
+    jobs.append(TrainingJob("fox", "", module.EXPOSED, 40_000, 0, 30_000))
+    out = tmp_path / "out.jsonl"
+    begun = time.monotonic()
+    assert spread(out, tmp_path, 6.0, 2, [*jobs]) == 2
+    assert time.monotonic() - begun < 20
+    assert set(read_results([out])) == {jobs[0], jobs[3], jobs[4]}
+    assert all(json.loads(line)["psnr"] == 30.0 for line in out.read_text().splitlines())
+    told = capsys.readouterr().out
+    assert "failed: fox default 10000: no memory" in told and "cut off: fox default 20000" in told
