@@ -40,10 +40,10 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
                     graph.capture_end()
             except Exception:
                 # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
-                newer = hasattr(torch._C, "_cuda_endAllocateToPool")  # than torch 2.4
-                end = torch._C._cuda_endAllocateToPool if newer else torch._C._cuda_endAllocateCurrentStreamToPool
+                older = "_cuda_endAllocateCurrentStreamToPool"  # its name in torch 2.4
+                name = older if hasattr(torch._C, older) else "_cuda_endAllocateToPool"
                 with suppress(RuntimeError):
-                    end(stream.device_index, pool)
+                    getattr(torch._C, name)(stream.device_index, pool)
                 generator = torch.cuda.default_generators[stream.device_index]
                 generator.graphsafe_set_state(generator.clone_state())
             raise
