@@ -40,10 +40,9 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
                     graph.capture_end()
             except Exception:
                 # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
-                older = "_cuda_endAllocateCurrentStreamToPool"  # its name in torch 2.4
-                name = older if hasattr(torch._C, older) else "_cuda_endAllocateToPool"
+                newer, older = "_cuda_endAllocateToPool", "_cuda_endAllocateCurrentStreamToPool"  # older: torch 2.4
                 with suppress(RuntimeError):
-                    getattr(torch._C, name)(stream.device_index, pool)
+                    getattr(torch._C, newer if hasattr(torch._C, newer) else older)(stream.device_index, pool)
                 generator = torch.cuda.default_generators[stream.device_index]
                 generator.graphsafe_set_state(generator.clone_state())
             raise
