@@ -40,10 +40,9 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) 
                     graph.capture_end()
             except Exception:
                 # torch then leaves its allocator, in some versions, and its random generator as if still capturing.
-                newer = hasattr(torch._C, "_cuda_endAllocateToPool")  # than torch 2.4
-                end = torch._C._cuda_endAllocateToPool if newer else torch._C._cuda_endAllocateCurrentStreamToPool
+                newer, older = "_cuda_endAllocateToPool", "_cuda_endAllocateCurrentStreamToPool"  # older: torch 2.4
                 with suppress(RuntimeError):
-                    end(stream.device_index, pool)
+                    getattr(torch._C, newer if hasattr(torch._C, newer) else older)(stream.device_index, pool)
                 generator = torch.cuda.default_generators[stream.device_index]
                 generator.graphsafe_set_state(generator.clone_state())
             raise
