@@ -1,7 +1,6 @@
 """Rendering: (antialias ->) project -> tiles -> collect -> texture -> compose (paper Sec. 4.2)."""
 
 import numbers
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -9,19 +8,18 @@ import torch
 
 from nexwarp import ops
 from nexwarp.camera import Camera
-from nexwarp.checks import check_finite, check_range, check_tensors
+from nexwarp.checks import check_range, check_tensors
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.memory import keep_freed_memory, needed_memory
 from nexwarp.ops.tiles import Order, check_order
+from nexwarp.representation.background import Color, color_tensor
 from nexwarp.representation.detail_limits import DetailLimits, limited_depths
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Activated, Surfels
 from nexwarp.representation.texture import NeuralTexture
 
 MAX_JITTER = 1000.0  # pixels
-
-Color = float | Sequence[float] | torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -307,35 +305,6 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
     depths = torch.addmv(row[3], shape.means, row[:3])
     blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, camera.pixel_focal)
     return Activated(shape.means, shape.quats, *blurred)
-
-
-def color_tensor(background: Color, like: torch.Tensor) -> torch.Tensor:
-    """Return the background as a (3,) tensor; a tensor keeps its graph."""
-    if isinstance(background, torch.Tensor):
-        if background.device.type == "cpu":
-            check_finite("background", background.detach())
-        return background.expand(3) if background.ndim == 0 else background
-    return torch.stack([like.new_full((), x) for x in background_numbers(background, like.dtype)])
-
-
-def background_numbers(background: float | Sequence[float], dtype: torch.dtype) -> list[float]:
-    """Return a background that is no tensor as three numbers; raise TypeError or ValueError where it is none."""
-    values: Sequence[object]
-    if isinstance(background, numbers.Real):
-        values = [background] * 3
-    elif isinstance(background, Iterable) and not isinstance(background, str):
-        values = list(background)
-    else:
-        raise TypeError(f"background: expected numbers or a tensor, got {type(background).__name__}")
-    if len(values) != 3:
-        raise ValueError(f"background: expected 3 values, got {len(values)}")
-    numbers_ = [float(x) for x in values if isinstance(x, numbers.Real)]
-    if len(numbers_) != 3:
-        raise TypeError(f"background: expected three numbers or a tensor, got {values}")
-    for x in numbers_:
-        if not abs(x) <= torch.finfo(dtype).max:
-            raise ValueError(f"background: expected finite values, got {x}")
-    return numbers_
 
 
 def _check_types(

@@ -16,7 +16,7 @@ from tests.render_support import assert_same
 from tests.test_model import cameras_of, full_model
 
 # None of them the default.
-OPTIONS = nw.RenderOptions(1, (0.3, 0.2, 0.1), 2, True, True, "mean", False)
+OPTIONS = nw.RenderOptions(1, (0.3, 0.2, 0.1), 2, True, True, "mean", False, "distance")
 META: dict[str, Json] = {
     "near": 0.02,
     "scene_scale": 3.0,

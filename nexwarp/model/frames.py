@@ -28,7 +28,8 @@ from nexwarp.camera import Camera, StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.memory import needed_memory
 from nexwarp.model.options import RenderOptions
-from nexwarp.render import Color, Rendering, background_numbers
+from nexwarp.render import Rendering
+from nexwarp.representation.background import Color, background_numbers
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.merged_texture import MergedTexture

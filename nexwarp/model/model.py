@@ -16,7 +16,8 @@ from nexwarp.io.json_files import Json
 from nexwarp.model import frames
 from nexwarp.model.options import RenderChanges, RenderOptions
 from nexwarp.model.render_rays import RayRendering, render_rays
-from nexwarp.render import Color, Rendering, color_tensor, render
+from nexwarp.render import Rendering, render
+from nexwarp.representation.background import Color, color_tensor
 from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import Surfels

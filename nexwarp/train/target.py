@@ -8,7 +8,8 @@ import torch
 
 from nexwarp.camera import Camera, visible_points
 from nexwarp.data import Scene
-from nexwarp.render import Color, jitter_factors
+from nexwarp.render import jitter_factors
+from nexwarp.representation.background import Color
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.train.config import Config
 from nexwarp.train.surface_losses import surface_factors
