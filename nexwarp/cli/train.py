@@ -58,7 +58,7 @@ class Train:
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
     """Largest number of surfels."""
     iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
-    """Training steps, each of one photo; schedules scale with it."""
+    """Views to train on, one a step on one GPU; schedules scale with it."""
     downscale: Annotated[int, option("N")] = 1
     """Factor by which photos are downscaled, with an area filter."""
     images: Annotated[str, option("FOLDER")] = "images"
