@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +12,11 @@ from nexwarp.errors import SceneError
 from nexwarp.model.model import Model
 from nexwarp.representation.merged_texture import MergedTexture
 from nexwarp.representation.surfels import PARAMETERS
+from nexwarp.train import seams
 from nexwarp.train.blocks import inside, merge_blocks, split_space
 from nexwarp.train.seams import SeamTrainer, near_seams, seam_scene
+from nexwarp.train.trainer import Trainer
+from tests.narrowing import present
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small, trained
 
@@ -57,6 +61,39 @@ def test_only_surfels_near_seams_and_textures_change(tiny_scene: Scene, merged: 
     for part, before in zip(after.texture.textures, merged.texture.textures, strict=True):
         assert not torch.equal(part.grid, before.grid)
     assert len(trainer.finish().surfels) == len(merged.surfels)
+
+
+def test_all_views_finish_the_model(tiny_scene: Scene, merged: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views that do not see the seams too: what they alone show keeps its colours and texture."""
+    monkeypatch.setattr(seams, "seam_scene", lambda scene, *_: dataclasses.replace(scene, train=scene.train[:1]))
+    config = small(iterations=2, exposures=False)
+    trainer = SeamTrainer(tiny_scene, copy.deepcopy(merged), config)
+    assert len(trainer.scene.train) == 1
+    whole = Trainer(tiny_scene, config, "cpu")
+    whole.surfels, whole.texture = trainer.surfels, trainer.texture
+    monkeypatch.setattr(whole, "render_options", trainer.render_options)
+    found, expected = trainer.finish(), whole.finish()
+    assert found.state_dict().keys() == expected.state_dict().keys()
+    for name, x in expected.state_dict().items():
+        assert torch.equal(found.state_dict()[name], x), name
+
+
+def test_copies_of_the_blocks_trainings_go(tiny_scene: Scene, merged: Model) -> None:
+    """A training of the merged model changes the grids without telling them."""
+    model = copy.deepcopy(merged)
+    texture = present(model.texture)
+    assert isinstance(texture, MergedTexture)
+    for part in texture.textures:
+        part.half_copy()
+    assert texture.half_copy_key() is not None
+    SeamTrainer(tiny_scene, model, small(iterations=2, exposures=False))
+    assert texture.half_copy_key() is None and all(part.half_copy_key() is None for part in texture.textures)
+
+
+@pytest.mark.parametrize("settings", [{"refine_poses": True}, {"blur_poses": 3}])
+def test_learned_poses_are_refused(tiny_scene: Scene, merged: Model, settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="refine_poses=False and blur_poses=1"):
+        SeamTrainer(tiny_scene, merged, small(iterations=2, exposures=False, **settings))
 
 
 def test_refinement_lowers_the_error_and_can_go_back(tiny_scene: Scene, merged: Model) -> None:

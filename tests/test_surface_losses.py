@@ -48,6 +48,10 @@ def test_a_plane_has_its_normal(device: torch.device) -> None:
     expected = torch.zeros_like(found)
     expected[1:-1, 1:-1] = normal @ viewmat[:3, :3]
     assert_close(found, expected, kind="value", name="normals")
+    viewmat = viewmat.clone()
+    viewmat[:3, 3] *= 1e-9  # the unit of the world does not matter
+    found = depth_normals(1e-9 * plane_depths(normal, device), viewmat, pinhole(device))
+    assert_close(found, expected, kind="value", name="normals of a tiny world")
 
 
 def test_beside_a_pixel_without_a_surface_there_is_no_normal(device: torch.device) -> None:

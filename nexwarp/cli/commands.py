@@ -74,8 +74,8 @@ class Render:
     """Exposure and white balance: `photos` predicts them from the photos near each camera, so they vary along a path;
     `mean` takes the mean of all photos for every image."""
     order: Annotated[str | None, option("{depth,distance}", "that of the model, depth after a training")] = None
-    """Order in which surfels are blended: by their z-depth, the default of training, or by their distance from the camera, so
-    that pictures from one place agree where they overlap, and with panoramas (docs/cameras.md)."""
+    """Order in which surfels are blended: by their z-depth, the default of training, or by their distance from the
+    camera, so that pictures from one place agree where they overlap, and with panoramas (docs/cameras.md)."""
     device: Device_ = None
     """Device to render on."""
 

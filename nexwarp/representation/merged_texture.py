@@ -1,6 +1,6 @@
 """The texture of a model that was merged from blocks of space: a neural texture for each block."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 import torch
 from torch import nn
@@ -70,6 +70,16 @@ class MergedTexture(NeuralTexture):
     def half_precision(self, value: bool) -> None:
         for part in self.textures:
             part.half_precision = value
+
+    def drop_half_copy(self) -> None:
+        """Drop the half-precision copies of all parts."""
+        for part in self.textures:
+            part.drop_half_copy()
+
+    def half_copy_key(self) -> Hashable | None:
+        """Return a key that changes where a copy does; None where no part has one."""
+        keys = tuple(part.half_copy_key() for part in self.textures)
+        return keys if any(keys) else None
 
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
         """Return how many values an evaluation keeps for each point, and their dtype; see `NeuralTexture`."""

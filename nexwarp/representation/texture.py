@@ -1,6 +1,7 @@
 """The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
+from collections.abc import Hashable
 from typing import TypedDict
 
 import torch
@@ -154,7 +155,7 @@ class NeuralTexture(nn.Module):
         """Make each evaluation in half precision convert the grid again."""
         self._half_copy = None
 
-    def half_copy_key(self) -> tuple[int, int, int] | None:
+    def half_copy_key(self) -> Hashable | None:
         """Return what changes when `half_copy` would be made anew; None without a copy."""
         return None if self._half_copy is None else (self._half_copy[0].data_ptr(), *self._half_copy[1])
 

@@ -126,8 +126,8 @@ class Config:
     `nexwarp eval --refine-poses` fits them, too."""
     blur_poses: int = 1
     """For photos with motion blur, an odd number above 1, such as 3: learn how each training camera moves during its
-    exposure, and compare the photo with the mean of renderings from this many poses on the way. Steps take that many
-    times as long; 1 is for sharp photos."""
+    exposure, and compare the photo with the mean of renderings from this many poses on the way. Steps take at least
+    that many times as long; 1 is for sharp photos."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""

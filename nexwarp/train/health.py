@@ -1,7 +1,7 @@
 """Health of a training: numbers that are not finite, going back from them, and memory that does not suffice."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -94,12 +94,12 @@ def describe(name: str, tensor: torch.Tensor) -> str:
 
 
 def watched_tensors(
-    parameters: Mapping[str, torch.Tensor], optimizer: torch.optim.Optimizer
+    parameters: Iterable[tuple[str, torch.Tensor]], optimizer: torch.optim.Optimizer
 ) -> dict[str, torch.Tensor]:
     """Return parameters and optimizer state, which must stay finite, by the names that a report gives them."""
     watched: dict[str, torch.Tensor] = {}
     moments = {"exp_avg": "gradient", "exp_avg_sq": "squared gradient"}
-    for name, parameter in parameters.items():
+    for name, parameter in parameters:
         # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
         for key, value in optimizer.state.get(parameter, {}).items():
             if isinstance(value, torch.Tensor) and value.shape == parameter.shape:

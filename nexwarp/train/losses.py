@@ -43,7 +43,7 @@ class LossWeights:
     a tenth of the run on."""
     poses: float = 0.1
     """With `refine_poses` or `blur_poses`: factor of the squared pose correction, which keeps poses near the given
-    ones, and of the squared motion during the exposure, which keeps it short."""
+    ones, and of the squared motion during the exposure."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)

@@ -10,7 +10,7 @@ import dataclasses
 import torch
 
 from nexwarp.camera import Camera, visible_points
-from nexwarp.data import Scene
+from nexwarp.data import Scene, View
 from nexwarp.errors import SceneError
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
@@ -67,10 +67,15 @@ class SeamTrainer(Trainer):
 
         Raises:
             TypeError: the model is not merged.
+            ValueError: poses or motions are to be learned, which the frozen surfels would not follow.
             SceneError: no view sees the seams.
         """
         if not isinstance(model.texture, MergedTexture):
             raise TypeError("model: expected a merged model with a texture for each block")
+        if config.refine_poses or config.blur_poses > 1:
+            raise ValueError("config: expected refine_poses=False and blur_poses=1 for the seams of blocks")
+        model.texture.drop_half_copy()  # of the blocks' trainings: this one does not refresh them
+        self.whole = scene
         self.start, cells = model, model.texture.cells
         self.trained = near_seams(model.surfels.means.detach(), cells, band * scene.scale)
         config = dataclasses.replace(
@@ -85,6 +90,10 @@ class SeamTrainer(Trainer):
     def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
         assert self.start.texture is not None
         return self.start.surfels, self.start.texture
+
+    def _finish_views(self) -> tuple[list[View], list[Camera]]:
+        # All views: surfels that none of the seams' views shows would lose their colours and texture.
+        return self.whole.train, [view.camera.to(self.device) for view in self.whole.train]
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         optimizer = super()._make_optimizer()

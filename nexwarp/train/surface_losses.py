@@ -59,8 +59,10 @@ def depth_normals(depths: torch.Tensor, viewmat: torch.Tensor, pinhole: ops.Pinh
         (H, W, 3) unit normals that face the camera, world frame; 0 on the border and beside pixels without a surface.
     """
     points = ops.unproject(depths[..., None], viewmat, pinhole)[0][:, :, 0]
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    # Relative to the depth, so that the unit of the world does not matter.
+    scale = torch.where(depths > 0, depths, 1.0).detach()[1:-1, 1:-1, None]
+    across = (points[1:-1, 2:] - points[1:-1, :-2]) / scale
+    down = (points[2:, 1:-1] - points[:-2, 1:-1]) / scale
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
     known = depths > 0
     known = known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1] & known[:-2, 1:-1]

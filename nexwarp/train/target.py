@@ -134,7 +134,8 @@ class TargetMaker:
             return target
         camera, device = target.camera, self.views.device
         key = (index, camera.width)
-        if key not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
+        moves = self.poses is not None and self.poses.corrections.requires_grad
+        if key not in self.points or moves:  # a pose that moves sees them elsewhere
             mask = target.counts if target.empty is None else ~target.empty
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)

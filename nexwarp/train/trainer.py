@@ -8,8 +8,9 @@ from pathlib import Path
 
 import torch
 
+from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
-from nexwarp.data import Scene
+from nexwarp.data import Scene, View
 from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
@@ -292,9 +293,11 @@ class Trainer:
         self.texture.drop_half_copy()
         settings = FinishSettings(self.config.smooth_sh, self.config.footprints, self.config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
-            cameras = self.views.refined_cameras(self.poses)
-            views = with_cameras(self.scene.train, cameras)
-            return finish_model(self.model(), views, cameras, self.exposures, settings, observe)
+            return finish_model(self.model(), *self._finish_views(), self.exposures, settings, observe)
+
+    def _finish_views(self) -> tuple[list[View], list[Camera]]:
+        cameras = self.views.refined_cameras(self.poses)
+        return with_cameras(self.scene.train, cameras), cameras
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
@@ -305,8 +308,7 @@ class Trainer:
         return StepFacts(self.iteration, self.checked, len(self.surfels), self.rate_factor)
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        state = watched_tensors(dict(self._named_parameters()), self.optimizer)
-        return state | {"densify.errors": self.densifier.errors}
+        return watched_tensors(self._named_parameters(), self.optimizer) | {"densify.errors": self.densifier.errors}
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write a checkpoint, the model as it is, and the cameras into a folder, which the commands open."""
@@ -351,8 +353,7 @@ class Trainer:
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
-            found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            told = one_line(found)  # torch's go over several lines
+            told = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
 
     def checkpoint_size(self) -> int:
@@ -366,10 +367,8 @@ class Trainer:
         tensors = learned_tensors(self.surfels, self.texture, self.poses) | moments
         tensors |= {"densify.errors": self.densifier.errors, **numbers}
         state = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order), **generators}
-        state |= {"views": self.views.fingerprint(), "scene": self._scene_digest}
-        state |= {"rate_factor": self.rate_factor, "config": self.config.as_dict()}
-        if optimizer is not None:
-            state["optimizer"] = optimizer
+        state |= {"views": self.views.fingerprint(), "scene": self._scene_digest, "config": self.config.as_dict()}
+        state |= {"rate_factor": self.rate_factor} | ({} if optimizer is None else {"optimizer": optimizer})
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
 
     def load_snapshot(self, snapshot: Snapshot) -> None:
@@ -389,8 +388,7 @@ class Trainer:
         if self.graphs is not None:
             self.graphs.clear()
         self.iteration, self.seconds, self.order = state["iteration"], state["seconds"], list(state["order"])
-        self.rate_factor = state["rate_factor"]
-        self.loss_log, self.checked = LossLog(), self.iteration
+        self.rate_factor, self.loss_log, self.checked = state["rate_factor"], LossLog(), self.iteration
 
     @cached_property
     def _scene_digest(self) -> str:
