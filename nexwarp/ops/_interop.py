@@ -66,6 +66,16 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
+@functools.lru_cache(maxsize=64)
+def _array_at(pointer: int, length: int, dtype: type, kind: str, index: int | None) -> wp.array:
+    return wp.array(ptr=pointer, dtype=dtype, shape=(length,), device=_device(kind, index))
+
+
+def warp_array(tensor: torch.Tensor, dtype: type) -> wp.array:
+    """View a contiguous tensor (length,) as Warp's own functions take it; the view does not keep the tensor alive."""
+    return _array_at(tensor.data_ptr(), len(tensor), dtype, tensor.device.type, tensor.device.index)
+
+
 @functools.cache
 def _device(kind: str, index: int | None) -> wp.Device:
     start_warp()
@@ -86,7 +96,10 @@ def stream_of(tensor: torch.Tensor) -> wp.Stream | None:
     """Torch's current stream on the tensor's device, None on a CPU."""
     if tensor.device.type == "cpu":
         return None
-    return stream_on(torch.cuda.current_stream(tensor.device))
+    start_warp()
+    index = tensor.device.index
+    # The stream's address alone: making torch's own object takes ten times as long.
+    return _stream(index, torch._C._cuda_getCurrentRawStream(index))
 
 
 def stream_on(stream: torch.cuda.Stream) -> wp.Stream:

@@ -5,6 +5,7 @@ of nexwarp do not know these modules. `warp.config.log_level = warp.LOG_INFO` af
 """
 
 import ctypes
+import functools
 import os
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ if wp.config.log_level == wp.LOG_INFO:
     wp.config.log_level = wp.LOG_WARNING
 
 
+@functools.cache  # looking for the driver takes as long as a launch
 def start_warp() -> None:
     """Initialise Warp, which does nothing the second time. Without a driver, Warp's warning of that is not printed."""
     if _has_driver():

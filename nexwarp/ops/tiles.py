@@ -8,7 +8,7 @@ import warp as wp
 from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
 from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, warp_streams
+from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
@@ -197,7 +197,7 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     """Sort the first `count` pairs by the low `bits` bits of their keys, stably, in place."""
     if count == 0:
         return
-    sorted_keys, sorted_values = wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)
+    sorted_keys, sorted_values = warp_array(keys, wp.uint32), warp_array(values, wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)  # type: ignore[arg-type]  # no ctypes
 
@@ -206,7 +206,7 @@ def _scan(counts: torch.Tensor) -> None:
     """Turn counts into ends in place."""
     if len(counts) == 0:
         return
-    ends = wp.from_torch(counts, dtype=wp.int64)
+    ends = warp_array(counts, wp.int64)
     with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
         wp.utils.array_scan(ends, ends, inclusive=True)  # type: ignore[arg-type]  # no ctypes
 
