@@ -47,7 +47,7 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     """Make the kernels that count and emit (tile, surfel) entries, a thread a surfel in depth order.
 
     `count` gives each surfel's entries. `emit` reads the sums of these along the order, `totals`, and repeats them as
-    `ends`, where a number that an int32 cannot hold is the largest int32. On a CPU, `entries` gets each entry's own index and
+    `ends`, where a number that an int32 cannot hold is the largest int32. `entries` gets each entry's own index, and
     `surfels` its surfel; without `surfels`, a null array, `entries` gets the surfel. Places of the lists behind the
     last entry get the tile `no_tile`.
     """
