@@ -12,6 +12,7 @@ from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
+from nexwarp.kernels.expose import expose_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
@@ -74,7 +75,7 @@ def thread_kernels(
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
     yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
-    for kernels in (unproject_kernels(real), compose_kernels(real)):
+    for kernels in (unproject_kernels(real), compose_kernels(real), expose_kernels(real)):
         yield from (kernels.forward, kernels.backward)
     yield from (activate_kernels(real).forward, activate_kernels(real).backward)
     yield from (antialias_kernels(real).forward, limit_depths_kernel(real))

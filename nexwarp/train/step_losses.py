@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 import torch
 
+from nexwarp.ops import expose
 from nexwarp.render import Rendering
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
@@ -36,17 +37,17 @@ def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]
     return dict(losses or {})
 
 
-def as_taken(out: Rendering, target: Target) -> Rendering:
-    """Return a rendering at the exposure of the photo that it is compared with.
+def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
+    """Return a rendering at the exposure of the photo that it is compared with; without `plain`, its plain colours not.
 
     Where the photo is saturated, a brighter image counts as equal to it: it has no error and no gradient there.
     Clipped photos of different exposures would otherwise ask for different colours of the same bright surface.
     """
     if target.exposure is None:
         return out
-    image, plain, textured = (x * target.exposure for x in (out.image, out.plain, out.textured))
-    clipped = (target.photo >= SATURATION) & (image > target.photo)
-    return dataclasses.replace(out, image=torch.where(clipped, target.photo, image), plain=plain, textured=textured)
+    image, textured = expose(out.image, out.textured, target.exposure, target.photo, SATURATION)
+    colors = out.plain * target.exposure if plain else out.plain
+    return dataclasses.replace(out, image=image, plain=colors, textured=textured)
 
 
 def step_losses(

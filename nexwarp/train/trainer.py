@@ -214,7 +214,7 @@ class Trainer:
         try:
             target = refined(target, self.poses)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
-            taken = as_taken(out, target)
+            taken = as_taken(out, target, plain=bool(self.own_losses))
             given = (taken, target, self.surfels, self.texture, self.config)
             own, poses, grid = self.own_losses, self.poses, fused is None
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
