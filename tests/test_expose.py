@@ -21,7 +21,7 @@ def reference(
 @pytest.mark.parametrize("falloff", [False, True])
 def test_exposed_images_and_gradients_are_torchs(device: torch.device, dtype: torch.dtype, falloff: bool) -> None:
     image, textured = (torch.rand(7, 9, 3, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    exposure = 0.5 + torch.rand((7, 9, 3) if falloff else (3,), dtype=torch.float64)
+    exposure = 1.0 + torch.rand((7, 9, 3) if falloff else (3,), dtype=torch.float64)
     photo = (1.5 * torch.rand(7, 9, 3, dtype=torch.float64)).clamp(max=1.0)
     assert ((photo >= SATURATION) & (image * exposure > photo)).any()
     signals = [torch.randn(7, 9, 3, dtype=torch.float64) for _ in range(2)]
