@@ -142,27 +142,14 @@ def walk_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNamespac
         focal: vec2,
     ):
         """(number of surfels staged, this lane's surfel): what `candidate` leaves of the lanes' places k."""
-        i = int(-1)
-        a = vec4()
-        b = vec4()
-        n = vec4()
-        c = vec4()
-        if k < end:
-            i = surfel_at(k, surfel_ids, order, overflow)
-            if warp_size() > 1:
-                center = vec3()
-                if wp.static(low_pass):
-                    center = centers[i]
-                a = load(records, i, 0)
-                b = load(records, i, 1)
-                n = load(records, i, 2)
-                c = load(records, i, 3)
-                if misses_block(a, b, n, c[3], reaches[i], limits[i], center, middle, half, focal):
-                    i = int(-1)
+        i = candidate(k, end, surfel_ids, order, overflow, records, centers, limits, reaches, middle, half, focal)
         chosen = ballot(wp.where(i >= 0, 1, 0))
         sync_warp()  # the batch before has been read
         if i >= 0:
-            staged.put(lanes_below(chosen), i, k, a, b, n, c, records)
+            a = load(records, i, 0)
+            b = load(records, i, 1)
+            n = load(records, i, 2)
+            staged.put(lanes_below(chosen), i, k, a, b, n, load(records, i, 3), records)
         sync_warp()
         return wp.vec2i(population(chosen), i)
 
