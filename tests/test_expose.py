@@ -28,14 +28,15 @@ def test_exposed_images_and_gradients_are_torchs(device: torch.device, dtype: to
     expected = reference(image, textured, exposure, photo)
     gradients = torch.autograd.grad(expected, (image, textured), signals)
     leaves = [x.detach().to(device, dtype).requires_grad_() for x in (image, textured)]
-    given = (exposure.to(device, dtype), photo.to(device, dtype), SATURATION)
-    found = expose(*leaves, *given)
+    given = [x.to(device, dtype) for x in (exposure, photo)]
+    found = expose(leaves[0], leaves[1], given[0], given[1], SATURATION)
     for x, y in zip(found, expected, strict=True):
         assert x.dtype == dtype
         assert_close(x, y, kind="value", name="image")
     for x, y in zip(torch.autograd.grad(found, leaves, [x.to(leaves[0]) for x in signals]), gradients, strict=True):
         assert_close(x, y, kind="gradient", name="gradient")
-    (alone,) = torch.autograd.grad(expose(*leaves, *given)[1], leaves[1], signals[1].to(leaves[1]))
+    colors = expose(leaves[0], leaves[1], given[0], given[1], SATURATION)[1]
+    (alone,) = torch.autograd.grad(colors, leaves[1], signals[1].to(leaves[1]))
     assert_close(alone, gradients[1], kind="gradient", name="gradient alone")
 
 

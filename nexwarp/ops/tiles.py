@@ -203,7 +203,7 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
         return
     sorted_keys, sorted_values = warp_array(keys, wp.uint32), warp_array(values, wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
-        wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)  # type: ignore[arg-type]  # no ctypes
+        wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)
 
 
 def _scan(counts: torch.Tensor) -> None:
@@ -212,7 +212,7 @@ def _scan(counts: torch.Tensor) -> None:
         return
     ends = warp_array(counts, wp.int64)
     with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
-        wp.utils.array_scan(ends, ends, inclusive=True)  # type: ignore[arg-type]  # no ctypes
+        wp.utils.array_scan(ends, ends, inclusive=True)
 
 
 def _total(totals: torch.Tensor, tiles: int) -> int:
