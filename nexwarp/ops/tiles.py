@@ -172,7 +172,7 @@ def _sorted_entries(
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
     values, tile_ids = ends.new_empty(2 * room), ends.new_empty(2 * room)
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
-    surfels = array(ends.new_zeros(room) if exact else None, wp.int32)
+    surfels = array(ends.new_empty(room) if exact else None, wp.int32)
     emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
     launch(ends, emit, threads, emission, [array(ends, wp.int32), *emitted])
     if not threads:
