@@ -3,10 +3,12 @@
 python -m benchmarks.sanitize --device cpu --sweep      # without compute-sanitizer, which sees CUDA alone
 """
 
+import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -17,12 +19,17 @@ import nexwarp as nw
 from nexwarp.determinism import deterministic
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_tile_builds
+from nexwarp.kernels.rays import collect_rays_kernel, ray_list_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
+from nexwarp.kernels.tsdf import fuse_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops._interop import array, launch
+from nexwarp.ops.expose import expose
 from nexwarp.ops.photometric import photometric_terms
+from nexwarp.ops.rays import TILE_SIZE
 from nexwarp.ops.ssim import weighted_dssim
+from nexwarp.ops.tsdf import DistanceField
 from nexwarp.run.warmup import Build, compile_all
 from nexwarp.train.adam import FusedAdam
 
@@ -48,9 +55,11 @@ class Sweep:
 
 
 def catalogue(device: torch.device, hits: Sequence[int]) -> list[wp.Kernel]:
-    """Return the kernels of a device for some K."""
+    """Return the kernels of a device for some K, those of cameras of any rays and of meshes included."""
     cpu = device.type == "cpu"
-    return list(all_kernels(wp.float32, wp.float32 if cpu else wp.float16, max_hits=hits, cpu=cpu))
+    kernels = list(all_kernels(wp.float32, wp.float32 if cpu else wp.float16, max_hits=hits, cpu=cpu))
+    rays = [collect_rays_kernel(wp.float32, K, TILE_SIZE) for K in hits]
+    return [*kernels, *rays, ray_list_kernels(wp.float32).lists, fuse_kernel()]
 
 
 def compile_catalogue(device: torch.device, hits: Sequence[int] = range(MAX_HITS + 1)) -> None:
@@ -67,7 +76,10 @@ def compile_catalogue(device: torch.device, hits: Sequence[int] = range(MAX_HITS
 
 
 def sweep(
-    device: torch.device, hits: Sequence[int] = range(MAX_HITS + 1), sizes: Sequence[tuple[int, int]] = SIZES
+    device: torch.device,
+    hits: Sequence[int] = range(MAX_HITS + 1),
+    sizes: Sequence[tuple[int, int]] = SIZES,
+    part: tuple[int, int] = (0, 1),
 ) -> Sweep:
     """Launch every kernel of the catalogue.
 
@@ -75,35 +87,47 @@ def sweep(
         device: CUDA or CPU.
         hits: K.
         sizes: widths and heights, in turns.
+        part: (i, n) does every n-th rendering from the i-th on.
 
     Raises:
         RuntimeError: a result is not finite.
     """
-    size = itertools.cycle(sizes)
-    fixed_points = (False, True) if device.type == "cuda" else (False,)
+    first, parts = part
     renderings = 0
     with _launched() as launched:
-        for fixed, low_pass, errors, K in itertools.product(fixed_points, (False, True), (False, True), hits):
-            with deterministic(fixed):
-                _render(device, next(size), K, low_pass=low_pass, errors=errors)
-            renderings += 1
-        for (degree, features), clamp in itertools.product(enumerate(FEATURES), (False, True)):
-            for fixed in fixed_points:
-                with deterministic(fixed):
-                    _render(device, next(size), 2, degree=degree, features=features, clamp=clamp)
-                renderings += 1
-        for width, height in sizes:
-            _losses(device, width, height)
-            _render(device, (width, height), 2, surfels=0)
-            renderings += 1
-        if device.type == "cuda":  # where renderings add by atomics instead
-            _reduce(device)
-            for features in (2, 4):
-                _texture(device, next(size), features)
+        for job in itertools.islice(_jobs(device, hits, sizes), first, None, parts):
+            renderings += job()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
     names = {kernel.module.name for kernel in catalogue(device, hits)}
     return Sweep(renderings, len(names & launched), sorted(names - launched))
+
+
+def _jobs(device: torch.device, hits: Sequence[int], sizes: Sequence[tuple[int, int]]) -> Iterator[Callable[[], int]]:
+    """Yield what a sweep does; each returns how many renderings it was."""
+    size = itertools.cycle(sizes)
+    fixed_points = (False, True) if device.type == "cuda" else (False,)
+
+    def render(fixed: bool, size: tuple[int, int], max_hits: int, **options: Any) -> int:
+        with deterministic(fixed):
+            _render(device, size, max_hits, **options)
+        return 1
+
+    for fixed, low_pass, errors, K in itertools.product(fixed_points, (False, True), (False, True), hits):
+        yield partial(render, fixed, next(size), K, low_pass=low_pass, errors=errors)
+    for (degree, features), clamp in itertools.product(enumerate(FEATURES), (False, True)):
+        for fixed in fixed_points:
+            yield partial(render, fixed, next(size), 2, degree=degree, features=features, clamp=clamp)
+    for width, height in sizes:
+        yield partial(_losses, device, width, height)
+        yield partial(render, False, (width, height), 2, surfels=0)
+    for K in hits:
+        yield partial(_rays, device, next(size), K)
+    yield partial(_fuse, device, 33, 47)
+    if device.type == "cuda":  # where renderings add by atomics instead
+        yield partial(_reduce, device)
+        for features in (2, 4):
+            yield partial(_texture, device, next(size), features)
 
 
 @contextmanager
@@ -172,24 +196,64 @@ def _render(
         raise RuntimeError(f"a result is not finite: {size[0]}x{size[1]}, K = {max_hits}")
 
 
-def _losses(device: torch.device, width: int, height: int) -> None:
-    """Differentiate the losses that have kernels, on images of noise."""
+def _rays(device: torch.device, size: tuple[int, int], max_hits: int) -> int:
+    """Render with a camera of each kind of rays; returns how many."""
+    width, height = size
+    made, pinhole = _scene(device, width, height, SURFELS)
+    viewmat = pinhole.viewmat.detach()
+    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, 16, 1, 1).to(device)
+    model = nw.Model(made, texture, options=nw.RenderOptions(max_hits=max_hits))
+    cameras = (
+        nw.RayCamera.pinhole(dataclasses.replace(pinhole, viewmat=viewmat)),
+        nw.RayCamera.fisheye(viewmat, pinhole.K, (0.1, 0.0, 0.0, 0.0), width, height),
+        nw.RayCamera.panorama(viewmat, 2 * max(height, 2)),
+        nw.RayCamera.orthographic(viewmat, width, height, 3.0 / max(width, height)),
+    )
+    with torch.no_grad():
+        for camera in cameras:
+            out = model.render(camera)
+            found = (out.image, out.alpha, out.depths, out.weights, out.normals, out.expected_depth, out.median_depth)
+            if not all(bool(torch.isfinite(x).all()) for x in found):
+                raise RuntimeError(f"a result is not finite: rays, {size[0]}x{size[1]}, K = {max_hits}")
+    return len(cameras)
+
+
+def _fuse(device: torch.device, width: int, height: int) -> int:
+    """Fuse a depth image with holes into a distance field; returns 0 renderings."""
+    _, camera = _scene(device, width, height, 0)
+    camera = dataclasses.replace(camera, viewmat=camera.viewmat.detach())
+    depths = 1.0 + torch.rand(height, width, generator=torch.Generator().manual_seed(0)).to(device)
+    depths[::5] = 0.0
+    field = DistanceField(0.1, 0.4, device)
+    field.reserve(camera, depths, 10_000)
+    field.allocate()
+    for _ in range(2):
+        field.fuse(camera, depths, depths[..., None].expand(height, width, 3).contiguous() * 0.5)
+    if not (bool(torch.isfinite(field.distances).all()) and float(field.weights.max()) == 2.0):
+        raise RuntimeError("a depth image is not fused")
+    return 0
+
+
+def _losses(device: torch.device, width: int, height: int) -> int:
+    """Differentiate the losses that have kernels, on images of noise; returns 0 renderings."""
     generator = torch.Generator().manual_seed(0)
     image, textured, target = torch.rand(3, height, width, 3, generator=generator).to(device)
     weights = torch.rand(height, width, 2, generator=generator).to(device)
     leaves = image, textured, weights = [x.clone().requires_grad_() for x in (image, textured, weights)]
-    terms = photometric_terms(image, textured, weights, target, l1=1.0, texture=1.0, alpha=1.0)
-    total = weighted_dssim(image, target, 0.2)
+    exposed = expose(image, textured, torch.full((3,), 1.2, device=device), target, 0.9)
+    terms = photometric_terms(*exposed, weights, target, l1=1.0, texture=1.0, alpha=1.0)
+    total = weighted_dssim(exposed[0], target, 0.2)
     for term in terms:
         assert term is not None
         total = total + term
     total.backward()
     if not all(x.grad is not None and bool(torch.isfinite(x.grad).all()) for x in leaves):
         raise RuntimeError(f"a gradient of the losses is not finite: {width}x{height}")
+    return 0
 
 
-def _texture(device: torch.device, size: tuple[int, int], features: int) -> None:
-    """Look points up in a texture of the shape that the fused kernels take, differentiate, and take a step of Adam."""
+def _texture(device: torch.device, size: tuple[int, int], features: int) -> int:
+    """Look points up in a texture that the fused kernels take, differentiate, take a step of Adam; 0 renderings."""
     width, height = size
     texture = nw.NeuralTexture(32 // features, 2**8, features, 1.0, 6.0).to(device)
     generator = torch.Generator().manual_seed(0)
@@ -203,10 +267,11 @@ def _texture(device: torch.device, size: tuple[int, int], features: int) -> None
     found = [positions.grad, optimizer.grid_loss, *texture.parameters()]
     if not all(x is not None and bool(torch.isfinite(x).all()) for x in found):
         raise RuntimeError(f"a result of the fused texture is not finite: {width}x{height}, F = {features}")
+    return 0
 
 
-def _reduce(device: torch.device) -> None:
-    """Launch the kernels that add up slots, for elements of every type."""
+def _reduce(device: torch.device) -> int:
+    """Launch the kernels that add up slots, for elements of every type; returns 0 renderings."""
     real = wp.float32
     order = torch.tensor([2, 0, 1], dtype=torch.int32, device=device)
     ends = torch.tensor([3, 3, 8], dtype=torch.int32, device=device)
@@ -216,3 +281,4 @@ def _reduce(device: torch.device) -> None:
         launch(slots, reduce_slots_kernel(dtype), 3, inputs, [array(sums, dtype)])
         if not torch.equal(sums.flatten(1)[:, 0].cpu(), torch.tensor([0.0, 5.0, 3.0])):
             raise RuntimeError("slots are not added up")
+    return 0

@@ -12,6 +12,7 @@ makes each array an allocation of its own.
 """
 
 import dataclasses
+import itertools
 import os
 import re
 import shutil
@@ -158,6 +159,10 @@ class Sanitize:
     """Where; compute-sanitizer sees CUDA alone."""
     sweep: bool = False
     """Also launch every kernel of the catalogue, with K of 0 to 8 and images of odd sizes."""
+    parts: int = 1
+    """With --tool: processes that share the sweep, for each tool."""
+    part: int | None = None
+    """Do this one of the parts alone, from 0 on."""
     extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
     """More options for compute-sanitizer, such as "--report-api-errors no"."""
     compile_first: bool = False
@@ -171,16 +176,22 @@ class Sanitize:
         if self.device == "cuda" and not torch.cuda.is_available():
             print("device: expected a CUDA device, found none", file=sys.stderr)
             return 2
+        if self.parts < 1 or not 0 <= (self.part or 0) < self.parts:
+            print(f"--part: expected 0 to {self.parts - 1}, got {self.part}", file=sys.stderr)
+            return 2
         device = torch.device("cuda", torch.cuda.current_device()) if self.device == "cuda" else torch.device("cpu")
         if self.compile_first:
             compile_catalogue(device)
         isolate_arrays(device)
-        done = work(device)
-        print(f"{done['steps']} training steps and {done['frames']} frames on {self.device}", flush=True)
+        if not self.part:
+            done = work(device)
+            print(f"{done['steps']} training steps and {done['frames']} frames on {self.device}", flush=True)
         if not self.sweep:
             return 0
-        swept = sweep(device)
+        swept = sweep(device, part=(0, 1) if self.part is None else (self.part, self.parts))
         print(f"{swept.kernels} kernels in {swept.renderings} renderings on {self.device}", flush=True)
+        if self.part is not None:
+            return 0
         if swept.missing:
             print(f"not launched: {', '.join(swept.missing)}", file=sys.stderr)
         return 1 if swept.missing else 0
@@ -200,10 +211,12 @@ class Sanitize:
         if alone.returncode != 0:
             print(f"without a tool it ended with exit code {alone.returncode}", file=sys.stderr)
             return 1
-        with ThreadPoolExecutor(len(tools)) as pool:
-            reports = list(pool.map(lambda tool: check(tool, sanitizer, command, self.extra.split()), tools))
+        shares = [["--parts", str(self.parts), "--part", str(i)] for i in range(self.parts)] if self.parts > 1 else [[]]
+        jobs = list(itertools.product(tools, shares))
+        with ThreadPoolExecutor(len(jobs)) as pool:
+            reports = list(pool.map(lambda job: check(job[0], sanitizer, command + job[1], self.extra.split()), jobs))
         unknown = sum(report.errors is None for report in reports)
-        told = f"{sum(report.errors or 0 for report in reports)} errors found by {len(reports) - unknown} tools"
+        told = f"{sum(report.errors or 0 for report in reports)} errors found in {len(reports) - unknown} runs"
         print(told + (f"; {unknown} ended without a summary" if unknown else ""), flush=True)
         return 0 if all(report.clean for report in reports) else 1
 

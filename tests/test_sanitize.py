@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
-from benchmarks import sanitize
+from benchmarks import kernel_sweep, sanitize
 from benchmarks.kernel_sweep import SIZES, Sweep, catalogue, compile_catalogue, sweep
 from benchmarks.sanitize import Sanitize, check, find_tool, parse, work
 
@@ -93,7 +94,7 @@ def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsy
     assert Sanitize(tool="memcheck,racecheck")() == 1
     out = capsys.readouterr().out
     assert "memcheck: ERROR SUMMARY: 1 error: NOT CLEAN" in out and "(0 errors, 0 warnings): clean" in out
-    assert out.splitlines()[-1] == "1 errors found by 2 tools"
+    assert out.splitlines()[-1] == "1 errors found in 2 runs"
     assert Sanitize(tool="racecheck")() == 0
 
 
@@ -135,8 +136,31 @@ def test_a_tool_without_a_summary_is_counted(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sanitize, "find_tool", lambda: path)
     monkeypatch.setattr(sys, "executable", "true")
     assert Sanitize(tool="memcheck,synccheck", sweep=True)() == 1
-    assert capsys.readouterr().out.splitlines()[-1] == "0 errors found by 0 tools; 2 ended without a summary"
+    assert capsys.readouterr().out.splitlines()[-1] == "0 errors found in 0 runs; 2 ended without a summary"
     assert all(line.endswith("--device cuda --sweep 1") for line in (tmp_path / "asked").read_text().splitlines())
+
+
+def test_parts_share_the_sweep(tmp_path, monkeypatch):
+    """Each tool is run once for each part, and parts are told to be one."""
+    path = stub(tmp_path, 'echo "========= ERROR SUMMARY: 0 errors"')
+    monkeypatch.setattr(sanitize, "find_tool", lambda: path)
+    monkeypatch.setattr(sys, "executable", "true")
+    assert Sanitize(tool="memcheck,initcheck", sweep=True, parts=2)() == 0
+    asked = sorted(line.split("--device cuda ")[1] for line in (tmp_path / "asked").read_text().splitlines())
+    assert asked == [f"--sweep --parts 2 --part {i} 1" for i in (0, 0, 1, 1)]
+
+
+def test_a_part_that_is_none_is_one_line(capsys):
+    assert Sanitize(device="cpu", parts=2, part=2)() == 2
+    assert capsys.readouterr().err == "--part: expected 0 to 1, got 2\n"
+
+
+def test_parts_are_the_whole(monkeypatch):
+    """Every job of a sweep belongs to one part."""
+    done = []
+    monkeypatch.setattr(kernel_sweep, "_jobs", lambda *_: (lambda i=i: done.append(i) or 1 for i in range(7)))
+    assert [sweep(torch.device("cpu"), (2,), part=(i, 3)).renderings for i in range(3)] == [3, 2, 2]
+    assert sorted(done) == list(range(7))
 
 
 def test_the_sweep_launches_every_kernel_of_some_k(device):
@@ -155,7 +179,7 @@ def test_the_sweep_launches_every_kernel_on_a_cpu(capsys):
 
 def test_a_kernel_that_no_rendering_launches_is_named(monkeypatch, capsys):
     monkeypatch.setattr(sanitize, "work", lambda _: {"steps": 0, "frames": 0})
-    monkeypatch.setattr(sanitize, "sweep", lambda _: Sweep(3, 1, ["compose_1a2b"]))
+    monkeypatch.setattr(sanitize, "sweep", lambda _, part: Sweep(3, 1, ["compose_1a2b"]))
     assert Sanitize(device="cpu", sweep=True)() == 1
     out, err = capsys.readouterr()
     assert "1 kernels in 3 renderings on cpu" in out and err == "not launched: compose_1a2b\n"
