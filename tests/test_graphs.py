@@ -131,16 +131,19 @@ def test_resuming_changes_nothing(tiny_scene: Scene, tmp_path: Any) -> None:
 
 
 def test_sizes_beyond_the_first_few_are_launched(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    launched = trained(tiny_scene, cuda_graphs=False)
+    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
     monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
-    replayed = trained(tiny_scene)
-    assert replayed.graphs is not None and len(replayed.graphs.stages) == 1
+    monkeypatch.setattr(step_graphs, "FORGOTTEN", 10**6)
+    replayed = trained(tiny_scene, coarse=0.5)
+    assert replayed.graphs is not None
+    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
+    assert widths == {tiny_scene.train[0].camera.width // 2}
     assert_same_state(replayed, launched)
 
 
 def test_sizes_of_long_ago_make_room(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
-    monkeypatch.setattr(step_graphs, "MOST_KINDS", 2)
+    monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
     monkeypatch.setattr(step_graphs, "FORGOTTEN", 20)
     replayed = trained(tiny_scene, coarse=0.5)
     assert replayed.graphs is not None
