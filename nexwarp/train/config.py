@@ -109,6 +109,9 @@ class Config:
     """Strength of SH smoothing, a ridge regression after training that makes a surfel's colour smooth in directions
     that no training view has. A larger strength changes the colours in the training views more; 0 keeps the SH as
     trained."""
+    refit: int = 0
+    """With `smooth_sh`: number of iterations, of a run of 30,000, at the end of the run, in which everything else is
+    fitted to the smoothed SH. 0 smooths after training."""
     exposures: bool = True
     """Estimate each photo's exposure and white balance, as gains of red, green and blue, and the vignetting of the lens
     before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos and,
@@ -120,6 +123,8 @@ class Config:
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
+    dropout: float = 0.0
+    """Share of the surfels that a step leaves out at random, at the end of the run; it grows linearly from 0."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
@@ -154,7 +159,9 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
+        check_range("dropout", self.dropout, 0.0, 0.9)
         check_range("sh_every", self.sh_every, 1)
+        check_range("refit", self.refit, 0, REFERENCE_ITERATIONS)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
@@ -171,6 +178,13 @@ class Config:
     def settled(self) -> int:
         """First iteration of this run in which a pixel textures more than 2 hits, where K is more."""
         return math.ceil(self.more_hits_from * self.iterations / REFERENCE_ITERATIONS)
+
+    @property
+    def smoothed_after(self) -> int | None:
+        """Iteration of this run after which its SH are smoothed; None where that is not done during training."""
+        if self.smooth_sh == 0.0 or self.refit == 0:
+            return None
+        return max(self.iterations - self.scaled(self.refit), 0)
 
     def hits_at(self, iteration: int) -> int:
         """K at an iteration of this run: `max_hits`, but at most 2 while surfels settle."""

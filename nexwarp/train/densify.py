@@ -1,5 +1,6 @@
 """Adaptive density control (paper Sec. 4.3): splits surfels of large blended error, prunes transparent ones."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -25,6 +26,8 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    insert: float = 0.0
+    """Share of the new surfels that are placed at pixels of large error instead of being split off others."""
     floaters: bool = True
     """Remove floaters: surfels that are visible, in training views or views between them, at less than 0.6 times the
     depth of the nearest points."""
@@ -33,6 +36,7 @@ class DensifyConfig:
         check_range("every", self.every, 1)
         check_range("fraction", self.fraction, 0.0, 1.0)
         check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
+        check_range("insert", self.insert, 0.0, 1.0)
 
 
 class Densifier:
@@ -64,23 +68,37 @@ class Densifier:
         """Add the blended errors (N,) of one view."""
         self.errors += errors
 
-    def step(self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> tuple[int, int]:
-        """Split, then prune, in place; children start with optimizer state of zeros.
+    def step(
+        self,
+        surfels: Surfels,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+        new: Callable[[int], Mapping[str, torch.Tensor] | None] = lambda _: None,
+    ) -> tuple[int, int]:
+        """Split, insert, then prune, in place; children start with optimizer state of zeros.
 
         Args:
             surfels: to change.
             optimizer: holds their parameters; its state follows.
             generator: for the choice, on the CPU.
+            new: makes raw parameters of at most so many surfels to insert.
 
         Returns:
-            How many surfels were split and how many pruned.
+            How many surfels were added and how many pruned.
         """
         count = len(surfels)
         room = min(self.max_surfels, int((1 + self.config.fraction) * count)) - count
+        inserted = new(round(self.config.insert * room)) if room * self.config.insert >= 1 else None
+        if inserted is not None:
+            room -= len(inserted["means"])
         chosen = self._choose(min(room, count), generator) if room > 0 and count else None
         split = 0 if chosen is None else len(chosen)
         if chosen is not None and split:
             split_surfels(surfels, optimizer, chosen)
+        if inserted is not None:
+            append_surfels(surfels, optimizer, inserted)
+            split += len(inserted["means"])
+        if split:
             self.errors = torch.zeros_like(surfels.logit_opacities.detach())
         pruned = 0
         if split or self.config.prune_at_cap:
@@ -141,6 +159,20 @@ def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: to
         for value in optimizer.state.get(parameter, {}).values():
             if has_rows_of(value, parameter):
                 value[chosen] = 0
+                value[count:] = 0
+
+
+@torch.no_grad()
+def append_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, raw: Mapping[str, torch.Tensor]) -> None:
+    """Append surfels by their raw parameters; their optimizer state is 0."""
+    count, added = len(surfels), len(raw["means"])
+    everyone = torch.arange(count, device=surfels.device)
+    replace_rows(surfels, optimizer, torch.cat([everyone, everyone.new_zeros(added)]))
+    for name in PARAMETERS:
+        parameter = getattr(surfels, name)
+        parameter[count:] = raw[name]
+        for value in optimizer.state.get(parameter, {}).values():
+            if has_rows_of(value, parameter):
                 value[count:] = 0
 
 

@@ -23,6 +23,8 @@ class LossWeights:
 
     dssim: float = 0.2
     """Share of D-SSIM in the image loss; L1 has the rest."""
+    l2: float = 0.0
+    """Factor of the mean squared error of the image, beside the image loss."""
     alpha: float = 0.005
     """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
     texture: float = 0.5
@@ -40,7 +42,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "poses"):
+        for name in ("l2", "alpha", "texture", "opacity", "grid", "empty", "depth", "poses"):
             check_range(name, getattr(self, name), 0.0)
 
 

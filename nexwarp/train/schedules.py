@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
@@ -104,7 +104,9 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
     }
 
 
-def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float) -> None:
+def set_rates(
+    optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float, fixed: Collection[str] = ()
+) -> None:
     """Set an optimizer's learning rates for a step: log-linear between the ends of each group.
 
     Args:
@@ -112,12 +114,13 @@ def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int,
         iteration: of the step, from 1.
         iterations: of the run.
         factor: multiplies all rates.
+        fixed: names of groups that are not trained any more.
     """
     progress = (iteration - 1) / max(iterations - 1, 1)
     for group in optimizer.param_groups:
         first, last = group["ends"]
         rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-        rate *= factor
+        rate *= 0.0 if group["name"] in fixed else factor
         if isinstance(group["lr"], torch.Tensor):
             group["lr"].fill_(rate)
         else:

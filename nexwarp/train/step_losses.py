@@ -91,6 +91,9 @@ def step_losses(
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
+    if factors.l2 > 0:
+        missing = (out.image - target.photo).square()
+        losses["l2"] = factors.l2 * (missing if target.counts is None else missing * target.counts[..., None]).mean()
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

@@ -29,6 +29,7 @@ class Target:
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.render` takes it.
         view: (1,) int64, index of the training view; None where poses are not refined.
+        dropped: (P,) bool, of the budget's P surfels those that this step leaves out; None leaves out none.
     """
 
     camera: Camera
@@ -40,6 +41,7 @@ class Target:
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
+    dropped: torch.Tensor | None = None
     view: torch.Tensor | None = None
 
 
@@ -97,6 +99,10 @@ class TargetMaker:
             target = dataclasses.replace(target, depth_jitter=drawn)
         if self.poses is not None:
             target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
+        if config.dropout > 0:
+            share = config.dropout * iteration / config.iterations
+            drawn = torch.rand(config.max_surfels, generator=self.noise, device=self.views.device)
+            target = dataclasses.replace(target, dropped=drawn < share)
         return target
 
     def from_view(self, index: int, factor: int, upcoming: list[int] | None = None) -> Target:

@@ -14,6 +14,7 @@ from nexwarp.determinism import deterministic, seed_everything
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
+from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.files import one_line
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
@@ -31,6 +32,7 @@ from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
+from nexwarp.train.insertion import new_surfels
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates
 from nexwarp.train.state import (
@@ -54,6 +56,8 @@ from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
 CHECK_EVERY = 100
 SNAPSHOTS = 10
+
+DROPPED = -30.0  # logit of the opacity of a surfel that a step leaves out
 
 # Rounds of densification from one search for floaters to the next.
 FLOATERS_EVERY = 10
@@ -180,11 +184,15 @@ class Trainer:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
+            smoothed = self.config.smoothed_after
+            if self.iteration == smoothed:
+                self._smooth_sh()
             target = self._next_target()
-            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
+            fixed = ("shN",) if smoothed is not None and self.iteration > smoothed else ()
+            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor, fixed)
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
-                self.densifier.step(self.surfels, self.optimizer, self.generator)
+                self.densifier.step(self.surfels, self.optimizer, self.generator, self._new_surfels)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
@@ -197,6 +205,14 @@ class Trainer:
     def _make_optimizer(self) -> torch.optim.Optimizer:
         made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
         return make_optimizer(self.surfels, self.texture, *made)
+
+    def _new_surfels(self, count: int) -> dict[str, torch.Tensor] | None:
+        return new_surfels(self.model(), self.views, self.scene.train, count, self.generator, self.noise)
+
+    def _smooth_sh(self) -> None:
+        sh0, shN = smooth_sh(self.model(), self.scene.train, self.config.smooth_sh)
+        self.surfels.sh0.data.copy_(sh0)
+        self.surfels.shN.data.copy_(shN)
 
     def _next_view(self) -> int:
         if not self.order:
@@ -211,8 +227,12 @@ class Trainer:
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
+        logits = self.surfels.logit_opacities.data
+        undropped = None if target.dropped is None else logits.clone()
         try:
             target = refined(target, self.poses)
+            if target.dropped is not None:
+                logits.masked_fill_(target.dropped[: len(logits)], DROPPED)
             out = self.model().render(target.camera, background=target.background, depth_jitter=target.depth_jitter)
             taken = as_taken(out, target)
             given = (taken, target, self.surfels, self.texture, self.config)
@@ -223,6 +243,8 @@ class Trainer:
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             self._weighted(reduce(torch.add, losses.values())).backward()
+            if undropped is not None:
+                logits.copy_(undropped)
             kept = self._update(None if request is None else request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
@@ -289,7 +311,8 @@ class Trainer:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
         config = self.config
-        settings = FinishSettings(config.smooth_sh, config.footprints, config.deterministic)
+        strength = config.smooth_sh if config.smoothed_after is None else 0.0
+        settings = FinishSettings(strength, config.footprints, config.deterministic)
         with torch.autocast(self.device.type, enabled=False):
             cameras = self.views.refined_cameras(self.poses)
             views = with_cameras(self.scene.train, cameras)
