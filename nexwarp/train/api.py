@@ -38,10 +38,10 @@ def train(
         losses: own losses by name: functions of the step's `Rendering`, at the photo's exposure, and its `Target`
             (`target.photo` (H, W, 3), `target.camera`, `target.background`, `target.counts`) that return a scalar
             tensor. They are added to ours as they are, so that factors are their own business, and appear in
-            `StepReport.losses` by their names. On CUDA, steps are replayed as CUDA graphs: a loss may then depend on
-            tensors, which it reads in place, but not on numbers that change in Python, for which set
-            `config.cuda_graphs` to False. A loss that cannot be captured, such as one that calls `item()`, warns, and
-            steps are launched one by one.
+            `StepReport.losses` by their names. In border steps, the photo's edge is repeated beyond its frame, where
+            `counts` is False. On CUDA, steps are replayed as CUDA graphs: a loss may then depend on tensors, which it
+            reads in place, but not on numbers that change in Python, for which set `config.cuda_graphs` to False. A
+            loss that cannot be captured, such as one that calls `item()`, warns, and steps are launched one by one.
         optimizer: function from a list of parameter groups, dictionaries with `params`, `name` and `lr`, to any
             `torch.optim.Optimizer` that keeps these groups; None is Adam. Each group's `lr` is that of the first step,
             and may be changed; a schedule sets `group["lr"]` before each step, and keeps the ratio of the last rate to

@@ -125,6 +125,11 @@ class Config:
     `nexwarp eval --refine-poses` fits them, too."""
     dropout: float = 0.0
     """Share of the surfels that a step leaves out at random, at the end of the run; it grows linearly from 0."""
+    border: float = 0.0
+    """Largest shift of border steps, as a fraction of the frame; 0 does none. A border step renders a window that is
+    shifted beyond the photo's frame; there its target is the photo's repeated edge."""
+    border_every: int = 4
+    """One of this many steps is a border step."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
@@ -160,6 +165,8 @@ class Config:
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("dropout", self.dropout, 0.0, 0.9)
+        check_range("border", self.border, 0.0, 0.5)
+        check_range("border_every", self.border_every, 1)
         check_range("sh_every", self.sh_every, 1)
         check_range("refit", self.refit, 0, REFERENCE_ITERATIONS)
         if self.smooth_sh != 0.0:

@@ -37,12 +37,14 @@ class LossWeights:
     """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.1
     """Factor of the relative depth error at the points that were triangulated from the photo."""
+    border: float = 0.1
+    """Factor of the image loss beyond the frame in border steps, against the photo's repeated edge."""
     poses: float = 0.1
     """With `refine_poses`: factor of the squared pose correction, which keeps poses near the given ones."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("l2", "alpha", "texture", "opacity", "grid", "empty", "depth", "poses"):
+        for name in ("l2", "alpha", "texture", "opacity", "grid", "empty", "depth", "poses", "border"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -187,6 +189,14 @@ def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Te
 def alpha_loss(weights: torch.Tensor) -> torch.Tensor:
     """L_alpha: mean over the pixels of 1 - sum_k W, for (H, W, K) weights."""
     return _computed(photometric_terms(None, None, weights, None, alpha=1.0)[2])
+
+
+def border_loss(image: torch.Tensor, target: torch.Tensor, beyond: torch.Tensor) -> torch.Tensor:
+    """Sum over the pixels `beyond` (H, W) the frame of the L1 of (H, W, 3) images, over the number of all pixels."""
+    shape = ("H", "W", 3)
+    check_tensors({"image": (image, shape), "target": (target, shape)})
+    check_tensors({"beyond": (beyond, image.shape[:2])}, dtype=torch.bool, device=image.device)
+    return ((image - target).abs().mean(-1) * beyond).mean()
 
 
 def depth_loss(

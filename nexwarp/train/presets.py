@@ -82,6 +82,7 @@ PRESETS: dict[str, Config] = {
         preset="paper",
         more_hits_from=0,
         background=(0.0, 0.0, 0.0),
+        border=0.0,
         depth_jitter=0.0,
         footprints=False,
         smooth_sh=0.0,

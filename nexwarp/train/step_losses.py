@@ -10,13 +10,13 @@ from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
-from nexwarp.train.losses import depth_loss, training_losses
+from nexwarp.train.losses import border_loss, depth_loss, training_losses
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "poses")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "poses", "border", "l2")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -94,6 +94,8 @@ def step_losses(
     if factors.l2 > 0:
         missing = (out.image - target.photo).square()
         losses["l2"] = factors.l2 * (missing if target.counts is None else missing * target.counts[..., None]).mean()
+    if target.beyond is not None and factors.border > 0:
+        losses["border"] = factors.border * border_loss(out.image, target.photo, target.beyond)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

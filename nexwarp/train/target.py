@@ -25,6 +25,7 @@ class Target:
         exposure: (3,) or (H, W, 3), the photo's gains times the lens's falloff; None is the mean exposure.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
+        beyond: (H, W) bool, what lies beyond the photo's frame, where its edge is repeated; None is nothing.
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.render` takes it.
@@ -38,6 +39,7 @@ class Target:
     exposure: torch.Tensor | None = None
     counts: torch.Tensor | None = None
     empty: torch.Tensor | None = None
+    beyond: torch.Tensor | None = None
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
@@ -72,7 +74,7 @@ class TargetMaker:
             config: settings.
             views: the scene's training views on the device.
             background: the colour behind everything, where it is not random.
-            generator: of random backgrounds, on the CPU.
+            generator: of random backgrounds and of the shifts of border steps, on the CPU.
             noise: of the depth jitter, on the device.
             poses: corrections of the training poses that are learned; None where they are not.
         """
@@ -92,7 +94,12 @@ class TargetMaker:
         """
         config = self.config
         coarse = iteration <= config.coarse * config.iterations
-        target = self.with_points(self.from_view(index, 2 if coarse else 1, upcoming), index)
+        target = self.from_view(index, 2 if coarse else 1, upcoming)
+        if config.border > 0 and iteration % config.border_every == 0:
+            # Without points: those of a shifted window would have to be found anew in every border step.
+            target = self.shifted(target)
+        else:
+            target = self.with_points(target, index)
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
@@ -127,6 +134,31 @@ class TargetMaker:
         if mask is None or self.config.mask_mode == "ignore":
             return Target(camera, photo, background, exposure, counts=mask)
         return Target(camera, torch.where(mask[..., None], photo, behind), background, exposure, empty=~mask)
+
+    def shifted(self, target: Target) -> Target:
+        """Shift a target's window at random, for a border step; beyond the frame, the photo's edge is repeated.
+
+        No photo supervises what lies beyond all frames, and every test view shows some of it at its edges.
+        """
+        camera, device = target.camera, self.views.device
+        sizes = (camera.height, camera.width)
+        shifts = (2 * torch.rand(2, generator=self.generator) - 1) * self.config.border * torch.tensor(sizes)
+        top, left = (round(x) for x in shifts.tolist())
+        rows = torch.arange(top, top + sizes[0], device=device)
+        columns = torch.arange(left, left + sizes[1], device=device)
+        inside = ((rows >= 0) & (rows < sizes[0]))[:, None] & ((columns >= 0) & (columns < sizes[1]))
+        rows, columns = rows.clamp(0, sizes[0] - 1)[:, None], columns.clamp(0, sizes[1] - 1)
+        known = None if target.counts is None else target.counts[rows, columns]
+        exposure = target.exposure
+        return dataclasses.replace(
+            target,
+            camera=camera.crop(left, top, camera.width, camera.height),
+            photo=target.photo[rows, columns],
+            exposure=exposure if exposure is None or exposure.ndim == 1 else exposure[rows, columns],
+            counts=inside if known is None else inside & known,
+            empty=None if target.empty is None else target.empty[rows, columns],
+            beyond=~inside if known is None else ~inside & known,
+        )
 
     def with_points(self, target: Target, index: int) -> Target:
         """Add the points of view `index` to its target, where it has any and the depth loss counts."""
