@@ -231,6 +231,10 @@ def _render(
     base = hits.base if texture is None or residual else None
     blended = _no_texels(hits) if texels is None else (texels, hits.weights)
     image, textured = ops.compose(hits.plain, *blended, hits.alpha, background, base)
+    environment = None if texture is None else getattr(texture, "environment", None)
+    if environment is not None:
+        degree = round(len(environment) ** 0.5) - 1
+        image = image + (1 - hits.alpha)[..., None] * (ray_basis(camera, degree) @ environment)
     factors = None if exposures is None else exposures.factors(camera).to(image)
     image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
     intermediates = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
@@ -246,6 +250,27 @@ def _jittered(
             return depths
         jitter = jitter_factors(camera, depths.shape[2], jitter, depths.dtype, generator)
     return depths * jitter
+
+
+def ray_basis(camera: Camera, degree: int) -> torch.Tensor:
+    """Trial: return the SH basis (H, W, C) of the pixels' rays."""
+    x = (torch.arange(camera.width, device=camera.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    y = (torch.arange(camera.height, device=camera.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    rays = torch.stack(torch.broadcast_tensors(x[None], y[:, None], torch.ones_like(x[None])), -1)
+    d = torch.nn.functional.normalize(rays @ camera.viewmat[:3, :3].to(rays), dim=-1)
+    x, y, z = d.unbind(-1)
+    terms = [0.28209479177387814 * torch.ones_like(x)]
+    if degree > 0:
+        terms += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree > 1:
+        terms += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (3 * z * z - 1)]
+        terms += [-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)]
+    if degree > 2:
+        terms += [-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z]
+        terms += [-0.4570457994644658 * y * (5 * z * z - 1), 0.3731763325901154 * z * (5 * z * z - 3)]
+        terms += [-0.4570457994644658 * x * (5 * z * z - 1), 1.445305721320277 * z * (x * x - y * y)]
+        terms += [-0.5900435899266435 * x * (x * x - 3 * y * y)]
+    return torch.stack(terms, -1)
 
 
 def _no_texels(hits: ops.Hits) -> tuple[torch.Tensor, torch.Tensor]:

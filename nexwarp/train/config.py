@@ -123,6 +123,10 @@ class Config:
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
+    environment: int = -1
+    """Trial: SH degree of a background that depends on the direction; -1 is one colour."""
+    environment_ridge: float = 0.01
+    """Trial: ridge of its fit."""
     dropout: float = 0.0
     """Share of the surfels that a step leaves out at random, at the end of the run; it grows linearly from 0."""
     border: float = 0.0

@@ -26,6 +26,12 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    relocate: float = 0.0
+    """Trial: share of the surfels that a round at the budget removes, those that contribute least."""
+    relocate_stop: float = 0.5
+    """Trial: share of the run after which nothing is relocated."""
+    square: bool = False
+    """Trial: densify by squared errors."""
     insert: float = 0.0
     """Share of the new surfels that are placed at pixels of large error instead of being split off others."""
     floaters: bool = True
@@ -74,6 +80,7 @@ class Densifier:
         optimizer: torch.optim.Optimizer,
         generator: torch.Generator,
         new: Callable[[int], Mapping[str, torch.Tensor] | None] = lambda _: None,
+        contributions: torch.Tensor | None = None,
     ) -> tuple[int, int]:
         """Split, insert, then prune, in place; children start with optimizer state of zeros.
 
@@ -86,6 +93,11 @@ class Densifier:
         Returns:
             How many surfels were added and how many pruned.
         """
+        if contributions is not None and len(surfels) >= 0.98 * self.max_surfels:
+            worst = contributions.topk(int(self.config.relocate * len(surfels)), largest=False).indices
+            chosen = torch.zeros(len(surfels), dtype=torch.bool, device=surfels.device)
+            chosen[worst] = True
+            self.remove(surfels, optimizer, chosen)
         count = len(surfels)
         room = min(self.max_surfels, int((1 + self.config.fraction) * count)) - count
         inserted = new(round(self.config.insert * room)) if room * self.config.insert >= 1 else None

@@ -25,6 +25,12 @@ class LossWeights:
     """Share of D-SSIM in the image loss; L1 has the rest."""
     l2: float = 0.0
     """Factor of the mean squared error of the image, beside the image loss."""
+    l2_from: float = 0.0
+    """Trial: share of the run from which l2 counts."""
+    texels: float = 0.0
+    """Trial: factor of the mean squared residual texture."""
+    texels_l1: float = 0.0
+    """Trial: factor of its mean absolute value."""
     alpha: float = 0.005
     """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
     texture: float = 0.5

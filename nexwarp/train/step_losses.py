@@ -60,6 +60,8 @@ def step_losses(
     own: Mapping[str, OwnLoss] | None = None,
     grid_term: bool = True,
     poses: PoseCorrections | None = None,
+    raw: Rendering | None = None,
+    progress: float = 1.0,
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
@@ -91,7 +93,11 @@ def step_losses(
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
-    if factors.l2 > 0:
+    if factors.texels > 0 or factors.texels_l1 > 0:
+        base = out.intermediates.hits.base if raw is None else raw.intermediates.hits.base
+        residual = (out if raw is None else raw).textured - base
+        losses["texels"] = factors.texels * residual.square().mean() + factors.texels_l1 * residual.abs().mean()
+    if factors.l2 > 0 and progress >= factors.l2_from:
         missing = (out.image - target.photo).square()
         losses["l2"] = factors.l2 * (missing if target.counts is None else missing * target.counts[..., None]).mean()
     if target.beyond is not None and factors.border > 0:

@@ -63,6 +63,35 @@ DROPPED = -30.0  # logit of the opacity of a surfel that a step leaves out
 FLOATERS_EVERY = 10
 
 
+def _constant(color, like):
+    """Return SH coefficients of one colour."""
+    out = torch.zeros_like(like)
+    out[0] = torch.tensor(color, device=like.device) / 0.28209479177387814
+    return out
+
+
+@torch.no_grad()
+def fit_environment(views, degree: int, ridge: float) -> torch.Tensor:
+    """Trial: fit colours (C, 3) of directions to the training photos at their mean exposure."""
+    from nexwarp.render import ray_basis
+
+    count = (degree + 1) ** 2
+    left = torch.zeros(count, count, dtype=torch.float64, device=views.device)
+    right = torch.zeros(count, 3, dtype=torch.float64, device=views.device)
+    total = 0
+    for index in range(len(views)):
+        camera, photo = views.get(index, 8)
+        exposure = views.exposure(index, 8)
+        seen = photo if exposure is None else photo / exposure.clamp_min(0.05)
+        basis = ray_basis(camera, degree).reshape(-1, count).double()
+        left += basis.T @ basis
+        right += basis.T @ seen.reshape(-1, 3).double()
+        total += len(basis)
+    degrees = torch.tensor([l for l in range(degree + 1) for _ in range(2 * l + 1)], device=views.device).double()
+    left += torch.diag(ridge * total * (degrees * (degrees + 1)) ** 2 / 12.566)
+    return torch.linalg.solve(left, right).float()
+
+
 class Trainer:
     """A training run: `run` is the loop, `step` one iteration of it, `finish` makes the model.
 
@@ -128,6 +157,10 @@ class Trainer:
         gains = None if calibration is None else calibration.gains
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
         self.background = config.background or scene.background or mean_color(scene.train, calibration)
+        self.texture.environment = None
+        if config.environment >= 0:
+            fitted = fit_environment(self.views, config.environment, config.environment_ridge)
+            self.texture.environment = fitted - _constant(self.background, fitted)
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise, self.poses)
         self.views_a_step, self.ranks = 1, Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
@@ -192,7 +225,9 @@ class Trainer:
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor, fixed)
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
-                self.densifier.step(self.surfels, self.optimizer, self.generator, self._new_surfels)
+                self.densifier.step(
+                    self.surfels, self.optimizer, self.generator, self._new_surfels, self._contributions()
+                )
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
@@ -205,6 +240,20 @@ class Trainer:
     def _make_optimizer(self) -> torch.optim.Optimizer:
         made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
         return make_optimizer(self.surfels, self.texture, *made)
+
+    @torch.no_grad()
+    def _contributions(self) -> torch.Tensor | None:
+        d = self.config.densify
+        if not d.relocate or self.iteration > d.relocate_stop * self.config.iterations:
+            return None
+        if len(self.surfels) < 0.98 * self.config.max_surfels:
+            return None
+        sums = torch.zeros(len(self.surfels), device=self.device)
+        for index in torch.randperm(len(self.views), generator=self.generator)[:16].tolist():
+            camera, _ = self.views.get(index, 2)
+            out = self.model().bare(max_hits=1).render(camera)
+            sums = torch.maximum(sums, out.splat_error(torch.ones_like(out.alpha)))
+        return sums
 
     def _new_surfels(self, count: int) -> dict[str, torch.Tensor] | None:
         return new_surfels(self.model(), self.views, self.scene.train, count, self.generator, self.noise)
@@ -237,10 +286,15 @@ class Trainer:
             taken = as_taken(out, target)
             given = (taken, target, self.surfels, self.texture, self.config)
             own, poses, grid = self.own_losses, self.poses, fused is None
-            losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
+            progress = self.iteration / self.config.iterations
+            losses = step_losses(
+                *given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses, raw=out, progress=progress
+            )
             request = None
             if self.densifier.active(self.iteration):
                 errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
+                if self.config.densify.square:
+                    errors = errors.square()
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             self._weighted(reduce(torch.add, losses.values())).backward()
             if undropped is not None:
@@ -269,8 +323,9 @@ class Trainer:
 
     def _graph_key(self) -> Hashable:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
+        late = self.iteration >= self.config.losses.l2_from * self.config.iterations
         key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
-        return key, self.texture.half_copy_key()
+        return key, late, self.texture.half_copy_key()
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
