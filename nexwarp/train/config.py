@@ -127,6 +127,8 @@ class Config:
     """Trial: SH degree of a background that depends on the direction; -1 is one colour."""
     environment_ridge: float = 0.01
     """Trial: ridge of its fit."""
+    camera_jitter: float = 0.0
+    """Trial: standard deviation of random shifts of the principal point, pixels."""
     dropout: float = 0.0
     """Share of the surfels that a step leaves out at random, at the end of the run; it grows linearly from 0."""
     border: float = 0.0

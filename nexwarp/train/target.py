@@ -104,6 +104,13 @@ class TargetMaker:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
             target = dataclasses.replace(target, depth_jitter=drawn)
+        if config.camera_jitter > 0:
+            camera, (dx, dy) = target.camera, (config.camera_jitter * torch.randn(2, generator=self.generator)).tolist()
+            K = camera.K.clone()
+            K[0, 2] += dx
+            K[1, 2] += dy
+            checked = (camera.fx, camera.fy, camera.cx + dx, camera.cy + dy)
+            target = dataclasses.replace(target, camera=dataclasses.replace(camera, K=K, checked=checked))
         if self.poses is not None:
             target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
         if config.dropout > 0:
