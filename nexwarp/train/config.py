@@ -127,6 +127,10 @@ class Config:
     """Trial: SH degree of a background that depends on the direction; -1 is one colour."""
     environment_ridge: float = 0.01
     """Trial: ridge of its fit."""
+    background_noise: float = 0.0
+    """Trial: half the range of random shifts of the background's channels in training."""
+    background_noise_until: float = 1.0
+    """Trial: share of the run."""
     camera_jitter: float = 0.0
     """Trial: standard deviation of random shifts of the principal point, pixels."""
     dropout: float = 0.0

@@ -104,6 +104,12 @@ class TargetMaker:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
             target = dataclasses.replace(target, depth_jitter=drawn)
+        if config.background_noise > 0:
+            drawn = (2 * torch.rand(3, generator=self.generator) - 1) * config.background_noise
+            if iteration > config.background_noise_until * config.iterations:
+                drawn = torch.zeros(3)
+            noisy = (self.background_tensor + drawn.to(self.views.device)).clamp(0, 1)
+            target = dataclasses.replace(target, background=noisy)
         if config.camera_jitter > 0:
             camera, (dx, dy) = target.camera, (config.camera_jitter * torch.randn(2, generator=self.generator)).tolist()
             K = camera.K.clone()
