@@ -30,6 +30,8 @@ class DensifyConfig:
     """Trial: share of the surfels that a round at the budget removes, those that contribute least."""
     relocate_stop: float = 0.5
     """Trial: share of the run after which nothing is relocated."""
+    relocate_every: int = 1
+    """Trial: rounds from one relocation to the next; from 2 on, all training views count."""
     square: bool = False
     """Trial: densify by squared errors."""
     insert: float = 0.0

@@ -248,8 +248,11 @@ class Trainer:
             return None
         if len(self.surfels) < 0.98 * self.config.max_surfels:
             return None
+        if self.iteration // self.densifier.config.every % d.relocate_every:
+            return None
+        count = 16 if d.relocate_every == 1 else len(self.views)
         sums = torch.zeros(len(self.surfels), device=self.device)
-        for index in torch.randperm(len(self.views), generator=self.generator)[:16].tolist():
+        for index in torch.randperm(len(self.views), generator=self.generator)[:count].tolist():
             camera, _ = self.views.get(index, 2)
             out = self.model().bare(max_hits=1).render(camera)
             sums = torch.maximum(sums, out.splat_error(torch.ones_like(out.alpha)))
