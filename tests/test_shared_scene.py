@@ -1,15 +1,17 @@
 """The ranks of a machine hold a scene once: one of them loads it, and the others map its memory."""
 
 import dataclasses
+import mmap
 import os
 from pathlib import Path
+from types import ModuleType
 
 import psutil
 import pytest
 import torch
 
 from nexwarp.data import Scene
-from nexwarp.data.shared import _mapped, _moved, _tensors, shared_scene
+from nexwarp.data.shared import _mapped, _moved, _reserved, _tensors, shared_scene
 from nexwarp.distributed.join import Place
 from nexwarp.distributed.ranks import Ranks
 from tests.ranks_support import CPU, run_ranks
@@ -89,8 +91,10 @@ def test_ranks_that_cannot_share_load_for_themselves(
 
 @pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="files in memory are Linux's")
 def test_memory_of_another_process_is_not_taken_for_the_scene(tiny_scene: Scene, tmp_path: Path) -> None:
-    number = os.memfd_create("test")
-    moved, told = _moved(copied(tiny_scene), number)
+    reserved = _reserved(tiny_scene)
+    assert reserved is not None
+    number = reserved[0]
+    moved, told = _moved(copied(tiny_scene), *reserved)
     assert_same(moved, tiny_scene)
     found = _mapped(told)
     assert found is not None
@@ -103,6 +107,29 @@ def test_memory_of_another_process_is_not_taken_for_the_scene(tiny_scene: Scene,
     assert _mapped(told) is None and _mapped(told | {"file": str(tmp_path / "none")}) is None
 
 
-def test_a_rank_alone_loads_as_ever(tiny_scene: Scene) -> None:
-    for ranks in (Ranks.alone(CPU), Ranks(Place(1, 2, 0, 1, "", False), CPU, "gloo")):
-        assert shared_scene(lambda: tiny_scene, ranks) is tiny_scene
+def test_a_rank_alone_loads_as_ever(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine of its own it takes part in what all ranks do: others may share theirs."""
+    assert shared_scene(lambda: tiny_scene, Ranks.alone(CPU)) is tiny_scene
+    calls: list[object] = []
+    ranks = Ranks(Place(1, 2, 0, 1, "", False), CPU, "gloo")
+    monkeypatch.setattr(ranks, "gather", lambda told: calls.append(told) or [{}, told])  # type: ignore[func-returns-value]
+    monkeypatch.setattr(ranks, "barrier", lambda: calls.append("barrier"))
+    assert shared_scene(lambda: tiny_scene, ranks) is tiny_scene
+    assert calls == [None, "barrier"]
+
+
+@pytest.mark.parametrize(("module", "name"), [(os, "memfd_create"), (os, "ftruncate"), (mmap, "mmap")])
+def test_where_the_system_gives_no_memory_each_rank_loads(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str
+) -> None:
+    def refused(*_: object) -> int:
+        raise OSError("not permitted")
+
+    before = [view.image for view in tiny_scene.train]
+    ranks = Ranks(Place(0, 2, 0, 2, "", False), CPU, "gloo")
+    told: list[object] = []
+    monkeypatch.setattr(ranks, "gather", lambda x: [told.append(x), x])  # type: ignore[func-returns-value]
+    monkeypatch.setattr(ranks, "barrier", lambda: None)
+    monkeypatch.setattr(module, name, refused)
+    assert shared_scene(lambda: tiny_scene, ranks) is tiny_scene
+    assert told == [None] and all(view.image is x for view, x in zip(tiny_scene.train, before, strict=True))

@@ -38,14 +38,16 @@ def shared_scene(load: Callable[[], Scene], ranks: Ranks) -> Scene:
         load: loads the scene, the same on all ranks.
         ranks: all ranks.
     """
-    if ranks.local_size == 1:
+    if ranks.size == 1:
         return load()
     scene, told, file = None, None, None
     if ranks.local_rank == 0:
         scene = load()
-        file = os.memfd_create("nexwarp-scene") if hasattr(os, "memfd_create") else None
-        if file is not None:
-            scene, told = _moved(scene, file)
+        # A rank that is alone on its machine shares nothing, but takes part in what all do.
+        reserved = _reserved(scene) if ranks.local_size > 1 else None
+        if reserved is not None:
+            file, content = reserved
+            scene, told = _moved(scene, file, content)
     given = ranks.gather(told)[ranks.rank - ranks.local_rank]
     if scene is None and isinstance(given, dict):
         scene = _mapped(given)
@@ -82,14 +84,28 @@ class _Memory:
         return {name: None if each is None else self.get(each) for name, each in told.items()}
 
 
-def _moved(scene: Scene, file: int) -> tuple[Scene, Described]:
+def _reserved(scene: Scene) -> tuple[int, mmap.mmap] | None:
+    """Return a file in memory for a scene, and its mapping; None where the system has or gives none."""
+    size = ALIGNMENT + sum(_aligned(tensor.nbytes) for tensor in _tensors(scene))
+    if not hasattr(os, "memfd_create"):
+        return None
+    try:
+        file = os.memfd_create("nexwarp-scene")
+    except OSError:
+        return None
+    try:
+        os.ftruncate(file, size)
+        return file, mmap.mmap(file, size)
+    except OSError:
+        os.close(file)
+        return None
+
+
+def _moved(scene: Scene, file: int, content: mmap.mmap) -> tuple[Scene, Described]:
     """Move a scene to a memory file; return it, and what other processes need to map it.
 
     Photos move one by one, in the scene's own lists, so that no more than one is there twice.
     """
-    size = ALIGNMENT + sum(_aligned(tensor.nbytes) for tensor in _tensors(scene))
-    os.ftruncate(file, size)
-    content = mmap.mmap(file, size)
     content[:TOKEN_BYTES] = token = secrets.token_bytes(TOKEN_BYTES)
     memory = _Memory(content)
     told: Described = {"file": f"/proc/{os.getpid()}/fd/{file}", "token": token.hex(), "train": [], "test": []}
