@@ -33,7 +33,7 @@ from tests.narrowing import present
 from tests.ranks_support import CPU, digest, run_ranks
 from tests.test_poses import RATES, model, shown  # noqa: F401  # fixtures
 from tests.tolerances import assert_close
-from tests.trainer_support import assert_same_state, small, trained
+from tests.trainer_support import assert_resumed_alike, small, trained
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
@@ -154,20 +154,13 @@ def test_resuming_a_blurred_training_changes_nothing(tiny_scene: Scene, tmp_path
     start = motions_of(Trainer(tiny_scene, config, "cpu"))
     assert (motions_of(straight) - start).abs().amin(1).max() > 1e-4
     assert (present(straight.poses).corrections.abs().max() > 1e-4) == refine
-    first, second = Trainer(tiny_scene, config, "cpu"), Trainer(tiny_scene, config, "cpu")
-    for _ in range(7):
-        first.step()
-    first.save(tmp_path)
-    second.restore(tmp_path)
-    assert_same_state(second, first)
-    second.run()
-    assert_same_state(second, straight)
+    first = assert_resumed_alike(tiny_scene, config, straight, tmp_path)
     # A checkpoint without motions is named, and so is one of other settings.
     snapshot = first.snapshot()
     del snapshot.tensors["poses.motions"]
     first._write(tmp_path, snapshot)
     with pytest.raises(CheckpointError, match="motions: expected those of the exposures, got None"):
-        second.restore(tmp_path)
+        Trainer(tiny_scene, config, "cpu").restore(tmp_path)
     with pytest.raises(CheckpointError, match="its settings are others"):
         Trainer(tiny_scene, dataclasses.replace(config, blur_poses=1), "cpu").restore(tmp_path)
 

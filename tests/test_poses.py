@@ -27,7 +27,7 @@ from nexwarp.train.views import with_cameras
 from tests import scenes
 from tests.cli.support import FLAGS, SMALL
 from tests.tolerances import assert_close
-from tests.trainer_support import assert_same_state, small, trained
+from tests.trainer_support import assert_resumed_alike, small, trained
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
 
@@ -102,14 +102,7 @@ def test_resuming_a_refinement_changes_nothing(tiny_scene, tmp_path):
     config = small(refine_poses=True, rates=RATES)
     straight = trained(tiny_scene, config)
     assert straight.poses is not None and straight.poses.corrections.abs().max() > 1e-4
-    first, second = Trainer(tiny_scene, config, "cpu"), Trainer(tiny_scene, config, "cpu")
-    for _ in range(7):
-        first.step()
-    first.save(tmp_path)
-    second.restore(tmp_path)
-    assert_same_state(second, first)
-    second.run()
-    assert_same_state(second, straight)
+    assert_resumed_alike(tiny_scene, config, straight, tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Helpers run short trainings, and compare all that a training's future depends on."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -62,3 +63,20 @@ def rescaled(scene: Scene, factor: float) -> Scene:
         points=scene.points * factor,
         scale=scene.scale * factor,
     )
+
+
+def assert_resumed_alike(scene: Scene, config: Config, straight: Trainer, folder: Path) -> Trainer:
+    """Stop after 7 steps and go on from the checkpoint: the state is that of an uninterrupted run on the CPU.
+
+    Returns:
+        The trainer that was stopped.
+    """
+    first, second = Trainer(scene, config, "cpu"), Trainer(scene, config, "cpu")
+    for _ in range(7):
+        first.step()
+    first.save(folder)
+    second.restore(folder)
+    assert_same_state(second, first)
+    second.run()
+    assert_same_state(second, straight)
+    return first
