@@ -52,9 +52,8 @@ def _series(square: torch.Tensor, lowest: int) -> torch.Tensor:
 
 
 def _last_row(like: torch.Tensor) -> torch.Tensor:
-    last = torch.zeros(4, 4, dtype=like.dtype, device=like.device)
-    last[3, 3] = 1.0
-    return last
+    # Assigning a number would copy it from the CPU, which a CUDA graph cannot capture.
+    return nn.functional.pad(torch.ones(1, 1, dtype=like.dtype, device=like.device), (3, 0, 3, 0))
 
 
 def corrected(viewmat: torch.Tensor, twist: torch.Tensor, pivot: torch.Tensor) -> torch.Tensor:
