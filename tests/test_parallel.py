@@ -13,6 +13,7 @@ import safetensors.torch
 import torch
 
 from benchmarks import scaling
+from nexwarp.cli import device
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.distributed import join, liveness
@@ -313,6 +314,29 @@ def test_a_scene_that_cannot_be_read_is_told_once(tiny_folder: Path, tmp_path: P
     assert wait(processes)[0] == 2
     (line,) = printed(tmp_path / "a")
     assert line.startswith(f"nexwarp: error: {photo}: ") and not run.exists()
+
+
+def test_ranks_that_may_not_join_are_told_once(tiny_folder: Path, tmp_path: Path) -> None:
+    """Other code on one rank, and a rank without a device of its own; nothing is written."""
+    run = tmp_path / "run"
+    arguments = ["train", str(tiny_folder), "--run", str(run), *TRAIN]
+
+    def other_code(rank: int) -> int:
+        device.code_digest = lambda: f"version {rank}"
+        return cli.main(arguments)
+
+    assert 2 in wait(start_ranks(2, other_code, tmp_path / "a"))
+    expected = "rank 1: expected the same code of nexwarp as rank 0, version 0, got version 1"
+    assert printed(tmp_path / "a") == [f"nexwarp: error: {expected}"]
+
+    def too_few(rank: int) -> int:
+        with pytest.raises(RankError, match="expected a GPU of its own") as caught:
+            Ranks.join(CPU, {}, fault="expected a GPU of its own" if rank == 1 else None)
+        print(caught.value) if liveness.may_speak() else None
+        return liveness.end_process(2)
+
+    wait(start_ranks(2, too_few, tmp_path / "b"))
+    assert printed(tmp_path / "b", "out") == ["expected a GPU of its own"] and not run.exists()
 
 
 def _exit_code(arguments: list[str]) -> int:

@@ -14,7 +14,7 @@ from tests.reference.surface import Surface, surface
 from tests.render_support import assert_gradients, rigid_gradient, twin
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.test_laws import awkward_scene
-from tests.tolerances import FLIPS, assert_close
+from tests.tolerances import FLIPS, TOLERANCES, assert_close
 
 BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals", "distortion")
 GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
@@ -99,7 +99,9 @@ def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) 
         )
         return tuple(out)
 
-    assert torch.autograd.gradcheck(buffers, [x for _, x in named], fast_mode=True)
+    # Sums are in no fixed order on a GPU, so that two backward passes differ by roundings.
+    nondet_tol = TOLERANCES[torch.float64]["gradient"] if device.type == "cuda" else 0.0
+    assert torch.autograd.gradcheck(buffers, [x for _, x in named], fast_mode=True, nondet_tol=nondet_tol)
 
 
 class _Drawn(torch.nn.Module):

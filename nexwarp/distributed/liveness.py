@@ -52,7 +52,7 @@ class Liveness:
         self.leaving = self.speaks = False
         self.partners = list(range(1, place.size)) if place.rank == 0 else [0]
         self.store = open_store(STORE_SECONDS, host=False)
-        self.ended = threading.Event()
+        self.ended, self.others_failed = threading.Event(), threading.Event()
         self.threads = [_started(self._wait_for, partner) for partner in self.partners]
         if "TORCHELASTIC_RUN_ID" in os.environ:
             self.threads.append(_started(self._watch_parent, os.getppid()))
@@ -78,7 +78,8 @@ class Liveness:
         if isinstance(error, RuntimeError) and not isinstance(error, NexwarpError) and LOST.search(str(error)):
             time.sleep(GRACE_SECONDS)
         self.leaving = True
-        self.speaks = self._claim(default=True)
+        claimed = self._claim()
+        self.speaks = not self._told_by_others() if claimed is None else claimed
         self._tell_failure()
 
     def _tell_failure(self) -> None:
@@ -93,6 +94,7 @@ class Liveness:
         except RuntimeError:
             self._end(f"rank {partner} ({self.names[partner]}) has ended unexpectedly, so all ranks end", partner)
         if int(farewell) == FAILED:
+            self.others_failed.set()
             self._end("", partner)
 
     def _watch_parent(self, parent: int) -> None:
@@ -109,7 +111,8 @@ class Liveness:
         """
         if self.leaving:
             return
-        if why and self._claim(default=self.place.rank == (0 if lost else 1)):
+        claimed = self._claim() if why else False
+        if claimed or (claimed is None and self.place.rank == (0 if lost else 1)):
             shown = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a progress bar hides the cursor
             sys.stdout.write(shown)
             sys.stderr.write(f"nexwarp: error: {why}{self.hint}\n")
@@ -117,13 +120,19 @@ class Liveness:
             self._tell_failure()
         finish_process(EXIT_CODE)
 
-    def _claim(self, *, default: bool) -> bool:
-        """Return True on one rank only; `default` where the store is gone."""
+    def _claim(self) -> bool | None:
+        """Return True on one rank only; None where the store is gone, and rank 0, which may serve it, with it."""
         try:
             mine = str(self.place.rank).encode()
             return self.store.compare_set("fault", "", mine.decode()) == mine
         except RuntimeError:
-            return default
+            return None
+
+    def _told_by_others(self) -> bool:
+        """Whether another rank said before its end that it failed; then it, or one before it, has printed why."""
+        for thread in self.threads[: len(self.partners)]:
+            thread.join(GRACE_SECONDS)
+        return self.others_failed.is_set()
 
 
 def _started(work: Callable[[int], None], argument: int) -> threading.Thread:

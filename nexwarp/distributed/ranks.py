@@ -79,9 +79,13 @@ class Ranks:
         watched = dist.new_group(backend="gloo", timeout=FOREVER)
         names = [str(name) for name in ranks.gather(f"process {os.getpid()} on {socket.gethostname()}")]
         ranks.liveness = Liveness(place, watched, names, hint)
-        if (told := next((x for x in ranks.gather(fault) if x is not None), None)) is not None:
-            raise RankError(str(told))
-        ranks.check_same(facts)
+        try:
+            if (told := next((x for x in ranks.gather(fault) if x is not None), None)) is not None:
+                raise RankError(str(told))
+            ranks.check_same(facts)
+        except BaseException as error:  # the caller has no context yet that would tell the others
+            ranks.liveness.fail(error)
+            raise
         return ranks
 
     def __enter__(self) -> "Ranks":
@@ -168,13 +172,17 @@ class Ranks:
             for tensor in tensors:
                 dist.broadcast(tensor.detach(), 0)
 
+    def largest(self, values: torch.Tensor) -> torch.Tensor:
+        """Return, for each of the values, which are on the ranks' devices, the largest that any rank has."""
+        if self.size == 1:
+            return values
+        values = values.clone()
+        dist.all_reduce(values, dist.ReduceOp.MAX)
+        return values
+
     def union(self, chosen: torch.Tensor) -> torch.Tensor:
         """Return (N,) bool, True where any rank's `chosen` (N,) bool is."""
-        if self.size == 1:
-            return chosen
-        counts = chosen.to(torch.uint8)
-        dist.all_reduce(counts, dist.ReduceOp.MAX)
-        return counts > 0
+        return self.largest(chosen.to(torch.uint8)) > 0
 
     def agree(self, number: int | None, *, now: bool = False) -> int | None:
         """Return the largest number that ranks gave in their previous call; the same on all ranks.
