@@ -87,6 +87,7 @@ def tile_polygon_kernel(real: type, low_pass: bool, tile_size: int) -> wp.Kernel
         # Nothing to see: no corners, and no rows.
         reaches[i] = vec2()
         shapes[i] = wp.vec3i(0, 0, -1)
+        margins[i] = ZERO
         if wp.static(low_pass):
             discs[i] = vec3()
         # 0.1 % beyond the support, so that rounding in log and pow cannot cull a hit.
