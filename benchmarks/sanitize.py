@@ -2,8 +2,8 @@
 
     python -m benchmarks.sanitize --tool memcheck,racecheck,initcheck,synccheck --sweep
 
-runs itself under each tool, all at a time, prints a line for each and the number of errors, and exits with 1 when a
-tool found an error, with 2 when there is no compute-sanitizer. --sweep adds the kernels of the catalogue, forward and
+runs itself under each tool, prints a line for each and the number of errors, and exits with 1 when a tool found an
+error, with 2 when there is no compute-sanitizer. --sweep adds the kernels of the catalogue, forward and
 backward (`benchmarks.kernel_sweep`). `compute-sanitizer --tool memcheck python -m benchmarks.sanitize` is the same by
 hand.
 
@@ -18,6 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -77,6 +78,12 @@ def parse(output: str) -> Report:
             return Report(sum(int(match["errors"]) for match in found), found[-1][0].strip("= "))
     said = [line.strip("= ") for line in output.splitlines() if line.startswith("=") and line.strip("= ")]
     return Report(None, said[-1] if said else "no output of compute-sanitizer")
+
+
+def kernels_at_fault(output: str) -> list[str]:
+    """Return a line for each kernel and place that printed errors name, most errors first."""
+    found = Counter(re.findall(r"^=+\s+at (\S+\+0x[0-9a-f]+)", output, re.M))
+    return [f"{count:>8} printed errors at {place}" for place, count in found.most_common()]
 
 
 def find_tool() -> str | None:
@@ -142,6 +149,7 @@ def check(tool: str, sanitizer: str, command: Sequence[str], extra: Sequence[str
     code = "" if run.returncode == 0 else f", exit code {run.returncode}"
     told = [f"{tool}: {report.told}{code}: {'clean' if report.clean else 'NOT CLEAN'}"]
     if not report.clean:
+        told += kernels_at_fault(run.stdout)
         lines = [line for line in run.stdout.splitlines() if line.strip()]
         first = next((i for i, line in enumerate(lines) if line.startswith("========= ") and i), 0)
         told += lines[first : first + SHOWN] if report.errors else lines[-SHOWN:]
@@ -160,7 +168,9 @@ class Sanitize:
     sweep: bool = False
     """Also launch every kernel of the catalogue, with K of 0 to 8 and images of odd sizes."""
     parts: int = 1
-    """With --tool: processes that share the sweep, for each tool."""
+    """With --tool: parts of the sweep, a process each, for each tool."""
+    jobs: int = 4
+    """With --tool: processes at a time. More take longer: initcheck holds the GPU, and starting a tool a CPU core."""
     part: int | None = None
     """Do this one of the parts alone, from 0 on."""
     extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
@@ -213,7 +223,7 @@ class Sanitize:
             return 1
         shares = [["--parts", str(self.parts), "--part", str(i)] for i in range(self.parts)] if self.parts > 1 else [[]]
         jobs = list(itertools.product(tools, shares))
-        with ThreadPoolExecutor(len(jobs)) as pool:
+        with ThreadPoolExecutor(self.jobs) as pool:
             reports = list(pool.map(lambda job: check(job[0], sanitizer, command + job[1], self.extra.split()), jobs))
         unknown = sum(report.errors is None for report in reports)
         told = f"{sum(report.errors or 0 for report in reports)} errors found in {len(reports) - unknown} runs"

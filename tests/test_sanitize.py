@@ -11,7 +11,7 @@ import torch
 
 from benchmarks import kernel_sweep, sanitize
 from benchmarks.kernel_sweep import SIZES, Sweep, catalogue, compile_catalogue, sweep
-from benchmarks.sanitize import Sanitize, check, find_tool, parse, work
+from benchmarks.sanitize import Sanitize, check, find_tool, kernels_at_fault, parse, work
 
 BANNER = "========= COMPUTE-SANITIZER\n4 training steps and 2 frames on cuda\n"
 WRITE = """========= Invalid __global__ write of size 4 bytes
@@ -72,7 +72,19 @@ def test_a_tool_is_clean_only_when_it_says_so(tmp_path, capsys, body, clean, tol
 def test_errors_are_shown(tmp_path, capsys):
     (tmp_path / "output").write_text(BANNER + WRITE + "========= ERROR SUMMARY: 1 error\n")
     assert not check("memcheck", stub(tmp_path, f"cat {tmp_path}/output"), ["program"]).clean
-    assert "Invalid __global__ write" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert (
+        "Invalid __global__ write" in out and "       1 printed errors at collect_1a2b_cuda_kernel_forward+0x1f0" in out
+    )
+
+
+def test_places_are_told_by_their_errors():
+    other = WRITE.replace("collect_1a2b", "count_3c4d")
+    assert kernels_at_fault(other + WRITE * 3) == [
+        "       3 printed errors at collect_1a2b_cuda_kernel_forward+0x1f0",
+        "       1 printed errors at count_3c4d_cuda_kernel_forward+0x1f0",
+    ]
+    assert kernels_at_fault(BANNER) == []
 
 
 def test_tools_are_called_as_they_want(tmp_path):
