@@ -46,7 +46,14 @@ def test_paper_is_the_paper():
         down_weighting=True,
     )
     assert p.densify == DensifyConfig(
-        start=500, stop=25_000, every=100, fraction=0.05, prune_opacity=0.005, prune_at_cap=False, floaters=False
+        start=500,
+        stop=25_000,
+        every=100,
+        fraction=0.05,
+        prune_opacity=0.005,
+        prune_at_cap=False,
+        relocate=0.0,
+        floaters=False,
     )
 
 

@@ -1,16 +1,21 @@
 """Relocation: the surfels that the training views need least make room for others, at set times."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 
+from nexwarp.camera import reduced
 from nexwarp.data import Scene
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.render import render
+from nexwarp.train import relocation
 from nexwarp.train import trainer as trainer_module
 from nexwarp.train.densify import Densifier, DensifyConfig
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
+from tests.ranks_support import run_ranks
 from tests.scenes import make_surfels, random_scene
 from tests.trainer_support import OFTEN, assert_same_state, small, trained
 
@@ -42,6 +47,23 @@ def test_what_no_image_shows_goes_first(scene: Scene) -> None:
         most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1 / out.alpha.numel())))
     assert most[chosen].mean() < 0.2 * most[~chosen].mean()
     assert not least_contributing(trainer.model(), cameras, 0.0).any()
+
+
+def test_ranks_share_the_views(scene: Scene, tmp_path: Path) -> None:
+    """Each renders some of them, and all choose what one process would."""
+    model = Trainer(scene, small(iterations=30), "cpu").model()
+    cameras = [view.camera for view in scene.train]
+    rendered: list[int] = []
+
+    def work(ranks: Ranks) -> object:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(relocation, "reduced", lambda *given: rendered.append(0) or reduced(*given))
+            return least_contributing(model, cameras, 0.3, ranks).tolist(), len(rendered)
+
+    found = run_ranks(3, work, tmp_path)
+    expected = least_contributing(model, cameras, 0.3)
+    counts = [len(cameras[rank::3]) for rank in range(3)]
+    assert found == [[expected.tolist(), count] for count in counts] and 0 < expected.sum() < len(expected)
 
 
 def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() -> None:

@@ -29,7 +29,7 @@ class DensifyConfig:
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
-    relocate: float = 0.0
+    relocate: float = 0.1
     """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
     that contribute least to the training views. The next rounds split others in their place. 0 removes none."""
     floaters: bool = True

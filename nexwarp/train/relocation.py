@@ -4,7 +4,7 @@ Once the budget is used up, the paper's density control splits a surfel only whe
 so that the surfels stay where the first iterations put them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import torch
 
@@ -15,7 +15,7 @@ from nexwarp.model.model import Model
 
 @torch.no_grad()
 def least_contributing(
-    model: Model, cameras: Iterable[Camera], share: float, ranks: Ranks | None = None
+    model: Model, cameras: Sequence[Camera], share: float, ranks: Ranks | None = None
 ) -> torch.Tensor:
     """Return (N,) bool, True for the share of the surfels that contribute least to any image.
 
@@ -26,15 +26,16 @@ def least_contributing(
         model: its N surfels and options are used.
         cameras: of the training views, on any device.
         share: of the surfels, 0 to 1; rounded down to whole surfels.
-        ranks: return the same on all of them; None is this process alone.
+        ranks: which share the cameras out and return the same; None is this process alone.
     """
     bare = model.bare(max_hits=0)
     most = torch.zeros_like(bare.surfels.logit_opacities)
-    for camera in cameras:
+    mine = cameras if ranks is None else cameras[ranks.rank :: ranks.size]
+    for camera in mine:
         out = bare.render(reduced(camera, max(camera.height // 2, 1)))
         most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
     if ranks is not None:
-        ranks.share_tensors([most])
+        most = ranks.largest(most)
     chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
     chosen[most.argsort(stable=True)[: int(share * len(most))]] = True
     return chosen
