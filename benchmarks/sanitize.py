@@ -12,18 +12,19 @@ makes each array an allocation of its own.
 """
 
 import dataclasses
-import itertools
 import os
 import re
 import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
+from unittest.mock import patch
 
 import torch
 import tyro
@@ -125,6 +126,34 @@ def work(device: torch.device) -> dict[str, int]:
     return done
 
 
+@contextmanager
+def plain_products() -> Iterator[None]:
+    """Multiply matrices by torch's own kernels: initcheck does not see what cuBLAS writes on a Hopper GPU."""
+    whole = torch.Tensor.__matmul__
+
+    def matmul(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        if min(a.dim(), b.dim()) < 2:
+            return whole(a, b)
+        wide = torch.promote_types(a.dtype, torch.float32)
+        return (a.to(wide)[..., None] * b.to(wide)[..., None, :, :]).sum(-2).to(a.dtype)
+
+    def mm(
+        a: torch.Tensor, b: torch.Tensor, *, out_dtype: torch.dtype | None = None, out: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        found = matmul(a.to(out_dtype or a.dtype), b.to(out_dtype or b.dtype))
+        return found if out is None else out.copy_(found)
+
+    def activated(bias: torch.Tensor, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return (bias + matmul(a, b)).relu()
+
+    with (
+        patch.object(torch.Tensor, "__matmul__", matmul),
+        patch.object(torch, "mm", mm),
+        patch.object(torch, "_addmm_activation", activated),
+    ):
+        yield
+
+
 def isolate_arrays(device: torch.device) -> None:
     """Make each array on a GPU an allocation of its own; must come before the first one."""
     os.environ["PYTORCH_NO_CUDA_MEMORY_CACHING"] = "1"
@@ -175,6 +204,8 @@ class Sanitize:
     """Do this one of the parts alone, from 0 on."""
     extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
     """More options for compute-sanitizer, such as "--report-api-errors no"."""
+    plain_products: bool = False
+    """Multiply matrices without cuBLAS, as --tool initcheck does."""
     compile_first: bool = False
     """Compile the kernels of the catalogue first, several at a time."""
 
@@ -193,6 +224,10 @@ class Sanitize:
         if self.compile_first:
             compile_catalogue(device)
         isolate_arrays(device)
+        with plain_products() if self.plain_products else nullcontext():
+            return self._work(device)
+
+    def _work(self, device: torch.device) -> int:
         if not self.part:
             done = work(device)
             print(f"{done['steps']} training steps and {done['frames']} frames on {self.device}", flush=True)
@@ -222,7 +257,7 @@ class Sanitize:
             print(f"without a tool it ended with exit code {alone.returncode}", file=sys.stderr)
             return 1
         shares = [["--parts", str(self.parts), "--part", str(i)] for i in range(self.parts)] if self.parts > 1 else [[]]
-        jobs = list(itertools.product(tools, shares))
+        jobs = [(t, [*share, *["--plain-products"] * (t == "initcheck")]) for t in tools for share in shares]
         with ThreadPoolExecutor(self.jobs) as pool:
             reports = list(pool.map(lambda job: check(job[0], sanitizer, command + job[1], self.extra.split()), jobs))
         unknown = sum(report.errors is None for report in reports)

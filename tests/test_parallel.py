@@ -322,8 +322,9 @@ def test_ranks_that_may_not_join_are_told_once(tiny_folder: Path, tmp_path: Path
     arguments = ["train", str(tiny_folder), "--run", str(run), *TRAIN]
 
     def other_code(rank: int) -> int:
-        device.code_digest = lambda: f"version {rank}"
-        return cli.main(arguments)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(device, "code_digest", lambda: f"version {rank}")
+            return cli.main(arguments)
 
     assert 2 in wait(start_ranks(2, other_code, tmp_path / "a"))
     expected = "rank 1: expected the same code of nexwarp as rank 0, version 0, got version 1"

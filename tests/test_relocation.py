@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nexwarp.camera import reduced
+from nexwarp.camera import Camera, reduced
 from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.render import render
@@ -55,9 +55,13 @@ def test_ranks_share_the_views(scene: Scene, tmp_path: Path) -> None:
     cameras = [view.camera for view in scene.train]
     rendered: list[int] = []
 
+    def noted(camera: Camera, height: int) -> Camera:
+        rendered.append(height)
+        return reduced(camera, height)
+
     def work(ranks: Ranks) -> object:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(relocation, "reduced", lambda *given: rendered.append(0) or reduced(*given))
+            patch.setattr(relocation, "reduced", noted)
             return least_contributing(model, cameras, 0.3, ranks).tolist(), len(rendered)
 
     found = run_ranks(3, work, tmp_path)

@@ -12,6 +12,7 @@ import torch
 from benchmarks import kernel_sweep, sanitize
 from benchmarks.kernel_sweep import SIZES, Sweep, catalogue, compile_catalogue, sweep
 from benchmarks.sanitize import Sanitize, check, find_tool, kernels_at_fault, parse, work
+from tests.tolerances import assert_close
 
 BANNER = "========= COMPUTE-SANITIZER\n4 training steps and 2 frames on cuda\n"
 WRITE = """========= Invalid __global__ write of size 4 bytes
@@ -97,6 +98,20 @@ def test_tools_are_called_as_they_want(tmp_path):
     ]
 
 
+def test_products_without_cublas_are_products():
+    a, b, v = (torch.randn(*shape, dtype=torch.float64) for shape in ((3, 5, 4), (4, 6), (4,)))
+    out = torch.zeros(5, 6, dtype=torch.float64)
+    half = a[0].half(), b.half()
+    with sanitize.plain_products():
+        found = [a @ b, a[0] @ b, torch.mm(a[0], b), torch.mm(a[0], b, out=out), out, b.T @ v]
+        found += [torch._addmm_activation(torch.ones(6), a[1], b)]
+        wide = torch.mm(*half, out_dtype=torch.float32)
+    expected = [a @ b, *[a[0] @ b] * 4, b.T @ v, (1 + a[1] @ b).relu()]
+    for x, y in zip(found, expected, strict=True):
+        assert_close(x, y, kind="value", name="product")
+    assert_close(wide, half[0].float() @ half[1].float(), kind="value", name="half")
+
+
 def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsys):
     found = 'echo "========= ERROR SUMMARY: 1 error"'
     clean = 'echo "========= RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)"'
@@ -154,13 +169,14 @@ def test_a_tool_without_a_summary_is_counted(tmp_path, monkeypatch, capsys):
 
 
 def test_parts_share_the_sweep(tmp_path, monkeypatch):
-    """Each tool is run once for each part, and parts are told to be one."""
+    """Each tool is run once for each part, and parts are told to be one; initcheck's do without cuBLAS."""
     path = stub(tmp_path, 'echo "========= ERROR SUMMARY: 0 errors"')
     monkeypatch.setattr(sanitize, "find_tool", lambda: path)
     monkeypatch.setattr(sys, "executable", "true")
     assert Sanitize(tool="memcheck,initcheck", sweep=True, parts=2)() == 0
     asked = sorted(line.split("--device cuda ")[1] for line in (tmp_path / "asked").read_text().splitlines())
-    assert asked == [f"--sweep --parts 2 --part {i} 1" for i in (0, 0, 1, 1)]
+    plain = " --plain-products"
+    assert asked == [f"--sweep --parts 2 --part {i}{x} 1" for i in (0, 1) for x in (plain, "")]
 
 
 def test_a_part_that_is_none_is_one_line(capsys):

@@ -15,7 +15,7 @@ from contextlib import suppress
 import torch
 import torch.distributed as dist
 
-from nexwarp.distributed.join import Place, first_present, is_rank, open_store
+from nexwarp.distributed.join import POLL_SECONDS, Place, first_present, is_rank, open_store
 from nexwarp.errors import NexwarpError
 
 EXIT_CODE = 3
@@ -81,6 +81,18 @@ class Liveness:
         claimed = self._claim()
         self.speaks = not self._told_by_others() if claimed is None else claimed
         self._tell_failure()
+
+    def settle(self) -> None:
+        """Note that this rank has told why all end, or wait for the one that tells to have done so.
+
+        torchrun ends the other ranks as soon as one has ended.
+        """
+        until = time.monotonic() + GRACE_SECONDS
+        with suppress(RuntimeError):  # the store is gone, and with it rank 0
+            if self.speaks:
+                self.store.set("told", "")
+            while not self.store.check(["told"]) and time.monotonic() < until:
+                time.sleep(POLL_SECONDS)
 
     def _tell_failure(self) -> None:
         for partner in self.partners:
@@ -154,6 +166,7 @@ def end_process(code: int) -> int:
     The threads that wait for other ranks would disturb an ordinary exit.
     """
     if _current is not None:
+        _current.settle()
         finish_process(code)
     return code
 
