@@ -136,7 +136,7 @@ def test_optimizer_follows_and_goes_on_stepping():
     densifier = densifier_of(surfels, budget=31, prune_opacity=0.4)
     densifier.accumulate(torch.arange(30.0))
     split, pruned = densifier.step(surfels, optimizer, generator())
-    assert split == 1 and pruned > 0 and len(surfels) == 31 - pruned
+    assert split == 1 + pruned > 1 and len(surfels) == 31
     for group in optimizer.param_groups:
         assert len(group["params"]) == 1 and group["params"][0] is getattr(surfels, group["name"])
     assert set(optimizer.state) == set(surfels.parameters())
@@ -233,25 +233,80 @@ def test_prune_removes_exactly_the_transparent_ones():
         )
     old, moments = rows_of(surfels), moments_of(surfels, optimizer)
     densifier = densifier_of(surfels, budget=8)
-    densifier.accumulate(torch.arange(8.0))
+    densifier.accumulate(torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0]))  # no error of those that stay
     assert densifier.step(surfels, optimizer, generator()) == (0, 4)
     kept = [2, 3, 4, 6]
     for name in PARAMETERS:
         assert torch.equal(getattr(surfels, name), old[name][kept]), name
     for key, now in moments_of(surfels, optimizer).items():
         assert torch.equal(now, moments[key][kept]), key
-    assert densifier.errors.tolist() == [2.0, 3.0, 4.0, 6.0]
+    assert densifier.errors.tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize(("at_cap", "pruned"), [(True, 3), (False, 0)])
-def test_prune_at_the_cap_is_a_choice(at_cap, pruned):
+@pytest.mark.parametrize(("at_cap", "changed"), [(True, 3), (False, 0)])
+def test_prune_at_the_cap_is_a_choice(at_cap, changed):
     surfels, optimizer = make(10, opacity=0.5)
     with torch.no_grad():
         surfels.logit_opacities[:3] = -8.0
     densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap)
     densifier.accumulate(torch.ones(10))
-    assert densifier.step(surfels, optimizer, generator()) == (0, pruned)
-    assert len(surfels) == 10 - pruned
+    assert densifier.step(surfels, optimizer, generator()) == (changed, changed)
+    assert len(surfels) == 10 and int((surfels.logit_opacities < -7).sum()) == 3 - changed
+
+
+def addresses(surfels: nw.Surfels, optimizer: torch.optim.Adam, densifier: Densifier) -> list[int]:
+    """Of all tensors that a CUDA graph of a training step reads and writes."""
+    moments = [x for state in optimizer.state.values() for x in state.values()]
+    return [x.data_ptr() for x in (*surfels.parameters(), *moments, densifier.errors)]
+
+
+def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
+    """Tensors stay where they are; rows of others stay as they are, children start without moments."""
+    surfels, optimizer = make(20)
+    gone = [2, 11, 17]
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.linspace(1.0, 0.5, 20))
+        surfels.logit_opacities[gone[:2]] = -8.0
+    densifier = densifier_of(surfels, budget=20)
+    parents = [4, 7, 19]
+    errors = torch.zeros(20)
+    errors[[*parents, *gone]] = 1.0
+    densifier.accumulate(errors)
+    unneeded = torch.zeros(20, dtype=torch.bool)
+    unneeded[gone[2]] = True
+    before, old, moments = addresses(surfels, optimizer, densifier), rows_of(surfels), moments_of(surfels, optimizer)
+    alone, alone_optimizer = make(20)
+    alone.load_state_dict(surfels.state_dict())
+    assert densifier.step(surfels, optimizer, generator(), unneeded) == (3, 3)
+    assert addresses(surfels, optimizer, densifier) == before and not densifier.errors.any()
+    split_surfels(alone, alone_optimizer, torch.tensor(parents))
+    others = [i for i in range(20) if i not in (*gone, *parents)]
+    for name in PARAMETERS:
+        now = getattr(surfels, name)
+        assert torch.equal(now[others], old[name][others]), name
+        assert torch.equal(now[[*parents, *gone]], getattr(alone, name)[[*parents, 20, 21, 22]]), name
+    for key, now in moments_of(surfels, optimizer).items():
+        assert torch.equal(now[others], moments[key][others]) and not now[[*parents, *gone]].any(), key
+
+
+def test_places_are_filled_before_rows_are_appended():
+    surfels, optimizer = make(20, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[[3, 8]] = -8.0
+    densifier = densifier_of(surfels, budget=21)
+    densifier.accumulate(torch.ones(20))
+    assert densifier.step(surfels, optimizer, generator()) == (3, 2)
+    assert len(surfels) == 21 and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (21,)
+
+
+def test_unneeded_surfels_go_first_where_the_budget_is_far():
+    surfels, optimizer = make(20, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[:5] = -1.0
+    densifier = densifier_of(surfels, budget=1000)
+    densifier.accumulate(torch.ones(20))
+    assert densifier.step(surfels, optimizer, generator(), torch.arange(20) < 5) == (0, 5)  # 5 % of 15 are none
+    assert len(surfels) == 15
 
 
 def test_a_round_that_splits_prunes_in_either_mode():

@@ -8,7 +8,7 @@ from torch import nn
 from nexwarp.checks import check_range
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 
-RELOCATE_EVERY = 10  # rounds: their places are taken within three rounds, and the new surfels have to settle
+RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations
 FULL = 0.98  # share of the budget from which it counts as used up: pruning always leaves some room
 
@@ -31,7 +31,7 @@ class DensifyConfig:
     """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
     relocate: float = 0.1
     """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
-    that contribute least to the training views. The next rounds split others in their place. 0 removes none."""
+    that contribute least to the training views. Others are split in their place. 0 removes none."""
     floaters: bool = True
     """Remove floaters: surfels that are visible, in training views or views between them, at less than 0.6 times the
     depth of the nearest points."""
@@ -78,37 +78,76 @@ class Densifier:
         """Add the blended errors (N,) of one view."""
         self.errors += errors
 
-    def step(self, surfels: Surfels, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> tuple[int, int]:
-        """Split, then prune, in place; children start with optimizer state of zeros.
+    def step(
+        self,
+        surfels: Surfels,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+        unneeded: torch.Tensor | None = None,
+    ) -> tuple[int, int]:
+        """Split and prune, in place; children start with optimizer state of zeros.
+
+        Where the budget is within reach of a round that prunes, second children take the rows of pruned surfels, so
+        that most rounds change no tensor's size or address, and CUDA graphs of training steps stay valid.
 
         Args:
             surfels: to change.
             optimizer: holds their parameters; its state follows.
             generator: for the choice, on the CPU.
+            unneeded: (N,) bool, surfels to prune beside the transparent ones; None is none.
 
         Returns:
             How many surfels were split and how many pruned.
         """
+        count, prunes = len(surfels), self.config.prune_at_cap
+        if prunes and int((1 + self.config.fraction) * count) >= self.max_surfels:
+            return self._replace(surfels, optimizer, generator, unneeded)
+        pruned = 0 if unneeded is None else self.remove(surfels, optimizer, unneeded)
         count = len(surfels)
         room = min(self.max_surfels, int((1 + self.config.fraction) * count)) - count
-        chosen = self._choose(min(room, count), generator) if room > 0 and count else None
-        split = 0 if chosen is None else len(chosen)
-        if chosen is not None and split:
+        chosen = self._choose(room, generator)
+        if len(chosen):
             split_surfels(surfels, optimizer, chosen)
             self.errors = torch.zeros_like(surfels.logit_opacities.detach())
-        pruned = 0
-        if split or self.config.prune_at_cap:
-            opacities = surfels.opacities.detach()
-            pruned = self.remove(surfels, optimizer, opacities < self.config.prune_opacity)
-        return split, pruned
+        if len(chosen) or prunes:
+            pruned += self.remove(surfels, optimizer, self._transparent(surfels))
+        return len(chosen), pruned
+
+    def _replace(
+        self,
+        surfels: Surfels,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+        unneeded: torch.Tensor | None,
+    ) -> tuple[int, int]:
+        """Split as many surfels as the budget allows once others are pruned, and put children in the others' rows."""
+        gone = self._transparent(surfels) if unneeded is None else self._transparent(surfels) | unneeded
+        gone &= ~_most_opaque(surfels)
+        rows, count = gone.nonzero()[:, 0], len(surfels)
+        self.errors[rows] = 0
+        chosen = self._choose(self.max_surfels - count + len(rows), generator)
+        if len(chosen):
+            appended = torch.arange(count, count + len(chosen), device=rows.device)
+            split_surfels(surfels, optimizer, chosen, torch.cat([rows, appended])[: len(chosen)])
+            if len(surfels) == count:
+                self.errors.zero_()
+            else:
+                self.errors = torch.zeros_like(surfels.logit_opacities.detach())
+        if len(chosen) < len(rows):
+            left = torch.zeros(len(surfels), dtype=torch.bool, device=rows.device)
+            left[rows[len(chosen) :]] = True
+            self.remove(surfels, optimizer, left)
+        return len(chosen), len(rows)
+
+    def _transparent(self, surfels: Surfels) -> torch.Tensor:
+        return surfels.opacities.detach() < self.config.prune_opacity
 
     def remove(self, surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> int:
         """Remove, in place, the chosen (N,) bool surfels but for the most opaque ones of all; return how many.
 
         A scene without surfels has no gradient to recover by.
         """
-        opacities = surfels.opacities.detach()
-        keep = ~chosen | (opacities == opacities.max())
+        keep = ~chosen | _most_opaque(surfels)
         removed = int((~keep).sum())
         if removed:
             kept = keep.nonzero()[:, 0]
@@ -120,7 +159,7 @@ class Densifier:
         """Draw surfels without replacement, with probability proportional to their blended error."""
         errors = torch.nan_to_num(self.errors.double().cpu(), 0.0, 0.0, 0.0).clamp_min(0)
         candidates = int((errors > 0).sum())
-        if candidates == 0:
+        if candidates == 0 or count <= 0:
             return torch.empty(0, dtype=torch.long, device=self.errors.device)
         # Keys u^(1/p) are those of weighted sampling without replacement; -log keeps them exact (Efraimidis, Spirakis).
         keys = torch.empty_like(errors).exponential_(generator=generator) / errors
@@ -128,12 +167,29 @@ class Densifier:
         return chosen.to(self.errors.device)
 
 
+def _most_opaque(surfels: Surfels) -> torch.Tensor:
+    opacities = surfels.opacities.detach()
+    return opacities == opacities.max()
+
+
 @torch.no_grad()
-def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> None:
+def split_surfels(
+    surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor, places: torch.Tensor | None = None
+) -> None:
     """Replace each chosen surfel by two halves along its longer axis: scale / 2, centres at +-scale / 2.
 
     The first child takes the parent's row, the second is appended.
+
+    Args:
+        surfels: N, to change.
+        optimizer: holds their parameters; its state follows, and is zero for children.
+        chosen: (M,) rows of the parents.
+        places: (M,) rows of the second children: ones that are no parent's, then N, N + 1 and so on for those to
+            append; None appends all. Tensors of parameters and optimizer stay the same where none is appended.
     """
+    count = len(surfels)
+    if places is None:
+        places = torch.arange(count, count + len(chosen), device=chosen.device)
     quats, log_scales = surfels.quats[chosen], surfels.log_scales[chosen]
     axis = log_scales.argmax(dim=1)
     rows = torch.arange(len(chosen), device=chosen.device)
@@ -145,17 +201,19 @@ def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: to
     halved = log_scales.clone()
     halved[rows, axis] -= torch.log(torch.tensor(2.0)).item()
     means = surfels.means[chosen]
-    count = len(surfels)
-    everyone = torch.arange(count, device=chosen.device)
-    replace_rows(surfels, optimizer, torch.cat([everyone, chosen]))
-    surfels.means[chosen], surfels.means[count:] = means - offset, means + offset
-    surfels.log_scales[chosen], surfels.log_scales[count:] = halved, halved
+    new = int((places >= count).sum())
+    if new:
+        everyone = torch.arange(count, device=chosen.device)
+        replace_rows(surfels, optimizer, torch.cat([everyone, chosen[len(chosen) - new :]]))
     for name in PARAMETERS:
         parameter = getattr(surfels, name)
+        parameter[places] = parameter[chosen]
         for value in optimizer.state.get(parameter, {}).values():
             if has_rows_of(value, parameter):
                 value[chosen] = 0
-                value[count:] = 0
+                value[places] = 0
+    surfels.means[chosen], surfels.means[places] = means - offset, means + offset
+    surfels.log_scales[chosen], surfels.log_scales[places] = halved, halved
 
 
 @torch.no_grad()

@@ -181,11 +181,11 @@ class Trainer:
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
+                unneeded = None
                 if self.densifier.relocates(self.iteration, len(self.surfels)):
                     cameras, share = self.views.refined_cameras(self.poses), self.config.densify.relocate
-                    chosen = least_contributing(self.model(), cameras, share, self.ranks)
-                    self.densifier.remove(self.surfels, self.optimizer, chosen)
-                self.densifier.step(self.surfels, self.optimizer, self.generator)
+                    unneeded = least_contributing(self.model(), cameras, share, self.ranks)
+                self.densifier.step(self.surfels, self.optimizer, self.generator, unneeded)
             if self._floaters_due():
                 self._remove_floaters(last=self.iteration == self.config.iterations)
             report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
