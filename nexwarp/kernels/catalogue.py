@@ -12,6 +12,7 @@ from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
+from nexwarp.kernels.expose import expose_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
@@ -87,6 +88,7 @@ def thread_kernels(
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     if not cpu:
         yield adam_kernel()
+        yield from (expose_kernels(real).forward, expose_kernels(real).backward)
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
     for length in ssim_lengths:
         ssim = ssim_kernels(real, length)
