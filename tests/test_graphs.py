@@ -13,10 +13,11 @@ import torch
 
 from nexwarp import ops
 from nexwarp.data import Scene, View
+from nexwarp.representation.surfels import Surfels
 from nexwarp.train import graphs as step_graphs
 from nexwarp.train import views as training_views
 from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.densify import Densifier, DensifyConfig
 from nexwarp.train.settings import with_settings
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
@@ -249,4 +250,33 @@ def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeyp
     monkeypatch.setattr(ops, "fits", fits)
     trainer.run()
     assert len(asked) > 7
+    assert_same_state(trainer, launched)
+
+
+def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Children take the rows of pruned surfels: tensors stay where they are, and graphs stay valid."""
+    changes = {"max_surfels": 200, "densify": DensifyConfig(every=60, fraction=0.5, prune_opacity=0.09)}
+    launched = trained(tiny_scene, cuda_graphs=False, **changes)
+    trainer = Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
+    captured: list[int] = []
+    replaced: list[int] = []
+    capture, control = step_graphs._Stage.capture, Densifier.step
+
+    def noted(*given: Any) -> None:
+        captured.append(trainer.iteration)
+        capture(*given)
+
+    def counted(densifier: Densifier, surfels: Surfels, *given: Any) -> tuple[int, int]:
+        before = len(surfels)
+        found = control(densifier, surfels, *given)
+        if found[0] and before == len(surfels):
+            replaced.append(trainer.iteration)
+        return found
+
+    monkeypatch.setattr(ops, "fits", lambda room: True)  # short lists are slow but right, and no reason here
+    monkeypatch.setattr(step_graphs._Stage, "capture", noted)
+    monkeypatch.setattr(Densifier, "step", counted)
+    trainer.run()
+    assert len(replaced) > 3 and captured
+    assert not [i for i in captured if replaced[0] < i <= trainer.densifier.config.stop]
     assert_same_state(trainer, launched)
