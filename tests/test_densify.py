@@ -133,7 +133,7 @@ def test_children_start_without_moments_and_others_keep_theirs():
 
 def test_optimizer_follows_and_goes_on_stepping():
     surfels, optimizer = make(30)
-    densifier = densifier_of(surfels, budget=31, prune_opacity=0.4)
+    densifier = densifier_of(surfels, budget=31, prune_opacity=0.4, fraction=0.5)
     densifier.accumulate(torch.arange(30.0))
     split, pruned = densifier.step(surfels, optimizer, generator())
     assert split == 1 + pruned > 1 and len(surfels) == 31
@@ -248,7 +248,7 @@ def test_prune_at_the_cap_is_a_choice(at_cap, changed):
     surfels, optimizer = make(10, opacity=0.5)
     with torch.no_grad():
         surfels.logit_opacities[:3] = -8.0
-    densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap)
+    densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap, fraction=0.5)
     densifier.accumulate(torch.ones(10))
     assert densifier.step(surfels, optimizer, generator()) == (changed, changed)
     assert len(surfels) == 10 and int((surfels.logit_opacities < -7).sum()) == 3 - changed
@@ -267,7 +267,7 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
     with torch.no_grad():
         surfels.logit_opacities.copy_(torch.linspace(1.0, 0.5, 20))
         surfels.logit_opacities[gone[:2]] = -8.0
-    densifier = densifier_of(surfels, budget=20)
+    densifier = densifier_of(surfels, budget=20, fraction=0.1)  # and one for the unneeded surfel
     parents = [4, 7, 19]
     errors = torch.zeros(20)
     errors[[*parents, *gone]] = 1.0
@@ -293,10 +293,32 @@ def test_places_are_filled_before_rows_are_appended():
     surfels, optimizer = make(20, opacity=0.5)
     with torch.no_grad():
         surfels.logit_opacities[[3, 8]] = -8.0
-    densifier = densifier_of(surfels, budget=21)
+    densifier = densifier_of(surfels, budget=21, fraction=0.2)
     densifier.accumulate(torch.ones(20))
     assert densifier.step(surfels, optimizer, generator()) == (3, 2)
     assert len(surfels) == 21 and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (21,)
+
+
+@pytest.mark.parametrize(("fraction", "candidates", "split"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])
+def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, split):
+    """The fraction of the surfels and those that have an error are bounds; rows without a child are removed."""
+    surfels, optimizer = make(20)
+    gone = [1, 5, 6, 19]
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.linspace(1.0, 0.5, 20))
+        surfels.logit_opacities[gone] = -8.0
+    densifier = densifier_of(surfels, budget=20, fraction=fraction)
+    stay = [i for i in range(20) if i not in gone]
+    errors = torch.zeros(20)
+    errors[stay[:candidates]] = 1.0
+    errors[gone] = 9.0
+    densifier.accumulate(errors)
+    means = surfels.means.detach().clone()
+    assert densifier.step(surfels, optimizer, generator()) == (split, 4)
+    assert len(surfels) == 16 + split and bool((surfels.logit_opacities > 0).all())
+    assert densifier.errors.shape == (16 + split,) and all(len(p) == 16 + split for p in optimizer.state)
+    unmoved = [bool((surfels.means == mean).all(dim=1).any()) for mean in means[stay]]
+    assert unmoved.count(False) == split and not any(bool((surfels.means == x).all(dim=1).any()) for x in means[gone])
 
 
 def test_unneeded_surfels_go_first_where_the_budget_is_far():

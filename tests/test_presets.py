@@ -1,5 +1,6 @@
 """A preset has its numbers, and settings that cannot be are refused."""
 
+import dataclasses
 import json
 
 import pytest
@@ -104,3 +105,11 @@ def test_settings_of_another_kind_are_refused(change):
 def test_settings_out_of_range_are_refused(name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected at least .*, got {value}$"):
         Config(**{name: value})
+
+
+def test_runs_from_before_relocation_do_not_relocate():
+    """Their config.json keeps what they did."""
+    written = Config().as_dict()
+    assert config_from_dict(written) == Config()
+    del written["densify"]["relocate"]
+    assert config_from_dict(written).densify == dataclasses.replace(DensifyConfig(), relocate=0.0)

@@ -26,7 +26,7 @@ from benchmarks.quality.results import drop_unfinished, read_results, result_lin
 from benchmarks.quality.rows import DEFAULT, MEGABYTES, PEERS, ROWS
 from benchmarks.timing import ROOT
 
-# Seconds of our training with 40,000 surfels alone on an H100, about; the spread corrects them by what it sees.
+# Seconds of our training with 40,000 surfels on an H100, roughly; the spread corrects them by what it sees.
 SECONDS = {"kitchen25": 250, "train": 220, "fox": 120, "saharov": 140}
 PEER_SECONDS = 230
 SLOTS = {"ours": 1, "gsplat": 3 if "CUDA_MPS_PIPE_DIRECTORY" in os.environ else 1}  # trainings at once on a GPU
@@ -70,7 +70,7 @@ def kind_of(job: TrainingJob) -> str:
 
 
 def expected_seconds(job: TrainingJob) -> float:
-    """Return how long a training takes alone on an H100, about."""
+    """Return how long a training takes on an H100, roughly."""
     if kind_of(job) == "gsplat":
         return PEER_SECONDS * (1.0 if job.size < 200_000 else 1.5)
     return SECONDS[job.scene] * (0.55 + 0.45 * (job.size / 40_000) ** 0.5)

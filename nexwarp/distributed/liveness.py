@@ -79,8 +79,8 @@ class Liveness:
             time.sleep(GRACE_SECONDS)
         self.leaving = True
         claimed = self._claim()
-        self.speaks = not self._told_by_others() if claimed is None else claimed
         self._tell_failure()
+        self.speaks = self._speaks_without_store() if claimed is None else claimed
 
     def settle(self) -> None:
         """Note that this rank has told why all end, or wait for the one that tells to have done so.
@@ -128,8 +128,11 @@ class Liveness:
             shown = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a progress bar hides the cursor
             sys.stdout.write(shown)
             sys.stderr.write(f"nexwarp: error: {why}{self.hint}\n")
+            sys.stderr.flush()
+            self.speaks = True
         if self.place.rank == 0:
             self._tell_failure()
+        self.settle()
         finish_process(EXIT_CODE)
 
     def _claim(self) -> bool | None:
@@ -140,11 +143,12 @@ class Liveness:
         except RuntimeError:
             return None
 
-    def _told_by_others(self) -> bool:
-        """Whether another rank said before its end that it failed; then it, or one before it, has printed why."""
-        for thread in self.threads[: len(self.partners)]:
-            thread.join(GRACE_SECONDS)
-        return self.others_failed.is_set()
+    def _speaks_without_store(self) -> bool:
+        """Whether this rank is the first that is left. Rank 0 has told why it ended if it said that it failed."""
+        if self.place.rank == 0:
+            return True
+        self.threads[0].join(GRACE_SECONDS)  # ends when rank 0 speaks or is gone
+        return self.place.rank == 1 and not self.others_failed.is_set()
 
 
 def _started(work: Callable[[int], None], argument: int) -> threading.Thread:
@@ -166,8 +170,10 @@ def end_process(code: int) -> int:
     The threads that wait for other ranks would disturb an ordinary exit.
     """
     if _current is not None:
-        _current.settle()
-        finish_process(code)
+        try:
+            _current.settle()
+        finally:  # Ctrl-C ends the wait
+            finish_process(code)
     return code
 
 

@@ -68,7 +68,8 @@ class Ranks:
             hint: added to the message when a rank has died.
 
         Raises:
-            RankError: not all ranks came, one cannot take part, or their facts differ; all ranks raise the same.
+            RankError: not all ranks came, one cannot take part, or their facts differ; all ranks raise the same, unless
+                the end of another, which has told why, ends a rank first.
         """
         place = Place.of_environment()
         store = join_store(place)

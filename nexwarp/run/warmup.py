@@ -25,6 +25,7 @@ from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.floaters import floaters
+from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 
 BINARIES = (".o", ".cubin", ".ptx")
@@ -100,13 +101,15 @@ def rehearse(config: Config, device: torch.device) -> None:
     """Train for a few steps, evaluate and render on a tiny scene with these settings; seed the generators like a run.
 
     The steps cover every SH degree, both photo sizes, rounds of density control and steps after the last round, in the
-    order of a full run. The detection of floaters runs too.
+    order of a full run. The detection of floaters and the choice of surfels to relocate run too.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
     trainer.run()
     if config.densify.floaters:
         floaters(trainer.model(), trainer.views.cameras, [1.0], torch.Generator())
+    if config.densify.relocate:
+        least_contributing(trainer.model(), trainer.views.cameras, config.densify.relocate)
     model = trainer.finish()
     evaluate(model, scene.test)
     with torch.no_grad():

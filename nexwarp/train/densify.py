@@ -10,7 +10,7 @@ from nexwarp.representation.surfels import PARAMETERS, Surfels
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations
-FULL = 0.98  # share of the budget from which it counts as used up: pruning always leaves some room
+FULL = 0.98  # share of the budget from which it counts as used up: surfels without error leave rooms
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Densifier:
         return c.start < iteration - late < c.stop and late < views
 
     def relocates(self, iteration: int, count: int) -> bool:
-        """Whether a round after this iteration, with so many surfels, begins by removing some of them."""
+        """Whether a round after this iteration, with so many surfels, also prunes those that are needed least."""
         c = self.config
         rare = iteration // c.every % RELOCATE_EVERY == 0
         return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and count >= FULL * self.max_surfels
@@ -120,12 +120,18 @@ class Densifier:
         generator: torch.Generator,
         unneeded: torch.Tensor | None,
     ) -> tuple[int, int]:
-        """Split as many surfels as the budget allows once others are pruned, and put children in the others' rows."""
-        gone = self._transparent(surfels) if unneeded is None else self._transparent(surfels) | unneeded
-        gone &= ~_most_opaque(surfels)
+        """Prune and split in one go, and put children in the rows of pruned surfels.
+
+        A round splits `fraction` of the surfels at most, and one more for each that is unneeded.
+        """
+        if unneeded is None:
+            unneeded = torch.zeros_like(surfels.logit_opacities, dtype=torch.bool)
+        spared = _most_opaque(surfels)
+        gone = (self._transparent(surfels) | unneeded) & ~spared
         rows, count = gone.nonzero()[:, 0], len(surfels)
         self.errors[rows] = 0
-        chosen = self._choose(self.max_surfels - count + len(rows), generator)
+        most = int(self.config.fraction * count) + int((unneeded & ~spared).sum())
+        chosen = self._choose(min(self.max_surfels - count + len(rows), most), generator)
         if len(chosen):
             appended = torch.arange(count, count + len(chosen), device=rows.device)
             split_surfels(surfels, optimizer, chosen, torch.cat([rows, appended])[: len(chosen)])

@@ -32,6 +32,9 @@ DEMO_SETTINGS: dict[str, object] = {
 
 PARTS = ("losses", "rates", "texture", "densify")
 
+# What runs did before a setting existed, where the default does something else.
+BEFORE: dict[str, dict[str, object]] = {"densify": {"relocate": 0.0}}
+
 
 Part = TypeVar("Part", LossWeights, LearningRates, TextureConfig, DensifyConfig)
 
@@ -109,14 +112,15 @@ def preset(name: str) -> Config:
 def config_from_dict(data: Mapping[str, Any]) -> Config:
     """Rebuild a config from `Config.as_dict`; ValueError names a value of another type or out of range.
 
-    Settings that an older version did not write are those of the preset that the run started from. Those that a newer
-    version wrote and this one does not know are passed over.
+    Settings that an older version did not write are those of the preset that the run started from, but for those of
+    `BEFORE`. Those that a newer version wrote and this one does not know are passed over.
     """
     try:
         preset = data.get("preset")
         base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else Config()
         known = {field.name for field in dataclasses.fields(Config)}
-        data = {k: _part(getattr(base, k), v, k) if k in PARTS else v for k, v in data.items() if k in known}
+        parts = {k: _part(getattr(base, k), {**BEFORE.get(k, {}), **v}, k) for k, v in data.items() if k in PARTS}
+        data = {k: v for k, v in data.items() if k in known} | parts
         return dataclasses.replace(base, **_checked(Config, _tuples(data), "config"))
     except (TypeError, AttributeError, KindError) as error:
         raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None

@@ -28,7 +28,7 @@ def least_contributing(
         share: of the surfels, 0 to 1; rounded down to whole surfels.
         ranks: which share the cameras out and return the same; None is this process alone.
     """
-    bare = model.bare(max_hits=0)
+    bare = model.bare()
     most = torch.zeros_like(bare.surfels.logit_opacities)
     mine = cameras if ranks is None else cameras[ranks.rank :: ranks.size]
     for camera in mine:
