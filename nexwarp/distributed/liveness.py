@@ -24,6 +24,8 @@ PARENT_SECONDS = 1.0
 # For the thread that waits for the other ranks to find which one has died, after a message to it has failed.
 GRACE_SECONDS = 3.0
 STORE_SECONDS = 3.0
+# The launcher, which looks every 0.1 s, should see the rank that ended by itself first: its exit code is the command's.
+NOTICE_SECONDS = 0.3
 # What gloo and NCCL say when the process at the other end is gone.
 LOST = re.compile(r"gloo|nccl|connection (closed|reset|refused)|broken pipe|socket", re.I)
 
@@ -36,6 +38,7 @@ class Liveness:
     Attributes:
         leaving: whether this rank is about to end, so that the end of others is no error.
         speaks: whether it is for this rank to print why all end.
+        ending: whether this rank ends because another has; whatever happens to it now is no news.
     """
 
     def __init__(self, place: Place, group: dist.ProcessGroup, names: list[str], hint: str) -> None:
@@ -49,7 +52,7 @@ class Liveness:
         """
         global _current
         self.place, self.group, self.names, self.hint = place, group, names, hint
-        self.leaving = self.speaks = False
+        self.leaving = self.speaks = self.ending = False
         self.partners = list(range(1, place.size)) if place.rank == 0 else [0]
         self.store = open_store(STORE_SECONDS, host=False)
         self.ended, self.others_failed = threading.Event(), threading.Event()
@@ -77,6 +80,8 @@ class Liveness:
         """
         if isinstance(error, RuntimeError) and not isinstance(error, NexwarpError) and LOST.search(str(error)):
             time.sleep(GRACE_SECONDS)
+        if self.ending:
+            return
         self.leaving = True
         claimed = self._claim()
         self._tell_failure()
@@ -123,16 +128,19 @@ class Liveness:
         """
         if self.leaving:
             return
+        self.ending = True
         claimed = self._claim() if why else False
         if claimed or (claimed is None and self.place.rank == (0 if lost else 1)):
             shown = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a progress bar hides the cursor
             sys.stdout.write(shown)
             sys.stderr.write(f"nexwarp: error: {why}{self.hint}\n")
             sys.stderr.flush()
-            self.speaks = True
+            with suppress(RuntimeError):
+                self.store.set("told", "")
         if self.place.rank == 0:
             self._tell_failure()
         self.settle()
+        time.sleep(NOTICE_SECONDS)
         finish_process(EXIT_CODE)
 
     def _claim(self) -> bool | None:
