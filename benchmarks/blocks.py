@@ -51,7 +51,7 @@ class Blocks:
     """How far a block reaches beyond its cell, in units of the scene's scale."""
     context: float = CONTEXT
     """Share of the points outside of a block that it starts from."""
-    refine: float = 0.25
+    refine: float = 0.4
     """Views of the refinement at the seams, in units of those of a training; 0 merges finished blocks, no more."""
     band: float = BAND
     """How far from a seam the refinement trains surfels, in units of the scene's scale."""
