@@ -83,7 +83,7 @@ def parse(output: str) -> Report:
 
 def kernels_at_fault(output: str) -> list[str]:
     """Return a line for each kernel and place that printed errors name, most errors first."""
-    found = Counter(re.findall(r"^=+\s+at (\S+\+0x[0-9a-f]+)", output, re.M))
+    found = Counter(re.findall(r"^=+\s+at (.+?\+0x[0-9a-f]+)", output, re.M))
     return [f"{count:>8} printed errors at {place}" for place, count in found.most_common()]
 
 
@@ -199,7 +199,7 @@ class Sanitize:
     parts: int = 1
     """With --tool: parts of the sweep, a process each, for each tool."""
     jobs: int = 4
-    """With --tool: processes at a time. More take longer: initcheck holds the GPU, and starting a tool a CPU core."""
+    """With --tool: processes at a time; each keeps a CPU core busy."""
     part: int | None = None
     """Do this one of the parts alone, from 0 on."""
     extra: Annotated[str, tyro.conf.arg(metavar="OPTIONS")] = ""
@@ -244,6 +244,9 @@ class Sanitize:
     def _under(self, tools: list[str]) -> int:
         if others := [tool for tool in tools if tool not in TOOLS]:
             print(f"--tool: expected some of {', '.join(TOOLS)}, got {others[0]!r}", file=sys.stderr)
+            return 2
+        if self.jobs < 1:
+            print(f"--jobs: expected at least 1, got {self.jobs}", file=sys.stderr)
             return 2
         sanitizer = find_tool()
         if sanitizer is None:

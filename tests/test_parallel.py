@@ -333,7 +333,8 @@ def test_ranks_that_may_not_join_are_told_once(tiny_folder: Path, tmp_path: Path
     def too_few(rank: int) -> int:
         with pytest.raises(RankError, match="expected a GPU of its own") as caught:
             Ranks.join(CPU, {}, fault="expected a GPU of its own" if rank == 1 else None)
-        print(caught.value) if liveness.may_speak() else None
+        if liveness.may_speak():
+            print(caught.value)
         return liveness.end_process(2)
 
     wait(start_ranks(2, too_few, tmp_path / "b"))

@@ -85,6 +85,10 @@ def test_places_are_told_by_their_errors():
         "       3 printed errors at collect_1a2b_cuda_kernel_forward+0x1f0",
         "       1 printed errors at count_3c4d_cuda_kernel_forward+0x1f0",
     ]
+    of_torch = WRITE.replace("collect_1a2b_cuda_kernel_forward", "void at::native::copy<(int)8, float>(float *)")
+    assert kernels_at_fault(of_torch) == [
+        "       1 printed errors at void at::native::copy<(int)8, float>(float *)+0x1f0"
+    ]
     assert kernels_at_fault(BANNER) == []
 
 
@@ -177,6 +181,11 @@ def test_parts_share_the_sweep(tmp_path, monkeypatch):
     asked = sorted(line.split("--device cuda ")[1] for line in (tmp_path / "asked").read_text().splitlines())
     plain = " --plain-products"
     assert asked == [f"--sweep --parts 2 --part {i}{x} 1" for i in (0, 1) for x in (plain, "")]
+
+
+def test_no_process_at_a_time_is_one_line(capsys):
+    assert Sanitize(tool="memcheck", jobs=0)() == 2
+    assert capsys.readouterr().err == "--jobs: expected at least 1, got 0\n"
 
 
 def test_a_part_that_is_none_is_one_line(capsys):
