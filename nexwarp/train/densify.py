@@ -10,7 +10,7 @@ from nexwarp.representation.surfels import PARAMETERS, Surfels
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations
-FULL = 0.98  # share of the budget from which it counts as used up: surfels without error leave rooms
+FULL = 0.98  # share of the budget from which it counts as used up: a round that splits few leaves some of it
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class DensifyConfig:
     prune_opacity: float = 0.005
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
-    """Prune also in rounds that split nothing because the budget is used up (the authors' code does not)."""
+    """Prune also once the budget is used up, and split others in their place (the authors' code does neither)."""
     relocate: float = 0.1
     """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
     that contribute least to the training views. Others are split in their place. 0 removes none."""
@@ -87,8 +87,8 @@ class Densifier:
     ) -> tuple[int, int]:
         """Split and prune, in place; children start with optimizer state of zeros.
 
-        Where the budget is within reach of a round that prunes, second children take the rows of pruned surfels, so
-        that most rounds change no tensor's size or address, and CUDA graphs of training steps stay valid.
+        Where the budget is within reach of a round that prunes, second children take the rows of pruned surfels. A
+        round at the budget then changes no tensor's size or address, and CUDA graphs of training steps stay valid.
 
         Args:
             surfels: to change.
