@@ -228,7 +228,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
         (
             ["--size", "8192x8192"],
-            "out of memory: an image of 8192x8192 pixels with K = 2 needs at least 35.2 GiB, of which 8.0 GiB are "
+            "out of memory: an image of 8192x8192 pixels with K = 2 needs at least 11.2 GiB, of which 8.0 GiB are "
             "free; render a smaller image, with a lower K, or in parts (Camera.crop)",
         ),
     ],

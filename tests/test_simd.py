@@ -1,5 +1,6 @@
 """SIMD vectors calculate what torch does, each group of snippets by itself; SIMD forms agree with the others."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -172,3 +173,48 @@ def test_both_forms_of_lookup_agree(count: int, features: int, dtype: torch.dtyp
     assert_close(results[0][0], results[1][0], kind="value", name="coefficients")
     for index, (simd, scalar) in enumerate(zip(results[0][1:], results[1][1:], strict=True)):
         assert_close(simd, scalar, kind="gradient", name=f"gradient {index}")
+
+
+@pytest.mark.parametrize(
+    ("count", "hits", "degree", "width", "hidden_layers"),
+    [(1, 1, 3, 16, 2), (7, 2, 0, 5, 1), (64, 2, 1, 16, 0), (1003, 3, 2, 31, 3), (2100, 2, 3, 64, 2)],
+)
+@pytest.mark.parametrize("clamp", [False, True])
+@DTYPES
+def test_both_forms_of_textured_colors_agree(
+    count: int, hits: int, degree: int, width: int, hidden_layers: int, clamp: bool, dtype: torch.dtype
+) -> None:
+    """Numbers of points, neurons and outputs that no block, vector or four divides, and more points than a part has."""
+    shape: dict[str, Any] = {"width": width, "hidden_layers": hidden_layers, "sh_degree": degree, "residual": True}
+    texture = nw.NeuralTexture(5, 2**8, 1, 1.0, 6.0, **shape).to(dtype)
+    torch.nn.init.normal_(texture.grid)
+    generator = torch.Generator().manual_seed(4)
+    draw = functools.partial(torch.randn, generator=generator, dtype=torch.float64)
+    positions, factors = draw(count, hits, 3).to(dtype), draw(count, hits, 3).to(dtype)
+    directions = torch.nn.functional.normalize(draw(count, 3), dim=-1).to(dtype)
+    depths = (1 + draw(count, hits).abs()).to(dtype)
+    depths[3::7] = 0.0  # points to skip
+    results = []
+    for form in FORMS:
+        with launch.cpu_form(form):
+            at, far = positions.clone().requires_grad_(), depths.clone().requires_grad_()
+            out = texture.colors(at, far, directions, 24.0, clamp=clamp)
+            grads = torch.autograd.grad((out * factors).sum(), [at, far, *texture.parameters()])
+            with torch.no_grad():
+                assert torch.equal(texture.colors(positions, depths, directions, 24.0, clamp=clamp), out)
+            results.append([out.detach(), *grads])
+    assert_close(results[0][0], results[1][0], kind="value", name="colors")
+    for index, (simd, scalar) in enumerate(zip(results[0][1:], results[1][1:], strict=True)):
+        assert_close(simd, scalar, kind="gradient", name=f"gradient {index}")
+
+
+def test_colors_of_large_layers_are_those_of_torch() -> None:
+    """Layers that the SIMD form has no room for are computed by torch, in both forms."""
+    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, width=200)
+    positions, depths = torch.rand(9, 2, 3), torch.ones(9, 2)
+    directions = torch.nn.functional.normalize(torch.rand(9, 3), dim=-1)
+    colors = []
+    for form in FORMS:
+        with launch.cpu_form(form):
+            colors.append(texture.colors(positions, depths, directions, 24.0))
+    assert_close(colors[0], colors[1], kind="value", name="colors")

@@ -12,6 +12,7 @@ from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
+from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
@@ -71,10 +72,14 @@ def thread_kernels(
     clamps: Sequence[bool] = (False, True),
     low_passes: Sequence[bool] = (False, True),
     ssim_lengths: Sequence[int] = (1, SIMD_WIDTH),
+    layered: bool = True,
     cpu: bool = False,
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
-    """Yield the kernels of threads that work alone, in blocks of Warp's own size."""
+    """Yield the kernels of threads that work alone, in blocks of Warp's own size.
+
+    `layered` are those of textured colours whose MLP is computed layer by layer.
+    """
     yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
     for kernels in (unproject_kernels(real), compose_kernels(real)):
         yield from (kernels.forward, kernels.backward)
@@ -93,7 +98,9 @@ def thread_kernels(
     for degree in degrees:
         plain = plain_colors_kernels(real, degree)
         yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
-        for clamp in clamps:
+        if cpu and storage is real:
+            yield from (mlp_simd_kernels(real, degree).forward, mlp_simd_kernels(real, degree).backward)
+        for clamp in clamps if layered else ():
             colors = textured_colors_kernels(real, storage, degree, clamp)
             yield from (colors.forward, colors.backward)
     for count in features:

@@ -12,9 +12,12 @@ from typing import Any, Literal
 
 import warp as wp
 
-# Chunks at most, or a few for each core where there are many: those that finish early take over what is left.
+# Chunks at most where some take much longer than others, or a few for each core where there are many: those that finish
+# early take over what is left.
 CHUNKS = 16
 CHUNKS_A_THREAD = 4
+# Where all take alike: handing out a chunk costs 9 us, during which no other thread can do so.
+EVEN_CHUNKS_A_THREAD = 2
 SMALLEST_CHUNK = 256
 # Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
 LIGHT_CHUNK = 2048
@@ -105,6 +108,7 @@ def launch(
     block_dim: int = 256,
     align: int = 1,
     smallest: int = LIGHT_CHUNK,
+    even: bool = True,
     adjoint: tuple[Sequence[Any], Sequence[Any]] | None = None,
 ) -> None:
     """Launch a kernel whose first argument is `first` over the leading dimension of `dim`.
@@ -119,6 +123,7 @@ def launch(
         block_dim: threads a block on CUDA.
         align: on a CPU, runs of this many neighbours stay in one thread, since they write to the same place.
         smallest: on a CPU, what one thread is given at least.
+        even: whether equal parts of the range take about equally long.
         adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs
             no gradient. Gradients are added to.
     """
@@ -143,7 +148,7 @@ def launch(
     if not device.is_cpu:
         part((0, shape[0]))
         return
-    most = max(CHUNKS, CHUNKS_A_THREAD * _threads)
+    most = EVEN_CHUNKS_A_THREAD * _threads if even else max(CHUNKS, CHUNKS_A_THREAD * _threads)
     ranges = chunks(shape[0], align, smallest, most) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
     if _threads == 1 or len(ranges) == 1:
         for bounds in ranges:

@@ -114,6 +114,7 @@ def launch(
     block_dim: int = 256,
     align: int = 1,
     smallest: int = launching.LIGHT_CHUNK,
+    even: bool = True,
     adjoint: tuple[Sequence[Argument], Sequence[Argument]] | None = None,
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`."""
@@ -127,6 +128,7 @@ def launch(
         block_dim=block_dim,
         align=align,
         smallest=smallest,
+        even=even,
         adjoint=adjoint,
     )
 

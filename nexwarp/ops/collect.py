@@ -139,7 +139,7 @@ def launch_walk(
     threads = tiles.tile_size**2 // width
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
     count = (len(tiles.tile_offsets) - 1) * threads
-    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=threads, smallest=threads)
+    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=threads, smallest=threads, even=False)
 
 
 def walk_inputs(

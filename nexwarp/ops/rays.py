@@ -233,6 +233,6 @@ def collect_rays(
     pixels = TILE_SIZE**2
     threads = (len(tiles.tile_offsets) - 1) * pixels
     kernel = collect_rays_kernel(real, max_hits, TILE_SIZE)
-    launch(rays, kernel, threads, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels)
+    launch(rays, kernel, threads, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
     normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
     return RayHits(plain, base, ids, depths, weights, alpha, Surface(expected, median, top, normals))

@@ -1,6 +1,5 @@
 """Texturing pass: the neural field at points, as spherical harmonics coefficients or as colours along rays."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,15 +11,10 @@ from nexwarp.kernels.cpu.hashgrid import WIDTH, hashgrid_simd_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops import fused_texture
+from nexwarp.ops import fused_texture, mlp
 from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point, uses_simd
-from nexwarp.ops.columns import parts_of, share_columns
 from nexwarp.ops.half_gradients import gradient_scale
 
-# Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
-POINT_MULTIPLE = 64
-# Not among torch's documented functions.
-_FUSED_RELU = hasattr(torch, "_addmm_activation")
 # Runs of levels that CPU threads share out in the backward pass.
 RUNS = 8
 
@@ -46,9 +40,9 @@ def texture(
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
     `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
 
-    On GPUs of compute capability 8.0 or more, colours in half precision are computed by one kernel forward and two
-    backward where L * F is 32, F is 2 or 4, there are two hidden layers of 64, directions need no gradient, and torch's
-    deterministic algorithms are off. All else is computed layer by layer.
+    Colours whose directions need no gradient are computed in few kernels: on CPUs for layers of at most 128, and in
+    half precision on GPUs of compute capability 8.0 or more for L * F = 32, F = 2 or 4, and two hidden layers of 64,
+    without torch's deterministic algorithms. All else is computed layer by layer.
 
     Args:
         positions: (n, 3) world.
@@ -71,19 +65,20 @@ def texture(
         (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours offset + SH(direction).
     """
     positions, depths = positions.contiguous(), depths.contiguous()
-    keep = torch.is_grad_enabled() and any(
-        x.requires_grad for x in (positions, depths, grid, *weights) + (() if directions is None else (directions,))
-    )
-    if directions is not None:
-        directions = directions.contiguous()
-        if fused and half and fused_texture.usable(positions, directions, grid, weights):
+    turned = directions is not None and directions.requires_grad
+    keep = torch.is_grad_enabled() and (turned or any(x.requires_grad for x in (positions, depths, grid, *weights)))
+    directions = None if directions is None else directions.contiguous()
+    points = (positions, depths, directions)
+    if directions is not None and fused:
+        if half and fused_texture.usable(positions, directions, grid, weights):
             height, width = image or (1, len(directions))
             shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
             copy = grid.detach().contiguous().half() if table is None else table
             inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
             return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
-    given = (positions, depths, directions, grid, table, resolutions, focal, offset, clamp, half, keep)
-    return _Texture.apply(*given, *weights)
+        if not half and not (keep and turned) and mlp.takes_simd(positions, weights):
+            return _SimdTexture.apply(*points, grid, resolutions, focal, offset, clamp, *weights)
+    return _Texture.apply(*points, grid, table, resolutions, focal, offset, clamp, half, keep, *weights)
 
 
 class _Texture(torch.autograd.Function):
@@ -106,21 +101,9 @@ class _Texture(torch.autograd.Function):
         dtype = torch.float16 if half else grid.dtype
         table = table if half and table is not None else grid.contiguous().to(dtype)
         matrices = [w.to(dtype) for w in weights]
-        count = len(positions)
-        encoded = torch.empty(grid.shape[0] * grid.shape[2], _padded(count, dtype), dtype=dtype, device=grid.device)
-        # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
-        if encoded.shape[1] > count:
-            encoded[:, count:] = 0
-        kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
-        launch(
-            positions,
-            kernels.forward,
-            (grid.shape[0], _groups(positions)),
-            arguments,
-            [array(encoded, STORAGES[dtype])],
-        )
+        encoded = _features(table, positions, depths, resolutions, focal)
         with torch.autocast(grid.device.type, enabled=False):
-            *layers, coefficients = _mlp(encoded, matrices, keep)
+            *layers, coefficients = mlp.outputs(encoded, matrices, keep)
         ctx.offset, ctx.clamp = offset, clamp
         ctx.layers = len(layers)
         # What was clamped, and how colours follow from directions, is all that the backward pass reads of them.
@@ -128,7 +111,7 @@ class _Texture(torch.autograd.Function):
         kept = coefficients if read else coefficients.new_empty(len(coefficients), 0)
         ctx.save_for_backward(positions, depths, directions, resolutions, focal, table, kept, *layers, *matrices)
         if directions is None:
-            return coefficients[:, :count].to(grid.dtype)
+            return coefficients[:, : len(positions)].to(grid.dtype)
         colors = torch.empty_like(positions)
         kernels, arguments = _colors(coefficients, directions, len(positions), offset, clamp)
         launch(
@@ -158,7 +141,7 @@ class _Texture(torch.autograd.Function):
             )
         unscale = scale.reciprocal()
         with torch.autocast(grad.device.type, enabled=False):
-            signal, grad_matrices = _mlp_backward(signal, layers, matrices)
+            signal, grad_matrices = mlp.outputs_backward(signal, layers, matrices)
         grad_matrices = [x * unscale for x in grad_matrices]
         grad_grid, grad_positions, grad_depths = _lookup_backward(
             table, positions, depths, resolutions, focal, signal, unscale, need_positions or need_depths
@@ -173,102 +156,71 @@ class _Texture(torch.autograd.Function):
         )
 
 
-def _padded(count: int, dtype: torch.dtype) -> int:
-    """Columns that the MLP works on for `count` points."""
-    if dtype == torch.float16:
-        return -(-count // POINT_MULTIPLE) * POINT_MULTIPLE
-    # An odd number of cache lines a row: with rows at multiples of 4096 bytes, a column would fall into one set of a
-    # CPU's cache and push itself out.
-    line = 64 // dtype.itemsize
-    return (-(-count // line) | 1) * line
+class _SimdTexture(torch.autograd.Function):
+    """Colours on a CPU, whose MLP and SH are one kernel each way."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        directions: torch.Tensor,
+        grid: torch.Tensor,
+        resolutions: torch.Tensor,
+        focal: torch.Tensor,
+        offset: float,
+        clamp: bool,
+        *weights: torch.Tensor,
+    ) -> torch.Tensor:
+        table = grid.contiguous()
+        encoded = _features(table, positions, depths, resolutions, focal)
+        colors = mlp.simd_colors(mlp.Field(encoded, weights, directions, len(positions)), offset, clamp)
+        ctx.clamp = clamp
+        ctx.save_for_backward(
+            positions, depths, directions, resolutions, focal, table, encoded, *([colors] if clamp else []), *weights
+        )
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        positions, depths, directions, resolutions, focal, table, encoded, *weights = ctx.saved_tensors
+        grad = grad.contiguous()
+        colors = weights.pop(0) if ctx.clamp else grad
+        need_positions, need_depths, _, need_grid = ctx.needs_input_grad[:4]
+        field = mlp.Field(encoded, weights, directions, len(positions))
+        signal, grad_matrices = mlp.simd_colors_backward(field, colors, grad, ctx.clamp)
+        grad_grid, grad_positions, grad_depths = _lookup_backward(
+            table, positions, depths, resolutions, focal, signal, grad.new_ones(1), need_positions or need_depths
+        )
+        return (
+            grad_positions if need_positions else None,
+            grad_depths if need_depths else None,
+            None,
+            grad_grid if need_grid else None,
+            *(None,) * 4,
+            *grad_matrices,
+        )
 
 
-def _mlp(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool) -> list[torch.Tensor]:
-    """Return the input (in, n) of each layer if `keep`, and the output of the last one."""
-    if encoded.device.type != "cpu":
-        layers = [encoded]
-        for matrix in matrices[:-1]:
-            layers.append(_product_relu(matrix, layers[-1]))
-            if not keep:
-                del layers[0]
-        return [*layers[: len(layers) * keep], matrices[-1] @ layers[-1]]
-    count = encoded.shape[1]
-    if not keep:
-        return [_mlp_on_cpu(encoded, matrices)]
-    layers = [encoded, *(encoded.new_empty(len(matrix), count) for matrix in matrices)]
-
-    def part(_: int, columns: slice) -> None:
-        for i, matrix in enumerate(matrices):
-            out = torch.mm(matrix, layers[i][:, columns], out=layers[i + 1][:, columns])
-            if i + 1 < len(matrices):
-                out.relu_()
-
-    share_columns(count, part)
-    return layers
-
-
-def _mlp_on_cpu(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return the output of the last layer; the others exist for one part of the columns at a time."""
-    result = encoded.new_empty(len(matrices[-1]), encoded.shape[1])
-
-    def part(_: int, columns: slice) -> None:
-        layer = encoded[:, columns]
-        for matrix in matrices[:-1]:
-            layer = torch.mm(matrix, layer).relu_()
-        torch.mm(matrices[-1], layer, out=result[:, columns])
-
-    share_columns(encoded.shape[1], part)
-    return result
-
-
-def _product_relu(matrix: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
-    """Relu(matrix @ layer) on CUDA, in half precision by one kernel, which saves reading and writing the product."""
-    if _FUSED_RELU and layer.dtype == torch.float16 and layer.shape[1] > 0:
-        return torch._addmm_activation(layer.new_zeros(layer.shape[1]), matrix, layer)
-    return torch.relu_(matrix @ layer)
-
-
-def _mlp_backward(
-    signal: torch.Tensor, layers: Sequence[torch.Tensor], matrices: Sequence[torch.Tensor]
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return the gradients of the first layer's input and of the matrices, from that of the output (out, n)."""
-    if signal.device.type != "cpu":
-        grads: list[torch.Tensor] = []
-        for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):
-            grads.insert(0, _product(signal, layer))
-            signal = matrix.T @ signal
-            if len(grads) < len(matrices):
-                signal = _relu_backward(signal, layer)
-        return signal, grads
-    count = signal.shape[1]
-    result = torch.empty_like(layers[0])
-    # A slot for each part, added up in order.
-    slots = [matrix.new_zeros(max(parts_of(count), 1), *matrix.shape) for matrix in matrices]
-
-    def part(index: int, columns: slice) -> None:
-        here = signal[:, columns]
-        for i in reversed(range(len(matrices))):
-            layer = layers[i][:, columns]
-            torch.mm(here, layer.T, out=slots[i][index])
-            if i == 0:
-                torch.mm(matrices[0].T, here, out=result[:, columns])
-            else:
-                here = _relu_backward(matrices[i].T @ here, layer)
-
-    share_columns(count, part)
-    return result, [functools.reduce(torch.Tensor.add_, slot.unbind()) for slot in slots]
-
-
-def _relu_backward(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
-    """Zero, in place, the gradient of a layer where the layer is 0."""
-    return torch.ops.aten.threshold_backward.grad_input(signal, layer, 0, grad_input=signal)
-
-
-def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
-    """Signal @ layer.T, summed and returned in at least float32."""
-    if signal.dtype == torch.float16:
-        return torch.mm(signal, layer.T, out_dtype=torch.float32)
-    return signal @ layer.T
+def _features(
+    table: torch.Tensor,
+    positions: torch.Tensor,
+    depths: torch.Tensor,
+    resolutions: torch.Tensor,
+    focal: torch.Tensor,
+) -> torch.Tensor:
+    """Return the features (L * F, padded n) of n points, 0 in the padding."""
+    levels, _, features = table.shape
+    count = len(positions)
+    encoded = table.new_empty(levels * features, mlp.padded(count, table.dtype))
+    # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
+    if encoded.shape[1] > count:
+        encoded[:, count:] = 0
+    kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
+    outputs = [array(encoded, STORAGES[table.dtype])]
+    launch(positions, kernels.forward, (levels, _groups(positions)), arguments, outputs)
+    return encoded
 
 
 def _lookup(

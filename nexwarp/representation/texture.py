@@ -9,7 +9,7 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.checks import check_range, check_tensors
-from nexwarp.ops import fused_texture
+from nexwarp.ops import fused_texture, mlp
 
 GRID_INIT = 0.01
 
@@ -121,7 +121,8 @@ class NeuralTexture(nn.Module):
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
         """Return how many values an evaluation keeps for each point, at least, and their dtype.
 
-        Features, hidden layers and output; without gradients no hidden layers; in one kernel the features alone.
+        Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone,
+        on CUDA those of no point without gradients.
 
         Args:
             sh_degree: SH degree of the evaluation.
@@ -129,8 +130,11 @@ class NeuralTexture(nn.Module):
         *hidden, last = self.mlp.parameters()
         features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
         kept = torch.is_grad_enabled()
-        if self._in_half() and fused_texture.fits(self.grid, [*hidden, last[:outputs]], 0):
+        matrices = [*hidden, last[:outputs]]
+        if self._in_half() and fused_texture.fits(self.grid, matrices, 0):
             return features * kept, torch.float16
+        if mlp.takes_simd(self.grid, matrices):
+            return features, self.grid.dtype
         dtype = torch.float16 if self._in_half() else self.grid.dtype
         return features + outputs + sum(map(len, hidden)) * kept, dtype
 

@@ -20,6 +20,7 @@ from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.fused_texture import supported, takes_shape
+from nexwarp.ops.mlp import fits_simd
 from nexwarp.ops.startup import start_warp
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
@@ -50,6 +51,9 @@ class Build(NamedTuple):
 def needed(config: Config, device: torch.device) -> list[Build]:
     """Return the catalogue's kernels that training and rendering with these settings need on a device."""
     textured, cpu = config.max_hits > 0, device.type == "cpu"
+    shape = config.texture
+    degree = config.sh_degree if shape.sh_degree is None else shape.sh_degree
+    sizes = [shape.levels * shape.features, *[shape.width] * shape.hidden_layers, 3 * (degree + 1) ** 2]
     threads = thread_kernels(
         wp.float32,
         wp.float32 if cpu else wp.float16,
@@ -59,6 +63,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH if cpu else 1,),
+        layered=not (cpu and fits_simd(sizes)),
         cpu=cpu,
         fixed_point=config.deterministic,
     )
@@ -68,7 +73,6 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
     builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
-    shape = config.texture
     if textured and supported(device) and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
         builds += (Build(*build) for build in fused_kernel_builds((shape.features,)))
     return builds

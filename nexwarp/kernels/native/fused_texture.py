@@ -1,7 +1,7 @@
 """Text of the fused texturing kernels, a program for one warp; see `nexwarp.kernels.fused_texture`."""
 
 from nexwarp.kernels.native.mma import PRELUDE, TRANSPOSED, product
-from nexwarp.kernels.sh import BAND_0, BAND_1, BAND_2, BAND_3
+from nexwarp.kernels.native.sh_terms import basis_terms
 
 FEATURES, WIDTH = 32, 64  # of the shapes that these kernels take: L * F, and both hidden layers
 OUTPUTS = 48  # of the last matrix, those of SH degree 3; lower degrees have zeros there
@@ -43,29 +43,10 @@ def _constants(**values: int) -> str:
 
 def _basis() -> str:
     """Return the text of `basis(x, y, z, q, out)`: the basis functions q, q + 4, q + 8, q + 12 at a unit direction."""
-    c, d = BAND_2, BAND_3
-    values = [
-        f"{BAND_0}f",
-        f"-{BAND_1}f * y",
-        f"{BAND_1}f * z",
-        f"-{BAND_1}f * x",
-        f"{c[0]}f * x * y",
-        f"-{c[0]}f * y * z",
-        f"{c[1]}f * (2.0f * zz - xx - yy)",
-        f"-{c[0]}f * x * z",
-        f"{c[2]}f * (xx - yy)",
-        f"-{d[0]}f * y * (3.0f * xx - yy)",
-        f"{d[1]}f * x * y * z",
-        f"-{d[2]}f * y * (4.0f * zz - xx - yy)",
-        f"{d[3]}f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy)",
-        f"-{d[2]}f * x * (4.0f * zz - xx - yy)",
-        f"{d[4]}f * z * (xx - yy)",
-        f"-{d[0]}f * x * (xx - 3.0f * yy)",
-    ]
     return f"""
     auto basis = [](float x, float y, float z, int q, float* out) {{
         const float xx = x * x, yy = y * y, zz = z * z;
-        const float all[] = {{{", ".join(values)}}};
+        const float all[] = {{{", ".join(basis_terms(3, suffix="f"))}}};
         for (int j = 0; j < 4; ++j)
             out[j] = q < 2 ? (q == 0 ? all[4 * j] : all[4 * j + 1]) : (q == 2 ? all[4 * j + 2] : all[4 * j + 3]);
     }};

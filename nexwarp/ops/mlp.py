@@ -1,0 +1,214 @@
+"""The texture's MLP (paper Sec. 4.1): layer by layer, or, on a CPU, with the SH colours in one kernel each way.
+
+Values are (features, points): a column is a point.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
+from nexwarp.kernels.launch import chunks
+from nexwarp.kernels.native.simd.mlp import BLOCKS, MOST_KEPT, MOST_ROWS, points_of
+from nexwarp.kernels.types import types
+from nexwarp.ops._interop import Argument, array, launch, real_of, uses_simd
+from nexwarp.ops.columns import parts_of, share_columns
+
+# Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
+POINT_MULTIPLE = 64
+# Not among torch's documented functions.
+_FUSED_RELU = hasattr(torch, "_addmm_activation")
+# Of the points that a thread of the SIMD form takes, each part with a sum of its own of the matrices' gradients.
+SMALLEST_PART, MOST_PARTS = 2048, 64
+
+
+def padded(count: int, dtype: torch.dtype) -> int:
+    """Columns that the MLP works on for `count` points."""
+    if dtype == torch.float16:
+        return -(-count // POINT_MULTIPLE) * POINT_MULTIPLE
+    # An odd number of cache lines a row: with rows at multiples of 4096 bytes, a column would fall into one set of a
+    # CPU's cache and push itself out.
+    line = 64 // dtype.itemsize
+    return (-(-count // line) | 1) * line
+
+
+def outputs(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool) -> list[torch.Tensor]:
+    """Return the input (in, n) of each layer if `keep`, and the output of the last one."""
+    if encoded.device.type != "cpu":
+        layers = [encoded]
+        for matrix in matrices[:-1]:
+            layers.append(_product_relu(matrix, layers[-1]))
+            if not keep:
+                del layers[0]
+        return [*layers[: len(layers) * keep], matrices[-1] @ layers[-1]]
+    count = encoded.shape[1]
+    if not keep:
+        return [_mlp_on_cpu(encoded, matrices)]
+    layers = [encoded, *(encoded.new_empty(len(matrix), count) for matrix in matrices)]
+
+    def part(_: int, columns: slice) -> None:
+        for i, matrix in enumerate(matrices):
+            out = torch.mm(matrix, layers[i][:, columns], out=layers[i + 1][:, columns])
+            if i + 1 < len(matrices):
+                out.relu_()
+
+    share_columns(count, part)
+    return layers
+
+
+def _mlp_on_cpu(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Return the output of the last layer; the others exist for one part of the columns at a time."""
+    result = encoded.new_empty(len(matrices[-1]), encoded.shape[1])
+
+    def part(_: int, columns: slice) -> None:
+        layer = encoded[:, columns]
+        for matrix in matrices[:-1]:
+            layer = torch.mm(matrix, layer).relu_()
+        torch.mm(matrices[-1], layer, out=result[:, columns])
+
+    share_columns(encoded.shape[1], part)
+    return result
+
+
+def _product_relu(matrix: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
+    """Relu(matrix @ layer) on CUDA, in half precision by one kernel, which saves reading and writing the product."""
+    if _FUSED_RELU and layer.dtype == torch.float16 and layer.shape[1] > 0:
+        return torch._addmm_activation(layer.new_zeros(layer.shape[1]), matrix, layer)
+    return torch.relu_(matrix @ layer)
+
+
+def outputs_backward(
+    signal: torch.Tensor, layers: Sequence[torch.Tensor], matrices: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return the gradients of the first layer's input and of the matrices, from that of the output (out, n)."""
+    if signal.device.type != "cpu":
+        grads: list[torch.Tensor] = []
+        for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):
+            grads.insert(0, _product(signal, layer))
+            signal = matrix.T @ signal
+            if len(grads) < len(matrices):
+                signal = _relu_backward(signal, layer)
+        return signal, grads
+    count = signal.shape[1]
+    result = torch.empty_like(layers[0])
+    # A slot for each part, added up in order.
+    slots = [matrix.new_zeros(max(parts_of(count), 1), *matrix.shape) for matrix in matrices]
+
+    def part(index: int, columns: slice) -> None:
+        here = signal[:, columns]
+        for i in reversed(range(len(matrices))):
+            layer = layers[i][:, columns]
+            torch.mm(here, layer.T, out=slots[i][index])
+            if i == 0:
+                torch.mm(matrices[0].T, here, out=result[:, columns])
+            else:
+                here = _relu_backward(matrices[i].T @ here, layer)
+
+    share_columns(count, part)
+    return result, [functools.reduce(torch.Tensor.add_, slot.unbind()) for slot in slots]
+
+
+def _relu_backward(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
+    """Zero, in place, the gradient of a layer where the layer is 0."""
+    return torch.ops.aten.threshold_backward.grad_input(signal, layer, 0, grad_input=signal)
+
+
+def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
+    """Signal @ layer.T, summed and returned in at least float32."""
+    if signal.dtype == torch.float16:
+        return torch.mm(signal, layer.T, out_dtype=torch.float32)
+    return signal @ layer.T
+
+
+class Field(NamedTuple):
+    """What the SIMD form reads.
+
+    Attributes:
+        encoded: (in, padded n) features.
+        matrices: (out, in) each.
+        directions: (P, 3) unit directions, of n // P points each.
+        points: n.
+    """
+
+    encoded: torch.Tensor
+    matrices: Sequence[torch.Tensor]
+    directions: torch.Tensor
+    points: int
+
+    def arguments(self) -> list[Argument]:
+        """Return the first arguments of both kernels, from `part_size` to `hits`."""
+        real = real_of(self.encoded)
+        sizes = [len(self.encoded), *map(len, self.matrices)]
+        return [
+            self.part_size,
+            array(torch.cat([matrix.reshape(-1) for matrix in self.matrices]), real),
+            array(torch.tensor(sizes, dtype=torch.int32), wp.int32),
+            array(self.encoded, real),
+            array(self.directions, types(real).vec3),
+            self.points // max(len(self.directions), 1),
+        ]
+
+    @property
+    def part_size(self) -> int:
+        """Points of a part, but for the last one."""
+        align = BLOCKS * points_of("float")
+        return next((last for _, last in chunks(self.points, align, SMALLEST_PART, MOST_PARTS)), align)
+
+    @property
+    def parts(self) -> int:
+        """Number of parts."""
+        return -(-self.points // self.part_size)
+
+    @property
+    def degree(self) -> int:
+        """SH degree."""
+        return round((len(self.matrices[-1]) // 3) ** 0.5) - 1
+
+
+def fits_simd(sizes: Sequence[int]) -> bool:
+    """Whether the SIMD form has room for an MLP of so many features, neurons of each hidden layer, and outputs."""
+    filled = [-(-size // 4) * 4 for size in sizes]
+    return max(filled) <= MOST_ROWS and sum(filled[:-1]) <= MOST_KEPT
+
+
+def takes_simd(like: torch.Tensor, matrices: Sequence[torch.Tensor]) -> bool:
+    """Whether the SIMD form takes an MLP, and points on a tensor's device."""
+    same = all(matrix.dtype == like.dtype for matrix in matrices)
+    return same and uses_simd(like) and fits_simd([matrices[0].shape[1], *map(len, matrices)])
+
+
+def simd_colors(field: Field, offset: float, clamp: bool) -> torch.Tensor:
+    """Return (n, 3) colours offset + SH(direction)."""
+    real = real_of(field.encoded)
+    colors = field.encoded.new_empty(field.points, 3)
+    arguments = [*field.arguments(), offset, clamp]
+    kernel = mlp_simd_kernels(real, field.degree).forward
+    launch(colors, kernel, field.parts, arguments, [array(colors, types(real).vec3)], smallest=1)
+    return colors
+
+
+def simd_colors_backward(
+    field: Field, colors: torch.Tensor, grad_colors: torch.Tensor, clamp: bool
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return the gradients of the features, padded as they are, and of the matrices.
+
+    Args:
+        field: as it was.
+        colors: (n, 3) what `simd_colors` returned, if `clamp`; else anything.
+        grad_colors: (n, 3) contiguous.
+        clamp: as it was.
+    """
+    real = real_of(field.encoded)
+    vec3 = types(real).vec3
+    grad_encoded = torch.empty_like(field.encoded)
+    grad_encoded[:, field.points :] = 0
+    sizes = [matrix.numel() for matrix in field.matrices]
+    slots = grad_colors.new_zeros(field.parts, sum(sizes))
+    arguments = [*field.arguments(), clamp, array(colors, vec3), array(grad_colors, vec3)]
+    kernel = mlp_simd_kernels(real, field.degree).backward
+    launch(grad_colors, kernel, field.parts, arguments, [array(grad_encoded, real), array(slots, real)], smallest=1)
+    sums = slots.sum(0).split(sizes)
+    return grad_encoded, [x.view_as(matrix) for x, matrix in zip(sums, field.matrices, strict=True)]
