@@ -13,7 +13,7 @@ from nexwarp.kernels import launch
 from nexwarp.kernels.native.simd import simd_functions
 from tests.scenes import Scene, layered_scene, random_scene
 from tests.simd_kernels import ARITHMETIC, WIDTH, function_kernel, masks_kernel, slots_kernel
-from tests.test_threads import Passes
+from tests.test_threads import Passes, errors_of
 from tests.tolerances import assert_close
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -136,12 +136,13 @@ def test_both_forms_of_collection_agree(
     """Sizes that no strip or tile divides, so that some of their pixels lie outside the image."""
     size: dict[str, Any] = {} if layered else {"width": 61, "height": 45}
     scene: Scene = (layered_scene if layered else random_scene)(150, seed=3, dtype=dtype, **size)
-    buffers, gradients = [], []
+    buffers, gradients, blended = [], [], []
     for form in FORMS:
         with launch.cpu_form(form):
             passes = Passes(scene, low_pass=low_pass, max_hits=max_hits, tile_size=tile_size)
             buffers.append(passes.buffers())
             gradients.append(passes.gradients())
+            blended.append(passes.blended(errors_of(scene, dtype)))
     for name, value in buffers[1].items():
         if name == "ids":
             assert torch.equal(buffers[0][name], value)
@@ -150,6 +151,8 @@ def test_both_forms_of_collection_agree(
     for name, gradient in gradients[1].items():
         assert gradient.abs().max() > 0, name
         assert_close(gradients[0][name], gradient, kind="gradient", name=name)
+    assert blended[1].any()
+    assert_close(blended[0], blended[1], kind="value", name="blended errors")
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 1003])

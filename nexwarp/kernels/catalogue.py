@@ -13,6 +13,7 @@ from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
 from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
+from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
@@ -137,7 +138,7 @@ def walk_kernels(
     forward = collect_simd_kernel if cpu else collect_kernel
     backward = collect_simd_backward_kernel if cpu else collect_backward_kernel
     for low_pass in low_passes:
-        yield splat_error_kernel(real, low_pass, tile_size)
+        yield (splat_error_simd_kernel if cpu else splat_error_kernel)(real, low_pass, tile_size)
         if fixed_point and not cpu:
             yield splat_error_kernel(real, low_pass, tile_size, fixed_point=True)
         for hits in max_hits:

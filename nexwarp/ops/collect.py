@@ -10,6 +10,7 @@ from nexwarp.checks import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel, strip_width
+from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.types import MAX_HITS, types
@@ -126,9 +127,15 @@ def splat_error(
     slots = sums.new()
     errors = errors.detach().to(records.dtype).contiguous()
     inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
-    inputs += [sums.slots, array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
-    kernel = splat_error_kernel(real, low_pass, tiles.tile_size, sums.fixed_point)
-    launch_walk(records, kernel, tiles, inputs, [sums.array(slots, real), sums.bad_array])
+    pixels = [sums.slots, array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
+    variant = (real, low_pass, tiles.tile_size)
+    if uses_simd(records):
+        inputs += [array(tiles.reaches, types(real).vec2), *pixels]
+        width = strip_width(tiles.tile_size)
+        launch_walk(records, splat_error_simd_kernel(*variant), tiles, inputs, [sums.array(slots, real)], width)
+    else:
+        kernel = splat_error_kernel(*variant, sums.fixed_point)
+        launch_walk(records, kernel, tiles, inputs + pixels, [sums.array(slots, real), sums.bad_array])
     return sums.reduce(slots[:, None], real)[:, 0]
 
 

@@ -206,9 +206,10 @@ def simd_colors_backward(
     grad_encoded = torch.empty_like(field.encoded)
     grad_encoded[:, field.points :] = 0
     sizes = [matrix.numel() for matrix in field.matrices]
-    slots = grad_colors.new_zeros(field.parts, sum(sizes))
+    slots = grad_colors.new_zeros(max(field.parts, 1), sum(sizes))
     arguments = [*field.arguments(), clamp, array(colors, vec3), array(grad_colors, vec3)]
     kernel = mlp_simd_kernels(real, field.degree).backward
     launch(grad_colors, kernel, field.parts, arguments, [array(grad_encoded, real), array(slots, real)], smallest=1)
-    sums = slots.sum(0).split(sizes)
-    return grad_encoded, [x.view_as(matrix) for x, matrix in zip(sums, field.matrices, strict=True)]
+    total = functools.reduce(torch.Tensor.add_, slots.unbind())
+    sums = zip(total.split(sizes), field.matrices, strict=True)
+    return grad_encoded, [x.view_as(matrix) for x, matrix in sums]
