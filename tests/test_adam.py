@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.train import schedules
+from nexwarp.ops.adam import Moments, adam_step
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.losses import LossWeights, grid_loss
@@ -84,6 +84,25 @@ def test_half_copy_is_the_grid(device: torch.device) -> None:
     assert (texture.half_copy() == 1).all()
 
 
+@pytest.mark.parametrize("shape", [(5, 1, 1), (5, 8, 1), (3, 1024, 1), (2, 1024, 2)])
+def test_grids_of_any_size_are_regularised(shape: tuple[int, int, int], device: torch.device) -> None:
+    """Levels smaller than a thread's values and than a SIMD vector's, and several threads a level."""
+    torch.manual_seed(1)
+    factors = torch.rand(shape[0], device=device)
+    ours = torch.randn(shape, device=device)
+    theirs = ours.double().requires_grad_()
+    expected = (factors.double()[:, None, None] * theirs.square()).sum()
+    (grad,) = torch.autograd.grad(expected, theirs)
+    moments = Moments(torch.ones((), device=device), torch.zeros_like(ours), torch.zeros_like(ours))
+    rate = torch.tensor(0.1, device=device)
+    loss = adam_step(ours, None, moments, rate, betas=(0.9, 0.999), epsilon=1e-15, factors=factors)
+    assert loss is not None
+    assert_close(loss, expected, kind="value", name="loss")
+    assert_close(moments.mean, 0.1 * grad, kind="value", name="mean")
+    assert_close(moments.square, 0.001 * grad.square(), kind="value", name="square")
+    assert_close(ours, theirs - 0.1 * grad.sign(), kind="value", name="grid")
+
+
 def test_parameters_without_a_gradient_stay(device: torch.device) -> None:
     """But for the regularised grid, which has the regulariser's."""
     texture, parameters = make_parameters(device)
@@ -126,9 +145,7 @@ def test_checkpoints_are_those_of_torch(kinds: tuple[type[torch.optim.Adam], ...
         assert_close(copies[name], parameter, kind="value", name=name)
 
 
-def test_trainings_resume_from_torchs_adam(
-    tmp_path: Path, tiny_scene: nw.Scene, device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trainings_resume_from_torchs_adam(tmp_path: Path, tiny_scene: nw.Scene, device: torch.device) -> None:
     """A checkpoint written with torch's Adam and the grid's loss continues as if ours had written it."""
     texture = TextureConfig(table_size=2**10)
     config = nw.Config(iterations=20, max_surfels=300, texture=texture, deterministic=True)
@@ -139,8 +156,6 @@ def test_trainings_resume_from_torchs_adam(
     def theirs(groups: list[dict[str, Any]]) -> torch.optim.Adam:
         return torch.optim.Adam(on_device(groups), eps=EPSILON, fused=True, capturable=device.type == "cuda")
 
-    # On a CPU torch's is the default.
-    monkeypatch.setattr(schedules, "_make_adam", lambda groups, _: FusedAdam(on_device(groups), eps=EPSILON))
     trainers = [Trainer(tiny_scene, config, device, optimizer=make) for make in (None, theirs)]
     assert isinstance(trainers[0].optimizer, FusedAdam)
     trainers[1].run(until=10)

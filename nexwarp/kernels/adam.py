@@ -1,8 +1,9 @@
 """One step of Adam (Kingma and Ba, 2015), with the hash grid's regulariser and its half-precision copy.
 
-A thread is four neighbouring values of one parameter, written in place with their moments. The regulariser is
-sum_l c_l sum(H_l^2) over the levels of a grid (L, T, F): its gradient is added to what autograd gave, and its value,
-before the step, is written as one sum for each warp, so that neither depends on the order of threads.
+A thread is four neighbouring values of one parameter, on a CPU 1,024, written in place with their moments. The
+regulariser is sum_l c_l sum(H_l^2) over the levels of a grid (L, T, F): its gradient is added to what autograd gave.
+Its value, before the step, is written as one sum for each warp, on a CPU for each thread. Neither depends on the order
+of threads.
 """
 
 import functools
@@ -11,42 +12,34 @@ import warp as wp
 
 from nexwarp.kernels.native.warp import lane_index, warp_size, warp_sum
 
-VALUES = 4  # of a thread
+VALUES, CPU_VALUES = 4, 1024  # of a thread
 
 _STEP = """
-    const size_t at = 4 * (size_t)thread, count = values.shape[0];
-    const int size = at + 4 <= count ? 4 : (at < count ? (int)(count - at) : 0);
 #if defined(__CUDA_ARCH__)
+    const size_t at = VALUES * (size_t)thread, count = values.shape[0];
+    const int size = at + VALUES <= count ? VALUES : (at < count ? (int)(count - at) : 0);
     auto read = [&](const wp::float32* from, wp::float32* to) {
-        if (size == 4) {
+        if (size == VALUES) {
             const float4 x = *reinterpret_cast<const float4*>(from + at);
             to[0] = x.x; to[1] = x.y; to[2] = x.z; to[3] = x.w;
         } else {
-            for (int k = 0; k < 4; ++k) to[k] = k < size ? from[at + k] : 0.0f;
+            for (int k = 0; k < VALUES; ++k) to[k] = k < size ? from[at + k] : 0.0f;
         }
     };
     auto write = [&](wp::float32* to, const wp::float32* from) {
-        if (size == 4) {
+        if (size == VALUES) {
             *reinterpret_cast<float4*>(to + at) = make_float4(from[0], from[1], from[2], from[3]);
         } else {
-            for (int k = 0; k < 4; ++k) if (k < size) to[at + k] = from[k];
+            for (int k = 0; k < VALUES; ++k) if (k < size) to[at + k] = from[k];
         }
     };
-#else
-    auto read = [&](const wp::float32* from, wp::float32* to) {
-        for (int k = 0; k < 4; ++k) to[k] = k < size ? from[at + k] : 0.0f;
-    };
-    auto write = [&](wp::float32* to, const wp::float32* from) {
-        for (int k = 0; k < size; ++k) to[at + k] = from[k];
-    };
-#endif
-    wp::float32 p[4], g[4] = {}, m[4], v[4];
+    wp::float32 p[VALUES], g[VALUES] = {}, m[VALUES], v[VALUES];
     read(values.data, p);
     read(means.data, m);
     read(squares.data, v);
     if (grads.shape[0] > 0) read(grads.data, g);
     wp::float32 loss = 0.0f;
-    for (int k = 0; k < 4; ++k) {
+    for (int k = 0; k < VALUES; ++k) {
         if (factors.shape[0] > 0 && k < size) {
             const wp::float32 pull = factors.data[(at + k) >> level_bits] * p[k];
             g[k] += 2.0f * pull;
@@ -60,21 +53,58 @@ _STEP = """
     write(means.data, m);
     write(squares.data, v);
     if (halves.shape[0] > 0) {
-#if defined(__CUDA_ARCH__)
         unsigned words[2];
         for (int k = 0; k < 2; ++k)
             asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(words[k]) : "f"(p[2 * k + 1]), "f"(p[2 * k]));
-        if (size == 4) {
+        if (size == VALUES) {
             *reinterpret_cast<uint2*>(halves.data + at) = make_uint2(words[0], words[1]);
         } else {
-            for (int k = 0; k < 4; ++k) if (k < size) halves.data[at + k] = wp::half(p[k]);
+            for (int k = 0; k < VALUES; ++k) if (k < size) halves.data[at + k] = wp::half(p[k]);
         }
-#else
-        for (int k = 0; k < size; ++k) halves.data[at + k] = wp::half(p[k]);
-#endif
     }
     return loss;
-"""
+#else
+    typedef float reals_t __attribute__((ext_vector_type(16)));
+    const size_t first = CPU_VALUES * (size_t)thread, count = values.shape[0];
+    reals_t loss = 0.0f;
+    for (size_t at = first; at < first + CPU_VALUES && at < count; at += 16) {
+        const int size = at + 16 <= count ? 16 : (int)(count - at);
+        auto read = [&](const wp::float32* from) {
+            reals_t x = 0.0f;
+            if (size == 16)
+                __builtin_memcpy(&x, from + at, sizeof(x));
+            else
+                for (int k = 0; k < size; ++k) x[k] = from[at + k];
+            return x;
+        };
+        auto write = [&](wp::float32* to, reals_t x) {
+            if (size == 16)
+                __builtin_memcpy(to + at, &x, sizeof(x));
+            else
+                for (int k = 0; k < size; ++k) to[at + k] = x[k];
+        };
+        reals_t p = read(values.data), g = grads.shape[0] > 0 ? read(grads.data) : (reals_t)(0.0f);
+        if (factors.shape[0] > 0) {
+            reals_t factor = factors.data[at >> level_bits];
+            if (level_bits < 4)
+                for (int k = 1; k < size; ++k) factor[k] = factors.data[(at + k) >> level_bits];
+            const reals_t pull = factor * p;
+            g += 2.0f * pull;
+            loss += pull * p;
+        }
+        const reals_t m = beta1 * read(means.data) + rest1 * g;
+        const reals_t v = beta2 * read(squares.data) + rest2 * g * g;
+        p -= rate * m / (__builtin_elementwise_sqrt(v) * correction + epsilon);
+        write(values.data, p);
+        write(means.data, m);
+        write(squares.data, v);
+        for (int k = 0; k < size && halves.shape[0] > 0; ++k) halves.data[at + k] = wp::half(p[k]);
+    }
+    wp::float32 sum = 0.0f;
+    for (int k = 0; k < 16; ++k) sum += loss[k];
+    return sum;
+#endif
+""".replace("CPU_VALUES", str(CPU_VALUES)).replace("VALUES", str(VALUES))
 
 # 1 - beta^count, which is small in the first steps: in double precision, or by the function made for that.
 _REST = """

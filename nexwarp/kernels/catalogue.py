@@ -90,8 +90,7 @@ def thread_kernels(
     if cpu:  # elsewhere the surfels themselves are sorted
         yield surfel_ids_kernel
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
-    if not cpu:
-        yield adam_kernel()
+    yield adam_kernel()
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
     for length in ssim_lengths:
         ssim = ssim_kernels(real, length)

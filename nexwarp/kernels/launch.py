@@ -20,7 +20,7 @@ CHUNKS_A_THREAD = 4
 EVEN_CHUNKS_A_THREAD = 2
 SMALLEST_CHUNK = 256
 # Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
-LIGHT_CHUNK = 2048
+LIGHT_CHUNK = 4096
 
 CpuForm = Literal["simd", "scalar"]
 

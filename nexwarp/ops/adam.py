@@ -6,8 +6,10 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from nexwarp.kernels.adam import VALUES, adam_kernel
+from nexwarp.kernels.adam import CPU_VALUES, VALUES, adam_kernel
 from nexwarp.ops._interop import array, launch
+
+SMALLEST_CHUNK = 64  # of threads on a CPU
 
 
 class Moments(NamedTuple):
@@ -52,7 +54,7 @@ def adam_step(
         With `factors`, that sum before the step, a scalar; None without.
     """
     count = parameter.numel()
-    threads = -(-count // VALUES)
+    threads = -(-count // (VALUES if parameter.is_cuda else CPU_VALUES))
     level_bits, losses = 0, parameter.new_empty(0)
     if factors is not None:
         level_bits = (count // len(parameter)).bit_length() - 1
@@ -66,7 +68,7 @@ def adam_step(
     inputs += [*betas, *(1.0 - beta for beta in betas), *(math.log(beta) for beta in betas), epsilon]
     outputs = [array(x.view(-1), wp.float32) for x in (parameter, moments.mean, moments.square)]
     outputs += [array(nothing.half() if half is None else half.view(-1), wp.float16), array(losses, wp.float32)]
-    launch(parameter, adam_kernel(), threads, inputs, outputs)
+    launch(parameter, adam_kernel(), threads, inputs, outputs, smallest=SMALLEST_CHUNK)
     return None if factors is None else losses.sum()
 
 

@@ -23,24 +23,25 @@ class FusedAdam(torch.optim.Adam):
         """Make an optimizer.
 
         Args:
-            groups: parameter groups; their learning rates are tensors on the parameters' device.
+            groups: parameter groups; their learning rates are numbers, or tensors on the parameters' device.
             eps: added to the denominator.
         """
-        capturable = all(group["lr"].is_cuda for group in groups)
+        capturable = all(isinstance(group["lr"], torch.Tensor) and group["lr"].is_cuda for group in groups)
         super().__init__(groups, eps=eps, fused=True, capturable=capturable)
         self.grid_loss: torch.Tensor | None = None
         self._texture: NeuralTexture | None = None
         self._factors: torch.Tensor | None = None
 
     def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:
-        """Take over a texture's grid: keep its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
+        """Take over a texture's grid: update its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
 
         Args:
             texture: whose grid is among the parameters.
             factors: (L,) factors; None adds nothing.
         """
         self._texture, self._factors = texture, factors
-        texture.half_copy()  # before any step is captured
+        if texture.grid.is_cuda:
+            texture.half_copy()  # before any step is captured
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -48,6 +49,9 @@ class FusedAdam(torch.optim.Adam):
         if closure is not None:
             raise TypeError("closure: expected None; a loss is evaluated once a step")
         grid = None if self._texture is None else self._texture.grid
+        half = None
+        if self._texture is not None and (self._texture.grid.is_cuda or self._texture.half_copy_key() is not None):
+            half = self._texture.half_copy()
         steps: list[torch.Tensor] = []
         work = []
         for group in self.param_groups:
@@ -69,11 +73,11 @@ class FusedAdam(torch.optim.Adam):
                 parameter.detach(),
                 parameter.grad,
                 Moments(state["step"], state["exp_avg"], state["exp_avg_sq"]),
-                group["lr"],
+                torch.as_tensor(group["lr"], dtype=torch.float32, device=parameter.device),
                 betas=group["betas"],
                 epsilon=group["eps"],
                 factors=factors,
-                half=self._texture.half_copy() if self._texture is not None and parameter is grid else None,
+                half=half if parameter is grid else None,
             )
             self.grid_loss = self.grid_loss if loss is None else loss
 

@@ -41,7 +41,7 @@ def make_optimizer(
         texture: to train, unless K is 0.
         config: whose learning rates count.
         scale: of the scene, world units, which the means' rates follow.
-        make: makes an optimizer of one's own; None makes Adam, on CUDA a `FusedAdam` that regularises the grid.
+        make: makes an optimizer of one's own; None makes a `FusedAdam`, which regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
         poses: pose corrections and motions to train; None trains none.
 
@@ -72,11 +72,11 @@ def make_optimizer(
     return optimizer
 
 
-def _make_adam(groups: list[ParameterGroup], device: torch.device) -> torch.optim.Adam:
+def _make_adam(groups: list[ParameterGroup], device: torch.device) -> FusedAdam:
     """Make Adam with the paper's epsilon; on CUDA, its rates are tensors, which a CUDA graph reads."""
-    if device.type != "cuda":
-        return torch.optim.Adam(groups, eps=EPSILON, fused=True)
-    return FusedAdam([group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups], eps=EPSILON)
+    if device.type == "cuda":
+        groups = [group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups]
+    return FusedAdam(groups, eps=EPSILON)
 
 
 def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:
