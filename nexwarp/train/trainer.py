@@ -20,6 +20,7 @@ from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
+from nexwarp.ops.columns import few_torch_threads
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
@@ -176,7 +177,8 @@ class Trainer:
     def step(self) -> StepReport:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
-        with fixed_order, torch.autocast(self.device.type, enabled=False):
+        threads = few_torch_threads(self.device, 3 * self.views.pixels * max(self.config.max_hits, 1))
+        with fixed_order, threads, torch.autocast(self.device.type, enabled=False):
             target = self._next_target()
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             result = self._run_step(target)

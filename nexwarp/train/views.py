@@ -79,6 +79,11 @@ class TrainingViews:
             for index, (name, camera) in middles
         }
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the first photo."""
+        return self.cameras[0].width * self.cameras[0].height
+
     def fingerprint(self) -> str:
         """Return a digest of the views' names and cameras."""
         digest = hashlib.sha256()
