@@ -130,3 +130,25 @@ def test_import_is_quick(fresh_imports: tuple[list[float], list[Path]]) -> None:
 def test_import_compiles_nothing(fresh_imports: tuple[list[float], list[Path]]) -> None:
     _, files = fresh_imports
     assert not files
+
+
+USES = """
+import sys
+import nexwarp as nw
+
+from nexwarp.train.config import TextureConfig
+
+scene, shape = nw.load_scene(sys.argv[1]), TextureConfig(table_size=2**10)
+trainer = nw.Trainer(scene, nw.Config(iterations=2, max_surfels=50, texture=shape), "cpu")
+trainer.run()
+trainer.finish().save(sys.argv[2])
+nw.load(sys.argv[2]).render(scene.test[0].camera)
+print([name for name in sys.modules if name.startswith("torch._dynamo") or name.startswith("sympy")])
+"""
+
+
+def test_training_and_loading_import_no_compiler_of_torch(tiny_folder: Path, tmp_path: Path) -> None:
+    """It takes 0.6 to 1.2 s, at the start of every command."""
+    command = [sys.executable, "-c", USES, str(tiny_folder), str(tmp_path / "model")]
+    run = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, check=False)
+    assert run.stdout.splitlines()[-1:] == ["[]"], run.stdout + run.stderr
