@@ -124,8 +124,9 @@ def _jobs(device: torch.device, hits: Sequence[int], sizes: Sequence[tuple[int, 
     yield partial(_fuse, device, 33, 47)
     if device.type == "cuda":  # where renderings add by atomics instead
         yield partial(_reduce, device)
-        for features in (2, 4):
-            yield partial(_texture, device, next(size), features)
+    # Above, directions have gradients, for which colours are computed layer by layer.
+    for features, degree in ((2, 3), (4, 3)) if device.type == "cuda" else zip((2,) * 4, range(4), strict=True):
+        yield partial(_texture, device, next(size), features, degree)
 
 
 @contextmanager
@@ -251,10 +252,10 @@ def _losses(device: torch.device, width: int, height: int) -> int:
     return 0
 
 
-def _texture(device: torch.device, size: tuple[int, int], features: int) -> int:
+def _texture(device: torch.device, size: tuple[int, int], features: int, degree: int) -> int:
     """Look points up in a texture that the fused kernels take, differentiate, take a step of Adam; 0 renderings."""
     width, height = size
-    texture = nw.NeuralTexture(32 // features, 2**8, features, 1.0, 6.0).to(device)
+    texture = nw.NeuralTexture(32 // features, 2**8, features, 1.0, 6.0, sh_degree=degree).to(device)
     generator = torch.Generator().manual_seed(0)
     positions, depths = (torch.rand(height, width, 2, *n, generator=generator).to(device) for n in ((3,), ()))
     directions = torch.nn.functional.normalize(torch.randn(height, width, 3, generator=generator), dim=-1).to(device)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from nexwarp.cli import main as cli
 from nexwarp.cli.display import TrainingDisplay
+from nexwarp.train.adam import FusedAdam
 from nexwarp.train.densify import Densifier
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, picture, read, refused, snapshot
@@ -42,7 +42,7 @@ def interrupt_after(
         (TrainingDisplay, "__call__", 7),  # between two steps
         (TrainingDisplay, "__call__", 1),  # before there is any checkpoint
         (Densifier, "accumulate", 5),  # after a backward pass, before the optimizer steps
-        (torch.optim.Adam, "step", 8),
+        (FusedAdam, "step", 8),
     ],
 )
 def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, capsys, owner, method, calls):
@@ -88,7 +88,7 @@ def test_other_signals_stop_in_order_too(trained, scene, tmp_path, capsys, name,
     number = getattr(signal, name)
     before, run = signal.getsignal(number), tmp_path / "run"
     with pytest.MonkeyPatch.context() as patch:
-        interrupt_after(patch, torch.optim.Adam, "step", 7, number)
+        interrupt_after(patch, FusedAdam, "step", 7, number)
         assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == code
     assert capsys.readouterr().err == "nexwarp: terminated; continue with --resume\n"
     assert read(run / "checkpoint", "state.json")["iteration"] == 7
@@ -101,7 +101,7 @@ def test_a_closed_terminal_does_not_stop_what_nohup_started(scene, tmp_path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with pytest.MonkeyPatch.context() as patch:
-            interrupt_after(patch, torch.optim.Adam, "step", 2, signal.SIGHUP)
+            interrupt_after(patch, FusedAdam, "step", 2, signal.SIGHUP)
             command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "3"]
             assert cli.main(command) == 0
     finally:
