@@ -221,3 +221,26 @@ def test_colors_of_large_layers_are_those_of_torch() -> None:
         with launch.cpu_form(form):
             colors.append(texture.colors(positions, depths, directions, 24.0))
     assert_close(colors[0], colors[1], kind="value", name="colors")
+
+
+@pytest.mark.parametrize("part", ["grid", "hidden", "last"])
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_not_a_number_reaches_the_colors(part: str, form: launch.CpuForm) -> None:
+    """And its gradients: ReLU must not hide that a training has diverged."""
+    texture = nw.NeuralTexture(2, 2**4, 1, 1.0, 2.0, width=8)
+    *hidden, last = texture.mlp.parameters()
+    with torch.no_grad():
+        {"grid": texture.grid, "hidden": hidden[1], "last": last}[part].fill_(torch.nan)
+    with launch.cpu_form(form):
+        colors = texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)
+        assert colors.isnan().all()
+        grads = torch.autograd.grad(colors.sum(), [texture.grid, hidden[0]])
+    assert any(grad.isnan().any() for grad in grads)
+
+
+def test_an_mlp_that_does_not_fit_its_grid_is_refused() -> None:
+    for wrong in (torch.nn.Linear(8, 48, bias=False), torch.nn.Linear(4, 47, bias=False)):
+        texture = nw.NeuralTexture(2, 2**4, 2, 1.0, 2.0, hidden_layers=0)
+        texture.mlp = torch.nn.Sequential(wrong)
+        with pytest.raises((RuntimeError, ValueError)):
+            texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)

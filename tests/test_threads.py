@@ -105,10 +105,12 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
 
 @BOTH_FORMS
 @pytest.mark.parametrize("with_colors", [False, True], ids=["coefficients", "colors"])
-def test_texture_does_not_depend_on_threads(with_colors):
+@pytest.mark.parametrize("turned", [False, True], ids=["fixed", "turned"])
+def test_texture_does_not_depend_on_threads(with_colors, turned):
+    """Colours are computed in few kernels where directions are fixed; 10,000 points have five parts."""
     texture = make_texture()
     generator = torch.Generator().manual_seed(4)
-    count, hits = 1500, 2
+    count, hits = 5000, 2
     positions = 3 * torch.randn(count, hits, 3, generator=generator)
     depths = 1 + torch.rand(count, hits, generator=generator)
     depths[::7, 1] = 0.0  # empty slots
@@ -118,11 +120,12 @@ def test_texture_does_not_depend_on_threads(with_colors):
         launch.set_num_threads(threads)
         inputs = {"positions": positions, "depths": depths, "directions": directions}
         leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+        toward = leaves["directions"] if turned else leaves.pop("directions").detach()
         if with_colors:
-            out = texture.colors(leaves["positions"], leaves["depths"], leaves["directions"], 24.0)
+            out = texture.colors(leaves["positions"], leaves["depths"], toward, 24.0)
         else:
             out = texture(leaves["positions"], leaves["depths"], 24.0)
-            leaves.pop("directions")
+            leaves.pop("directions", None)
         factors = torch.randn(out.shape, generator=torch.Generator().manual_seed(1))
         parameters = dict(texture.named_parameters())
         grads = torch.autograd.grad((out * factors).sum(), [*leaves.values(), *parameters.values()])

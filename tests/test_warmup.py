@@ -106,6 +106,7 @@ SETTINGS = {
     "no texture": Config(max_hits=0),
     "no texture, floaters left": Config(max_hits=0, densify=DensifyConfig(floaters=False)),
     "K = 3": Config(max_hits=3),
+    "poses": Config(refine_poses=True),
     "deterministic": Config(deterministic=True),
     "options": Config(low_pass=True, sh_degree=1, texture=TextureConfig(residual=False)),
 }
@@ -131,6 +132,8 @@ def test_few_kernels_are_listed_in_vain(launched: set[tuple[str, int]]) -> None:
     warmup.rehearse(Config(), CPU)
     idle = [key for module, key in listed.items() if module not in dict(launched)]
     assert len(idle) <= 1, idle
+    without = [kernel.key for kernel, _ in warmup.needed(Config(max_hits=0), CPU)]
+    assert not any("mlp" in key or "textured" in key for key in without)
 
 
 def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:

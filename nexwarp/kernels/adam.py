@@ -126,7 +126,7 @@ def rest_of_power(log_beta: wp.float32, count: wp.float32) -> wp.float32:
 
 @functools.cache
 def adam_kernel() -> wp.Kernel:
-    """Make the kernel; parameters and moments are flat float32, from addresses that are multiples of 16 bytes."""
+    """Make the kernel; parameters and moments are flat float32, on CUDA from addresses that are multiples of 16."""
     add_up = warp_sum(wp.float32)
 
     @wp.func_native(_STEP)

@@ -74,12 +74,14 @@ def thread_kernels(
     low_passes: Sequence[bool] = (False, True),
     ssim_lengths: Sequence[int] = (1, SIMD_WIDTH),
     layered: bool = True,
+    simd: bool = True,
     cpu: bool = False,
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size.
 
-    `layered` are those of textured colours whose MLP is computed layer by layer.
+    With `layered` also those of textured colours whose MLP is computed layer by layer, and with `simd`, on a CPU, those
+    of the MLP in SIMD form.
     """
     yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
     for kernels in (unproject_kernels(real), compose_kernels(real)):
@@ -98,7 +100,7 @@ def thread_kernels(
     for degree in degrees:
         plain = plain_colors_kernels(real, degree)
         yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
-        if cpu and storage is real:
+        if cpu and simd and storage is real:
             yield from (mlp_simd_kernels(real, degree).forward, mlp_simd_kernels(real, degree).backward)
         for clamp in clamps if layered else ():
             colors = textured_colors_kernels(real, storage, degree, clamp)

@@ -9,7 +9,7 @@ import warp as wp
 from nexwarp.kernels.adam import CPU_VALUES, VALUES, adam_kernel
 from nexwarp.ops._interop import array, launch
 
-SMALLEST_CHUNK = 64  # of threads on a CPU
+SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
 
 
 class Moments(NamedTuple):
@@ -68,11 +68,11 @@ def adam_step(
     inputs += [*betas, *(1.0 - beta for beta in betas), *(math.log(beta) for beta in betas), epsilon]
     outputs = [array(x.view(-1), wp.float32) for x in (parameter, moments.mean, moments.square)]
     outputs += [array(nothing.half() if half is None else half.view(-1), wp.float16), array(losses, wp.float32)]
-    launch(parameter, adam_kernel(), threads, inputs, outputs, smallest=SMALLEST_CHUNK)
+    launch(parameter, adam_kernel(), threads, inputs, outputs, smallest=SMALLEST_SHARE)
     return None if factors is None else losses.sum()
 
 
 def _aligned(tensor: torch.Tensor) -> torch.Tensor:
-    """Return a contiguous tensor whose address is a multiple of 16 bytes, which loads of four values need."""
+    """Return a contiguous tensor, on CUDA one whose address is a multiple of 16, which loads of four values need."""
     tensor = tensor.contiguous()
-    return tensor.clone() if tensor.data_ptr() % 16 else tensor
+    return tensor.clone() if tensor.is_cuda and tensor.data_ptr() % 16 else tensor

@@ -26,7 +26,7 @@ def few_torch_threads(device: torch.device, values: int) -> Iterator[None]:
     """Inside the context, on a CPU, let torch's own loops use one thread for each 500,000 values of an image.
 
     A thread takes 50 us to wake, in which another one works on 200,000 values; without this a step of the demo takes
-    1 ms longer. Kernels use all threads as before.
+    1 ms longer. Kernels use all threads as before. A thread that first uses torch meanwhile keeps the lower number.
     """
     before = torch.get_num_threads()
     count = min(before, 1 + values // VALUES_A_THREAD)

@@ -21,8 +21,9 @@ from nexwarp.ops.columns import parts_of, share_columns
 POINT_MULTIPLE = 64
 # Not among torch's documented functions.
 _FUSED_RELU = hasattr(torch, "_addmm_activation")
-# Of the points that a thread of the SIMD form takes, each part with a sum of its own of the matrices' gradients.
-SMALLEST_PART, MOST_PARTS = 2048, 64
+# Parts of the points, one for a thread of the SIMD form. Each part sums its own share of the matrices' gradients.
+SMALLEST_SIMD_PART, MOST_SIMD_PARTS = 2048, 64
+OUTPUTS = tuple(3 * (degree + 1) ** 2 for degree in range(4))
 
 
 def padded(count: int, dtype: torch.dtype) -> int:
@@ -123,7 +124,7 @@ def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
     return signal @ layer.T
 
 
-class Field(NamedTuple):
+class SimdInputs(NamedTuple):
     """What the SIMD form reads.
 
     Attributes:
@@ -145,7 +146,7 @@ class Field(NamedTuple):
         return [
             self.part_size,
             array(torch.cat([matrix.reshape(-1) for matrix in self.matrices]), real),
-            array(torch.tensor(sizes, dtype=torch.int32), wp.int32),
+            array(self.encoded.new_tensor(sizes, dtype=torch.int32), wp.int32),
             array(self.encoded, real),
             array(self.directions, types(real).vec3),
             self.points // max(len(self.directions), 1),
@@ -155,7 +156,7 @@ class Field(NamedTuple):
     def part_size(self) -> int:
         """Points of a part, but for the last one."""
         align = BLOCKS * points_of("float")
-        return next((last for _, last in chunks(self.points, align, SMALLEST_PART, MOST_PARTS)), align)
+        return next((last for _, last in chunks(self.points, align, SMALLEST_SIMD_PART, MOST_SIMD_PARTS)), align)
 
     @property
     def parts(self) -> int:
@@ -174,42 +175,44 @@ def fits_simd(sizes: Sequence[int]) -> bool:
     return max(filled) <= MOST_ROWS and sum(filled[:-1]) <= MOST_KEPT
 
 
-def takes_simd(like: torch.Tensor, matrices: Sequence[torch.Tensor]) -> bool:
-    """Whether the SIMD form takes an MLP, and points on a tensor's device."""
-    same = all(matrix.dtype == like.dtype for matrix in matrices)
-    return same and uses_simd(like) and fits_simd([matrices[0].shape[1], *map(len, matrices)])
+def takes_simd(like: torch.Tensor, grid: torch.Tensor, matrices: Sequence[torch.Tensor]) -> bool:
+    """Whether the SIMD form takes points like a tensor, the features of a grid (L, T, F), and an MLP for them."""
+    sizes = [grid.shape[0] * grid.shape[2], *map(len, matrices)]
+    chained = [tuple(matrix.shape) for matrix in matrices] == [*zip(sizes[1:], sizes[:-1], strict=True)]
+    same = all(x.dtype == like.dtype for x in (grid, *matrices))
+    return uses_simd(like) and same and chained and sizes[-1] in OUTPUTS and fits_simd(sizes)
 
 
-def simd_colors(field: Field, offset: float, clamp: bool) -> torch.Tensor:
+def simd_colors(inputs: SimdInputs, offset: float, clamp: bool) -> torch.Tensor:
     """Return (n, 3) colours offset + SH(direction)."""
-    real = real_of(field.encoded)
-    colors = field.encoded.new_empty(field.points, 3)
-    arguments = [*field.arguments(), offset, clamp]
-    kernel = mlp_simd_kernels(real, field.degree).forward
-    launch(colors, kernel, field.parts, arguments, [array(colors, types(real).vec3)], smallest=1)
+    real = real_of(inputs.encoded)
+    colors = inputs.encoded.new_empty(inputs.points, 3)
+    arguments = [*inputs.arguments(), offset, clamp]
+    kernel = mlp_simd_kernels(real, inputs.degree).forward
+    launch(colors, kernel, inputs.parts, arguments, [array(colors, types(real).vec3)], smallest=1)
     return colors
 
 
 def simd_colors_backward(
-    field: Field, colors: torch.Tensor, grad_colors: torch.Tensor, clamp: bool
+    inputs: SimdInputs, colors: torch.Tensor, grad_colors: torch.Tensor, clamp: bool
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return the gradients of the features, padded as they are, and of the matrices.
 
     Args:
-        field: as it was.
+        inputs: as they were.
         colors: (n, 3) what `simd_colors` returned, if `clamp`; else anything.
         grad_colors: (n, 3) contiguous.
         clamp: as it was.
     """
-    real = real_of(field.encoded)
+    real = real_of(inputs.encoded)
     vec3 = types(real).vec3
-    grad_encoded = torch.empty_like(field.encoded)
-    grad_encoded[:, field.points :] = 0
-    sizes = [matrix.numel() for matrix in field.matrices]
-    slots = grad_colors.new_zeros(max(field.parts, 1), sum(sizes))
-    arguments = [*field.arguments(), clamp, array(colors, vec3), array(grad_colors, vec3)]
-    kernel = mlp_simd_kernels(real, field.degree).backward
-    launch(grad_colors, kernel, field.parts, arguments, [array(grad_encoded, real), array(slots, real)], smallest=1)
+    grad_encoded = torch.empty_like(inputs.encoded)
+    grad_encoded[:, inputs.points :] = 0
+    sizes = [matrix.numel() for matrix in inputs.matrices]
+    slots = grad_colors.new_zeros(max(inputs.parts, 1), sum(sizes))
+    arguments = [*inputs.arguments(), clamp, array(colors, vec3), array(grad_colors, vec3)]
+    kernel = mlp_simd_kernels(real, inputs.degree).backward
+    launch(grad_colors, kernel, inputs.parts, arguments, [array(grad_encoded, real), array(slots, real)], smallest=1)
     total = functools.reduce(torch.Tensor.add_, slots.unbind())
-    sums = zip(total.split(sizes), field.matrices, strict=True)
+    sums = zip(total.split(sizes), inputs.matrices, strict=True)
     return grad_encoded, [x.view_as(matrix) for x, matrix in sums]

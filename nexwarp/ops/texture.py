@@ -40,9 +40,9 @@ def texture(
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
     `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
 
-    Colours whose directions need no gradient are computed in few kernels: on CPUs for layers of at most 128, and in
-    half precision on GPUs of compute capability 8.0 or more for L * F = 32, F = 2 or 4, and two hidden layers of 64,
-    without torch's deterministic algorithms. All else is computed layer by layer.
+    Colours whose directions need no gradient are computed in few kernels, all else layer by layer; the two differ by
+    rounding. Few kernels take layers that fit `mlp.fits_simd` on CPUs; in half precision on GPUs of compute capability
+    8.0 or more, L * F = 32, F = 2 or 4, and two hidden layers of 64, without torch's deterministic algorithms.
 
     Args:
         positions: (n, 3) world.
@@ -76,7 +76,7 @@ def texture(
             copy = grid.detach().contiguous().half() if table is None else table
             inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
             return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
-        if not half and not (keep and turned) and mlp.takes_simd(positions, weights):
+        if not half and not (keep and turned) and mlp.takes_simd(positions, grid, weights):
             return _SimdTexture.apply(*points, grid, resolutions, focal, offset, clamp, *weights)
     return _Texture.apply(*points, grid, table, resolutions, focal, offset, clamp, half, keep, *weights)
 
@@ -174,10 +174,10 @@ class _SimdTexture(torch.autograd.Function):
     ) -> torch.Tensor:
         table = grid.contiguous()
         encoded = _features(table, positions, depths, resolutions, focal)
-        colors = mlp.simd_colors(mlp.Field(encoded, weights, directions, len(positions)), offset, clamp)
+        colors = mlp.simd_colors(mlp.SimdInputs(encoded, weights, directions, len(positions)), offset, clamp)
         ctx.clamp = clamp
         ctx.save_for_backward(
-            positions, depths, directions, resolutions, focal, table, encoded, *([colors] if clamp else []), *weights
+            positions, depths, directions, resolutions, focal, table, encoded, *[colors.clone()] * clamp, *weights
         )
         return colors
 
@@ -188,8 +188,8 @@ class _SimdTexture(torch.autograd.Function):
         grad = grad.contiguous()
         colors = weights.pop(0) if ctx.clamp else grad
         need_positions, need_depths, _, need_grid = ctx.needs_input_grad[:4]
-        field = mlp.Field(encoded, weights, directions, len(positions))
-        signal, grad_matrices = mlp.simd_colors_backward(field, colors, grad, ctx.clamp)
+        inputs = mlp.SimdInputs(encoded, weights, directions, len(positions))
+        signal, grad_matrices = mlp.simd_colors_backward(inputs, colors, grad, ctx.clamp)
         grad_grid, grad_positions, grad_depths = _lookup_backward(
             table, positions, depths, resolutions, focal, signal, grad.new_ones(1), need_positions or need_depths
         )
@@ -304,6 +304,8 @@ def _colors(
 ) -> tuple[Any, list[Any]]:
     real, storage = real_of(directions), STORAGES[coefficients.dtype]
     degree = round((coefficients.shape[0] // 3) ** 0.5) - 1
+    if coefficients.shape[0] not in mlp.OUTPUTS:
+        raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {coefficients.shape[0]}")
     kernels = textured_colors_kernels(real, storage, degree, clamp)
     hits = count // max(len(directions), 1)
     return kernels, [array(coefficients, storage), array(directions, types(real).vec3), hits, offset]

@@ -136,7 +136,7 @@ def intersect_tiles(
     sharing = 1 if uses_simd(means) else SHARING
     arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows), sharing]
     counts = torch.empty(count * sharing, dtype=torch.int32, device=means.device)
-    launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)])
+    launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)], even=False)
     ends = _ends(counts, sharing, most=count * columns * rows)
     exact = means.device.type == "cpu" and room is None
     if room is None:
@@ -189,7 +189,7 @@ def _sorted_entries(
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
     surfels = array(order.new_zeros(room) if exact else None, wp.int32)
     emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
-    launch(order, emit, len(order) * sharing, emission, emitted)
+    launch(order, emit, len(order) * sharing, emission, emitted, even=False)
     _sort(tile_ids, values, room, tiles.bit_length())
     if not exact:
         return values[:room], values[:0], tile_ids[:room]

@@ -122,8 +122,8 @@ class NeuralTexture(nn.Module):
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
         """Return how many values an evaluation keeps for each point, at least, and their dtype.
 
-        Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone,
-        on CUDA those of no point without gradients.
+        Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone.
+        Without gradients, those on CUDA keep nothing.
 
         Args:
             sh_degree: SH degree of the evaluation.
@@ -134,7 +134,7 @@ class NeuralTexture(nn.Module):
         matrices = [*hidden, last[:outputs]]
         if self._in_half() and fused_texture.fits(self.grid, matrices, 0):
             return features * kept, torch.float16
-        if mlp.takes_simd(self.grid, matrices):
+        if mlp.takes_simd(self.grid, self.grid, matrices):
             return features, self.grid.dtype
         dtype = torch.float16 if self._in_half() else self.grid.dtype
         return features + outputs + sum(map(len, hidden)) * kept, dtype
@@ -252,7 +252,8 @@ def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
     """Return (count,) float32, computed in float64."""
     # Not by torch: on the device "meta", where files are checked, a logarithm imports its compiler, 1.2 s.
     low, high = math.log(first), math.log(last)
-    return torch.tensor([math.exp(low + (high - low) * i / max(count - 1, 1)) for i in range(count)])
+    values = [math.exp(low + (high - low) * i / max(count - 1, 1)) for i in range(count)]
+    return torch.tensor(values, dtype=torch.float32)
 
 
 def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:

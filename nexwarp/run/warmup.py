@@ -54,6 +54,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     shape = config.texture
     degree = config.sh_degree if shape.sh_degree is None else shape.sh_degree
     sizes = [shape.levels * shape.features, *[shape.width] * shape.hidden_layers, 3 * (degree + 1) ** 2]
+    simd = cpu and textured and fits_simd(sizes)
     threads = thread_kernels(
         wp.float32,
         wp.float32 if cpu else wp.float16,
@@ -63,7 +64,8 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH if cpu else 1,),
-        layered=not (cpu and fits_simd(sizes)),
+        layered=not simd or config.refine_poses or config.blur_poses > 1,  # directions with gradients
+        simd=simd,
         cpu=cpu,
         fixed_point=config.deterministic,
     )

@@ -39,7 +39,7 @@ class FusedAdam(torch.optim.Adam):
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Drop all gradients, as `torch.optim.Adam` does."""
+        """Drop all gradients, or zero them, as `torch.optim.Adam` does."""
         inspect.unwrap(torch.optim.Adam.zero_grad)(self, set_to_none)
 
     def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:

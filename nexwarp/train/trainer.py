@@ -149,36 +149,36 @@ class Trainer:
         last = total if until is None else min(until, total)
         if self.iteration < last:
             self.good = self.snapshot()
-        while self.iteration < last:
-            try:
-                start = time.perf_counter()
-                report = self.step()
-                if self.iteration >= last and self.device.type == "cuda":
-                    torch.cuda.synchronize(self.device)
-                self.seconds += time.perf_counter() - start
-                self.loss_log.note(self.iteration, report.losses)
-                keep = report.passed(max(total // SNAPSHOTS, 1))
-                if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
-                    self.check()
-                if keep:
-                    self.good = self.snapshot()
-                if observe is not None:
-                    observe(report)
-            except DivergedError as fault:
-                assert self.good is not None
-                warn(go_back(self, self.good, fault))
-            except (MemoryError, RuntimeError) as error:
-                if (needed := needed_memory(error)) is None:
-                    raise
-                camera, graphs = self.scene.train[0].camera, self.graphs is not None
-                told = oom_message(needed, self._facts(), camera, self.config, self.device, graphs=graphs)
-                raise OutOfMemoryError(told) from error
+        with few_torch_threads(self.device, 3 * self.views.pixels * max(self.config.max_hits, 1)):
+            while self.iteration < last:
+                try:
+                    start = time.perf_counter()
+                    report = self.step()
+                    if self.iteration >= last and self.device.type == "cuda":
+                        torch.cuda.synchronize(self.device)
+                    self.seconds += time.perf_counter() - start
+                    self.loss_log.note(self.iteration, report.losses)
+                    keep = report.passed(max(total // SNAPSHOTS, 1))
+                    if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
+                        self.check()
+                    if keep:
+                        self.good = self.snapshot()
+                    if observe is not None:
+                        observe(report)
+                except DivergedError as fault:
+                    assert self.good is not None
+                    warn(go_back(self, self.good, fault))
+                except (MemoryError, RuntimeError) as error:
+                    if (needed := needed_memory(error)) is None:
+                        raise
+                    camera, graphs = self.scene.train[0].camera, self.graphs is not None
+                    told = oom_message(needed, self._facts(), camera, self.config, self.device, graphs=graphs)
+                    raise OutOfMemoryError(told) from error
 
     def step(self) -> StepReport:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
-        threads = few_torch_threads(self.device, 3 * self.views.pixels * max(self.config.max_hits, 1))
-        with fixed_order, threads, torch.autocast(self.device.type, enabled=False):
+        with fixed_order, torch.autocast(self.device.type, enabled=False):
             target = self._next_target()
             set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
             result = self._run_step(target)

@@ -1,1 +1,1 @@
-"""SIMD forms of two stages, for the CPU."""
+"""SIMD forms of stages, for the CPU: collection, blended errors, lookup, and the texture's MLP with its SH."""

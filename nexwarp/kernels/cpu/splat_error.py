@@ -1,7 +1,7 @@
 """SIMD form of `splat_error`, for CPUs: a thread is a strip of pixels, as in `cpu.collect`.
 
-Read and added to is what the kernel of `splat_error` reads and adds to; a test compares the forms. A pixel's walk ends
-where that of `cpu.collect` does, whose arithmetic this is.
+Read and added to is what the kernel of `splat_error` reads and adds to; a test compares the forms. It uses the
+arithmetic of `cpu.collect`, so a pixel's walk ends at the same entry.
 """
 
 import functools

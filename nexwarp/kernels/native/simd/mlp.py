@@ -11,19 +11,19 @@ MOST_ROWS = 128  # of a layer, filled up
 MOST_KEPT = 256  # inputs of all layers together, filled up
 
 
-def lanes_of(real: str) -> int:
+def width_of(real: str) -> int:
     """Elements of a SIMD vector: as many as an AVX-512 register holds."""
     return {"float": 16, "double": 8}[real]
 
 
 def points_of(real: str) -> int:
     """Points of a block."""
-    return 4 * lanes_of(real)
+    return 4 * width_of(real)
 
 
 _PRELUDE = """
-    typedef REAL reals_t __attribute__((ext_vector_type(LANES)));
-    constexpr int POINTS = 4 * LANES;
+    typedef REAL reals_t __attribute__((ext_vector_type(WIDTH)));
+    constexpr int POINTS = 4 * WIDTH;
 #if defined(__AVX512F__)
     constexpr int COLUMNS = 4;  // vectors of a row that are worked on at once
 #else  // fewer or smaller registers
@@ -40,26 +40,26 @@ _PRELUDE = """
     // y (rows, POINTS) = matrix @ x (columns, POINTS); element (o, k) of the matrix is at o * along + k * across.
     auto product = [&](const REAL* matrix, int rows, int columns, int along, int across, const REAL* x, REAL* y) {
         for (int o = 0; o < rows; o += 4)
-            for (int p = 0; p < POINTS; p += COLUMNS * LANES) {
+            for (int p = 0; p < POINTS; p += COLUMNS * WIDTH) {
                 const REAL* w[4];
                 for (int r = 0; r < 4; ++r) w[r] = matrix + smaller(o + r, rows - 1) * along;
                 reals_t sum[4][COLUMNS] = {};
                 for (int k = 0; k < columns; ++k) {
                     reals_t value[COLUMNS];
-                    for (int v = 0; v < COLUMNS; ++v) value[v] = load(x + k * POINTS + p + v * LANES);
+                    for (int v = 0; v < COLUMNS; ++v) value[v] = load(x + k * POINTS + p + v * WIDTH);
                     for (int r = 0; r < 4; ++r)
                         for (int v = 0; v < COLUMNS; ++v)
                             sum[r][v] = __builtin_elementwise_fma((reals_t)(w[r][k * across]), value[v], sum[r][v]);
                 }
                 for (int r = 0; r < 4; ++r)
-                    for (int v = 0; v < COLUMNS; ++v) store(y + (o + r) * POINTS + p + v * LANES, sum[r][v]);
+                    for (int v = 0; v < COLUMNS; ++v) store(y + (o + r) * POINTS + p + v * WIDTH, sum[r][v]);
             }
     };
     // Hidden layer (rows, POINTS) of x: ReLU of the product.
     auto hidden = [&](const REAL* matrix, int rows, int columns, const REAL* x, REAL* y) {
         product(matrix, rows, columns, columns, 1, x, y);
-        for (int i = 0; i < filled(rows) * POINTS; i += LANES)
-            store(y + i, __builtin_elementwise_max(load(y + i), (reals_t)((REAL)0)));
+        for (int i = 0; i < filled(rows) * POINTS; i += WIDTH)
+            store(y + i, load(y + i) < (reals_t)((REAL)0) ? (reals_t)((REAL)0) : load(y + i));  // NaN stays NaN
     };
     // Features of a block, 0 beyond the last point.
     auto read_features = [&](int start, int last, REAL* to) {
@@ -70,12 +70,12 @@ _PRELUDE = """
             for (int p = there; p < POINTS; ++p) to[k * POINTS + p] = (REAL)0;
         }
     };
-    // Basis functions (COUNT, LANES) at the directions of the points from `start` on; beyond the last point, its own.
+    // Basis functions (COUNT, WIDTH) at the directions of the points from `start` on; beyond the last point, its own.
     auto basis = [&](int start, int last, reals_t* out) {
         reals_t x, y, z;
         int direction = start / hits, hit = start - direction * hits;
         #pragma unroll
-        for (int l = 0; l < LANES; ++l) {
+        for (int l = 0; l < WIDTH; ++l) {
             const auto& toward = directions.data[direction];
             x[l] = toward[0];
             y[l] = toward[1];
@@ -108,7 +108,7 @@ _FORWARD = """
             x = y;
             y = swap;
         }
-        for (int p = 0; p < POINTS && start + p < last; p += LANES) {
+        for (int p = 0; p < POINTS && start + p < last; p += WIDTH) {
             reals_t b[COUNT], color[3];
             basis(start + p, last, b);
             for (int c = 0; c < 3; ++c) {
@@ -117,7 +117,7 @@ _FORWARD = """
                     color[c] = __builtin_elementwise_fma(load(x + (3 * k + c) * POINTS + p), b[k], color[c]);
                 if (clamp) color[c] = __builtin_elementwise_max(color[c], (reals_t)((REAL)0));
             }
-            const int there = smaller(last - start - p, LANES);
+            const int there = smaller(last - start - p, WIDTH);
             for (int l = 0; l < there; ++l)
                 for (int c = 0; c < 3; ++c) colors.data[start + p + l][c] = color[c][l];
         }
@@ -133,7 +133,7 @@ _BACKWARD = """
                 for (int block = 0; block < BLOCKS; ++block) {
                     const REAL* from_a = a + (block * filled(rows) + o) * POINTS;
                     const REAL* from_b = b + block * filled(columns) * POINTS;
-                    for (int p = 0; p < POINTS; p += LANES) {
+                    for (int p = 0; p < POINTS; p += WIDTH) {
                         reals_t value[4];
                         for (int r = 0; r < 4; ++r) value[r] = load(from_a + r * POINTS + p);
                         for (int v = 0; v < COLUMNS; ++v) {
@@ -166,13 +166,13 @@ _BACKWARD = """
             }
         }
         const int outputs = sizes.data[layers];
-        for (int p = 0; p < BLOCKS * POINTS; p += LANES) {  // gradients of the coefficients
+        for (int p = 0; p < BLOCKS * POINTS; p += WIDTH) {  // gradients of the coefficients
             REAL* to = signal + p / POINTS * filled(outputs) * POINTS + p % POINTS;
             reals_t b[COUNT], grad[3] = {};
             if (start + p < last) {
                 basis(start + p, last, b);
                 #pragma unroll
-                for (int l = 0; l < LANES; ++l)
+                for (int l = 0; l < WIDTH; ++l)
                     for (int c = 0; c < 3; ++c) {
                         const int i = start + p + l;
                         const bool counts = i < last && (!clamp || colors.data[i][c] > (REAL)0);
@@ -191,9 +191,9 @@ _BACKWARD = """
                 REAL* to = next + block * size;
                 product(matrix, columns, rows, 1, columns, signal + block * filled(rows) * POINTS, to);
                 if (i > 0)
-                    for (int j = 0; j < size; j += LANES) {
+                    for (int j = 0; j < size; j += WIDTH) {
                         const reals_t zero = (reals_t)((REAL)0);
-                        store(to + j, load(x + block * size + j) > zero ? load(to + j) : zero);
+                        store(to + j, load(x + block * size + j) <= zero ? zero : load(to + j));
                     }
             }
             if (i > 0) {
@@ -218,25 +218,25 @@ _BACKWARD = """
 """
 
 
-def _fold(lanes: int) -> str:
+def _fold(width: int) -> str:
     """Return the text of FOLD: a vector that begins with the sums of the elements of four vectors."""
 
     def shuffled(a: str, b: str, which: int, size: int, pieces: int) -> str:
         """Text of the first or second halves of the `pieces` parts of `size` elements, of a and then of b."""
         half = size // 2
-        parts = [source * lanes + piece * size + which * half for source in (0, 1) for piece in range(pieces)]
+        parts = [source * width + piece * size + which * half for source in (0, 1) for piece in range(pieces)]
         places = [str(part + i) for part in parts for i in range(half)]
-        return f"__builtin_shufflevector({a}, {b}, {', '.join(places * (lanes // len(places)))})"
+        return f"__builtin_shufflevector({a}, {b}, {', '.join(places * (width // len(places)))})"
 
     def added(a: str, b: str, size: int, pieces: int) -> str:
         return f"({shuffled(a, b, 0, size, pieces)} + {shuffled(a, b, 1, size, pieces)})"
 
     text = [
-        f"        const reals_t ab = {added('a', 'b', lanes, 1)};",
-        f"        const reals_t cd = {added('c', 'd', lanes, 1)};",
-        f"        reals_t v = {added('ab', 'cd', lanes // 2, 2)};",
+        f"        const reals_t ab = {added('a', 'b', width, 1)};",
+        f"        const reals_t cd = {added('c', 'd', width, 1)};",
+        f"        reals_t v = {added('ab', 'cd', width // 2, 2)};",
     ]
-    size = lanes // 4
+    size = width // 4
     while size > 1:
         text.append(f"        v = {added('v', 'v', size, 4)};")
         size //= 2
@@ -245,13 +245,13 @@ def _fold(lanes: int) -> str:
 
 
 def _text(body: str, real: str, degree: int) -> str:
-    lanes = lanes_of(real)
+    width = width_of(real)
     terms = ", ".join(basis_terms(degree, suffix="f" if real == "float" else "", one="one"))
     text = _PRELUDE + body
     for name, value in (
         ("TERMS", terms),
         ("FOLD", "fold"),
-        ("LANES", lanes),
+        ("WIDTH", width),
         ("COUNT", (degree + 1) ** 2),
         ("BLOCKS", BLOCKS),
         ("MOST_ROWS", MOST_ROWS),
@@ -269,4 +269,4 @@ def forward_text(real: str, degree: int) -> str:
 
 def backward_text(real: str, degree: int) -> str:
     """Return the body of the backward function: gradients of the points from `first` to `last`."""
-    return _text(_fold(lanes_of(real)) + _BACKWARD, real, degree)
+    return _text(_fold(width_of(real)) + _BACKWARD, real, degree)
