@@ -1,4 +1,4 @@
-"""Random seeds, and operations whose results do not depend on the order of threads."""
+"""Random seeds, torch's threads, and operations whose results do not depend on the order of threads."""
 
 import random
 from collections.abc import Iterator
@@ -16,14 +16,24 @@ class _DeterministicModule(Protocol):
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread: how threads split a sum changes its rounding, and files must be reproducible."""
+def torch_threads(count: int) -> Iterator[None]:
+    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs.
+
+    A thread that first uses torch inside the context keeps this number.
+    """
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: how threads split a sum changes its rounding, and files must be reproducible."""
+    with torch_threads(1):
+        yield
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """SIMD vectors calculate what torch does, each group of snippets by itself; SIMD forms agree with the others."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,9 @@ import warp as wp
 import nexwarp as nw
 from nexwarp.kernels import launch
 from nexwarp.kernels.native.simd import simd_functions
+from tests.reference.render import Texture
+from tests.reference.render import field as reference_field
+from tests.reference.sh import evaluate
 from tests.scenes import Scene, layered_scene, random_scene
 from tests.simd_kernels import ARITHMETIC, WIDTH, function_kernel, masks_kernel, slots_kernel
 from tests.test_threads import Passes, errors_of
@@ -184,7 +188,7 @@ def test_both_forms_of_lookup_agree(count: int, features: int, dtype: torch.dtyp
 )
 @pytest.mark.parametrize("clamp", [False, True])
 @DTYPES
-def test_both_forms_of_textured_colors_agree(
+def test_both_forms_of_textured_colors_agree_with_the_reference(
     count: int, hits: int, degree: int, width: int, hidden_layers: int, clamp: bool, dtype: torch.dtype
 ) -> None:
     """Numbers of points, neurons and outputs that no block, vector or four divides, and more points than a part has."""
@@ -197,7 +201,16 @@ def test_both_forms_of_textured_colors_agree(
     directions = torch.nn.functional.normalize(draw(count, 3), dim=-1).to(dtype)
     depths = (1 + draw(count, hits).abs()).to(dtype)
     depths[3::7] = 0.0  # points to skip
-    results = []
+    leaves = [
+        x.detach().double().requires_grad_() for x in (positions, depths, texture.grid, *texture.mlp.parameters())
+    ]
+    there = depths > 0
+    field = Texture(leaves[2], texture.resolutions.double(), leaves[3:])
+    coefficients = reference_field(field, leaves[0][there], leaves[1][there], 24.0)
+    toward = directions.double()[:, None].expand(count, hits, 3)[there]
+    expected = torch.zeros(count, hits, 3, dtype=torch.float64)  # without features there is no colour
+    expected[there] = evaluate(coefficients, toward, degree).clamp_min(0.0 if clamp else -math.inf)
+    references = torch.autograd.grad((expected * factors.double()).sum(), leaves)
     for form in FORMS:
         with launch.cpu_form(form):
             at, far = positions.clone().requires_grad_(), depths.clone().requires_grad_()
@@ -205,10 +218,9 @@ def test_both_forms_of_textured_colors_agree(
             grads = torch.autograd.grad((out * factors).sum(), [at, far, *texture.parameters()])
             with torch.no_grad():
                 assert torch.equal(texture.colors(positions, depths, directions, 24.0, clamp=clamp), out)
-            results.append([out.detach(), *grads])
-    assert_close(results[0][0], results[1][0], kind="value", name="colors")
-    for index, (simd, scalar) in enumerate(zip(results[0][1:], results[1][1:], strict=True)):
-        assert_close(simd, scalar, kind="gradient", name=f"gradient {index}")
+        assert_close(out, expected, kind="value", name=f"colors, {form}")
+        for index, (gradient, reference) in enumerate(zip(grads, references, strict=True)):
+            assert_close(gradient, reference, kind="gradient", name=f"gradient {index}, {form}")
 
 
 def test_colors_of_large_layers_are_those_of_torch() -> None:

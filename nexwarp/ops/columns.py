@@ -7,9 +7,8 @@ are fixed, and each is worked on by one thread of torch and its BLAS.
 import functools
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import torch
 
@@ -18,26 +17,6 @@ from nexwarp.kernels import launch as launching
 # Columns that one part has at least, and what parts begin at multiples of. Small parts stay in a core's cache from one
 # layer to the next; what they add up does not depend on the number of threads, so their number must not either.
 SMALLEST_PART, ALIGN, MOST_PARTS = 2048, 16, 64
-VALUES_A_THREAD = 500_000
-
-
-@contextmanager
-def few_torch_threads(device: torch.device, values: int) -> Iterator[None]:
-    """Inside the context, on a CPU, let torch's own loops use one thread for each 500,000 values of an image.
-
-    A thread takes 50 us to wake, in which another one works on 200,000 values; without this a step of the demo takes
-    1 ms longer. Kernels use all threads as before. A thread that first uses torch meanwhile keeps the lower number.
-    """
-    before = torch.get_num_threads()
-    count = min(before, 1 + values // VALUES_A_THREAD)
-    if device.type != "cpu" or count == before:
-        yield
-        return
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def share_columns(count: int, part: Callable[[int, slice], None]) -> None:

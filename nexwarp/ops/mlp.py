@@ -23,7 +23,7 @@ POINT_MULTIPLE = 64
 _FUSED_RELU = hasattr(torch, "_addmm_activation")
 # Parts of the points, one for a thread of the SIMD form. Each part sums its own share of the matrices' gradients.
 SMALLEST_SIMD_PART, MOST_SIMD_PARTS = 2048, 64
-OUTPUTS = tuple(3 * (degree + 1) ** 2 for degree in range(4))
+OUTPUTS = tuple(3 * (degree + 1) ** 2 for degree in range(4))  # of the last matrix, by SH degree
 
 
 def padded(count: int, dtype: torch.dtype) -> int:
@@ -166,7 +166,7 @@ class SimdInputs(NamedTuple):
     @property
     def degree(self) -> int:
         """SH degree."""
-        return round((len(self.matrices[-1]) // 3) ** 0.5) - 1
+        return OUTPUTS.index(len(self.matrices[-1]))
 
 
 def fits_simd(sizes: Sequence[int]) -> bool:

@@ -303,9 +303,9 @@ def _colors(
     coefficients: torch.Tensor, directions: torch.Tensor, count: int, offset: float, clamp: bool
 ) -> tuple[Any, list[Any]]:
     real, storage = real_of(directions), STORAGES[coefficients.dtype]
-    degree = round((coefficients.shape[0] // 3) ** 0.5) - 1
     if coefficients.shape[0] not in mlp.OUTPUTS:
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {coefficients.shape[0]}")
+    degree = mlp.OUTPUTS.index(coefficients.shape[0])
     kernels = textured_colors_kernels(real, storage, degree, clamp)
     hits = count // max(len(directions), 1)
     return kernels, [array(coefficients, storage), array(directions, types(real).vec3), hits, offset]

@@ -11,7 +11,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene, View
-from nexwarp.determinism import deterministic, seed_everything
+from nexwarp.determinism import deterministic, seed_everything, torch_threads
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
 from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
@@ -20,7 +20,6 @@ from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.ops.columns import few_torch_threads
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
@@ -149,7 +148,7 @@ class Trainer:
         last = total if until is None else min(until, total)
         if self.iteration < last:
             self.good = self.snapshot()
-        with few_torch_threads(self.device, 3 * self.views.pixels * max(self.config.max_hits, 1)):
+        with torch_threads(self.views.torch_threads(self.config.max_hits)):
             while self.iteration < last:
                 try:
                     start = time.perf_counter()

@@ -17,6 +17,7 @@ from nexwarp.train.exposure_calibration import ExposureCalibration
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
 AHEAD = 2  # photos to fetch meanwhile where they do not
+VALUES_A_THREAD = 500_000
 
 
 class TrainingViews:
@@ -79,10 +80,15 @@ class TrainingViews:
             for index, (name, camera) in middles
         }
 
-    @property
-    def pixels(self) -> int:
-        """Number of pixels of the first photo."""
-        return self.cameras[0].width * self.cameras[0].height
+    def torch_threads(self, max_hits: int) -> int:
+        """Return how many threads to give torch's own loops: on a CPU one for each 500,000 values of K hits' colours.
+
+        With a second thread, loops over the demo's images take longer: it has to be woken for each.
+        """
+        all_threads, camera = torch.get_num_threads(), self.cameras[0]
+        if self.device.type != "cpu":
+            return all_threads
+        return min(all_threads, 1 + 3 * camera.width * camera.height * max(max_hits, 1) // VALUES_A_THREAD)
 
     def fingerprint(self) -> str:
         """Return a digest of the views' names and cameras."""

@@ -65,9 +65,8 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
         assert attacked_seconds - sum(drawn) < 20.0 * calm + 10.0
         finished = trainer.finish()
         viewer.finish("done", lambda: finished)
-        wait_for(
-            lambda: not viewer.web.gate.clients and not viewer.sessions
-        )  # viser says goodbye on a thread of its own
+        # Sessions end after their connections: viser says goodbye on a thread of its own.
+        wait_for(lambda: not viewer.web.gate.clients and not viewer.sessions)
         with Client(viewer) as good:
             good.look()
             wait_for(lambda: len(viewer.sessions) == 1)

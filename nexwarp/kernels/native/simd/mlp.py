@@ -144,7 +144,7 @@ _BACKWARD = """
                     }
                 }
                 for (int v = 0; v < COLUMNS && k + v < columns; ++v) {
-                    const reals_t four = FOLD(sum[v][0], sum[v][1], sum[v][2], sum[v][3]);
+                    const reals_t four = fold(sum[v][0], sum[v][1], sum[v][2], sum[v][3]);
                     for (int r = 0; r < 4 && o + r < rows; ++r) sums[(o + r) * columns + k + v] += four[r];
                 }
             }
@@ -219,7 +219,7 @@ _BACKWARD = """
 
 
 def _fold(width: int) -> str:
-    """Return the text of FOLD: a vector that begins with the sums of the elements of four vectors."""
+    """Return the text of `fold`: a vector that begins with the sums of the elements of four vectors."""
 
     def shuffled(a: str, b: str, which: int, size: int, pieces: int) -> str:
         """Text of the first or second halves of the `pieces` parts of `size` elements, of a and then of b."""
@@ -250,7 +250,6 @@ def _text(body: str, real: str, degree: int) -> str:
     text = _PRELUDE + body
     for name, value in (
         ("TERMS", terms),
-        ("FOLD", "fold"),
         ("WIDTH", width),
         ("COUNT", (degree + 1) ** 2),
         ("BLOCKS", BLOCKS),
