@@ -23,16 +23,8 @@ from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
-from nexwarp.kernels.tiles import (
-    LARGEST_INT,
-    MAX_CORNERS,
-    check_entries,
-    depth_keys_kernel,
-    list_kernels,
-    surfel_ids_kernel,
-    tile_offsets_kernel,
-    tile_polygon_kernel,
-)
+from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tiles import MAX_CORNERS, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernels
 from nexwarp.kernels.walk import BLOCK_DIM
@@ -218,20 +210,22 @@ def intersect_tiles(
     polygons = [corners, shapes, margins, discs]
     _silent(tile_polygon_kernel(real, low_pass, tile_size), count, surfels, [reaches, *polygons])
     kernels = list_kernels(real, low_pass, tile_size)
-    arguments = [order, *polygons, wp.vec2i(columns, rows), 1]
+    arguments = [order[:count], *polygons, wp.vec2i(columns, rows)]
+    # Whole warps, which work together.
+    threads = -(-count // 32) * 32 if means.device.is_cuda else count
+    totals = integers(count, wp.int64)
     total = 0
     if count:
         _silent(depth_keys_kernel(real), count, [centers], [keys, order])
         wp.utils.radix_sort_pairs(keys, order, count)
-        _silent(kernels.count, count, arguments, [ends])
-        if count * columns * rows > LARGEST_INT:
-            check_entries(int(ends.numpy().sum(dtype="int64")), count, columns * rows)
-        wp.utils.array_scan(ends, ends, inclusive=True)
-        total = check_entries(int(ends[count - 1 :].numpy()[0]), count, columns * rows)
+        _silent(kernels.count, threads, arguments, [totals])
+        wp.utils.array_scan(totals, totals, inclusive=True)
+        total = check_entries(int(totals[count - 1 :].numpy()[0]), count, columns * rows)
     tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
     if total:
         tile_ids = tiles.view(wp.int32)
-        _silent(kernels.emit, count, [*arguments, ends], [tile_ids, entries, emitted])
+        listed = [ends, tile_ids[:total], entries[:total], emitted[:total]]
+        _silent(kernels.emit, threads, [*arguments, totals, threads, columns * rows], listed)
         wp.utils.radix_sort_pairs(tiles, entries, total, end_bit=(columns * rows).bit_length())
         _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
     offsets = integers(columns * rows + 1)

@@ -33,13 +33,8 @@ from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
-from nexwarp.kernels.tiles import (
-    depth_keys_kernel,
-    list_kernels,
-    surfel_ids_kernel,
-    tile_offsets_kernel,
-    tile_polygon_kernel,
-)
+from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tiles import tile_polygon_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.unproject import unproject_kernels
 

@@ -1,7 +1,7 @@
 """Tile lists (paper Sec. 3, after 3DGS): which surfels may be seen in which tile, near to far.
 
-A thread is a surfel, one of several that share a surfel, a tile or an entry, as each kernel says. Written are integers
-and what only culls: nothing here is differentiated.
+Here a surfel's tile polygon and where a tile row cuts it; `tile_lists` makes the lists of them. A thread is a surfel.
+Written is what only culls: nothing here is differentiated.
 
 A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
 projected: a convex polygon of at most five corners, the tile polygon. A tile row's slab cuts out one span of it, so the
@@ -10,10 +10,10 @@ decides.
 """
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.surfel import frame_functions
 from nexwarp.kernels.types import types
 
@@ -26,8 +26,6 @@ MAX_CORNERS = 5
 LARGEST_INT = 2**31 - 1
 # Of the lists: the arrays that are sorted are twice as long, and indices are int32.
 MAX_ENTRIES = 2**30 - 1
-# A typed constant: a bare literal of this size would be an int32.
-SIGN = wp.constant(wp.uint32(2147483648))
 
 
 def check_entries(total: int, count: int, tiles: int) -> int:
@@ -191,7 +189,7 @@ def span_function(real: type, low_pass: bool, tile_size: int) -> wp.Function:
     HALF, ONE, ZERO = t.HALF, t.ONE, t.ZERO
     HUGE = wp.constant(real(LARGEST))
     SIZE = wp.constant(real(tile_size))
-    index = index_function(real)
+    index, load = index_function(real), load_function(2, real)
 
     @wp.func
     def span(
@@ -209,9 +207,9 @@ def span_function(real: type, low_pass: bool, tile_size: int) -> wp.Function:
         low = real(HUGE)
         high = real(-HUGE)
         if count > 0:
-            p = corners[i, count - 1]
+            p = load(corners, i, count - 1)
             for k in range(count):
-                q = corners[i, k]
+                q = load(corners, i, k)
                 if q[1] >= top and q[1] <= bottom:
                     low = wp.min(low, q[0])
                     high = wp.max(high, q[0])
@@ -239,138 +237,3 @@ def span_function(real: type, low_pass: bool, tile_size: int) -> wp.Function:
         return wp.vec2i(wp.max(x0, 0), wp.min(x1, tile_columns - 1))
 
     return span
-
-
-@functools.cache
-def depth_keys_kernel(real: type) -> wp.Kernel:
-    """Make the kernel that turns signed centre depths into sortable uint32 keys."""
-    vec3 = types(real).vec3
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def depth_keys(
-        first: wp.int32,
-        centers: wp.array(dtype=vec3),
-        # outputs
-        keys: wp.array(dtype=wp.uint32),
-        indices: wp.array(dtype=wp.int32),
-    ):
-        i = first + wp.tid()
-        # Adding 0 makes -0 and 0 tie, as they do in any comparison of floats.
-        bits = wp.cast(wp.float32(centers[i][2]) + wp.float32(0.0), wp.uint32)
-        keys[i] = wp.where((bits & SIGN) != wp.uint32(0), ~bits, bits | SIGN)
-        indices[i] = i
-
-    return depth_keys
-
-
-@functools.cache
-def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
-    """Make the kernels that count and emit (tile, surfel) entries: `sharing` threads a surfel, in depth order.
-
-    `entries` gets each entry's own index, and `surfels` its surfel; without `surfels`, a null array, `entries` gets the
-    surfel. The threads of a surfel take turns at its tile rows: near surfels cover many, and alone one thread would be
-    long.
-    """
-    t = types(real)
-    vec2, vec3 = t.vec2, t.vec3
-    span = span_function(real, low_pass, tile_size)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def count(
-        first: wp.int32,
-        order: wp.array(dtype=wp.int32),
-        corners: wp.array2d(dtype=vec2),
-        shapes: wp.array(dtype=wp.vec3i),
-        margins: wp.array(dtype=real),
-        discs: wp.array(dtype=vec3),
-        grid: wp.vec2i,
-        sharing: wp.int32,
-        # outputs
-        counts: wp.array(dtype=wp.int32),
-    ):
-        thread = first + wp.tid()
-        i = order[thread // sharing]
-        shape = shapes[i]
-        margin = margins[i]
-        total = int(0)
-        for row in range(shape[1] + thread % sharing, shape[2] + 1, sharing):
-            s = span(i, row, grid[0], shape[0], corners, margin, discs)
-            total += wp.max(s[1] - s[0] + 1, 0)
-        counts[thread] = total
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def emit(
-        first: wp.int32,
-        order: wp.array(dtype=wp.int32),
-        corners: wp.array2d(dtype=vec2),
-        shapes: wp.array(dtype=wp.vec3i),
-        margins: wp.array(dtype=real),
-        discs: wp.array(dtype=vec3),
-        grid: wp.vec2i,
-        sharing: wp.int32,
-        ends: wp.array(dtype=wp.int32),
-        # outputs
-        tiles: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        surfels: wp.array(dtype=wp.int32),
-    ):
-        thread = first + wp.tid()
-        e = int(0)
-        if thread > 0:
-            e = ends[thread - 1]
-        end = wp.min(ends[thread], entries.shape[0])
-        # Where there are more entries than an int32 counts, some ends are negative, and the lists will not be used.
-        if e < 0 or e >= end:
-            return
-        i = order[thread // sharing]
-        shape = shapes[i]
-        margin = margins[i]
-        for row in range(shape[1] + thread % sharing, shape[2] + 1, sharing):
-            s = span(i, row, grid[0], shape[0], corners, margin, discs)
-            for column in range(s[0], s[1] + 1):
-                # Lists may be too short (see `nexwarp.ops.tiles`), and a compiler may round here otherwise than in
-                # `count`: never write past the list's or the thread's own end.
-                if e < end:
-                    tiles[e] = row * grid[0] + column
-                    if surfels:
-                        entries[e] = e
-                        surfels[e] = i
-                    else:
-                        entries[e] = i
-                e += 1
-
-    return SimpleNamespace(count=count, emit=emit)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def tile_offsets_kernel(
-    first: wp.int32,
-    tiles: wp.array(dtype=wp.int32),
-    total: wp.int32,
-    # outputs
-    offsets: wp.array(dtype=wp.int32),
-):
-    """Start of each tile's entries in the sorted list, by binary search: one thread a tile, and one for the end."""
-    tile = first + wp.tid()
-    low = int(0)
-    high = int(total)
-    while low < high:
-        middle = (low + high) // 2
-        if tiles[middle] < tile:
-            low = middle + 1
-        else:
-            high = middle
-    offsets[tile] = low
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def surfel_ids_kernel(
-    first: wp.int32,
-    entries: wp.array(dtype=wp.int32),
-    surfels: wp.array(dtype=wp.int32),
-    # outputs
-    surfel_ids: wp.array(dtype=wp.int32),
-):
-    """Surfel of each sorted entry."""
-    k = first + wp.tid()
-    surfel_ids[k] = surfels[entries[k]]

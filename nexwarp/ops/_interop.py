@@ -66,6 +66,16 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
+@functools.lru_cache(maxsize=64)
+def _array_at(pointer: int, length: int, dtype: type, kind: str, index: int | None) -> "wp.array[Any]":
+    return wp.array(ptr=pointer, dtype=dtype, shape=(length,), device=_device(kind, index))
+
+
+def warp_array(tensor: torch.Tensor, dtype: type) -> "wp.array[Any]":
+    """View a contiguous tensor (length,) as Warp's own functions take it; the view does not keep the tensor alive."""
+    return _array_at(tensor.data_ptr(), len(tensor), dtype, tensor.device.type, tensor.device.index)
+
+
 @functools.cache
 def _device(kind: str, index: int | None) -> wp.Device:
     start_warp()

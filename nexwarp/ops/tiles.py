@@ -6,26 +6,17 @@ from typing import Literal, get_args
 import torch
 import warp as wp
 
-from nexwarp.kernels.tiles import (
-    LARGEST_INT,
-    MAX_CORNERS,
-    MAX_ENTRIES,
-    check_entries,
-    depth_keys_kernel,
-    list_kernels,
-    surfel_ids_kernel,
-    tile_offsets_kernel,
-    tile_polygon_kernel,
-)
+from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, uses_simd, warp_streams
+from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
-# Threads that share a surfel's tile rows on a GPU.
-SHARING = 8
+# Threads that share their surfels' tile rows on a GPU.
+WARP = 32
 # Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
@@ -129,20 +120,22 @@ def intersect_tiles(
     tensors = [x.detach().contiguous() for x in (means, quats, scales, opacities, gammas)]
     real, count = real_of(means), len(means)
     columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
-    centers = projection.centers.detach()
-    order = _depth_order(_with_distances(centers) if blending == "distance" else centers)
+    order = _depth_order(projection.centers.detach(), blending)
     kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
-    sharing = 1 if uses_simd(means) else SHARING
-    arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows), sharing]
-    counts = torch.empty(count * sharing, dtype=torch.int32, device=means.device)
-    launch(means, kernels.count, count * sharing, arguments, [array(counts, wp.int32)], even=False)
-    ends = _ends(counts, sharing, most=count * columns * rows)
-    exact = means.device.type == "cpu" and room is None
+    arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows)]
+    threads = -(-count // WARP) * WARP if means.is_cuda else count
+    totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
+    launch(means, kernels.count, threads, arguments, [array(totals, wp.int64)], even=False)
+    _scan(totals)
+    learns = room is None and means.is_cuda
+    exact = room is None and not learns
     if room is None:
-        room = _total(ends, columns * rows) if exact else _room(ends, kind)
-    emission = [*arguments, array(counts, wp.int32)]
-    surfel_ids, entries, tile_ids = _sorted_entries(order, kernels.emit, emission, room, columns * rows, sharing, exact)
+        room = _total(totals, columns * rows) if exact else _room(totals, kind)
+    emission = [*arguments, array(totals, wp.int64), threads, columns * rows]
+    surfel_ids, entries, tile_ids = _sorted_entries(ends, kernels.emit, emission, threads, room, columns * rows, exact)
+    if learns:
+        _ask(ends, kind)
     offsets = order.new_empty(columns * rows + 1)
     launch(means, tile_offsets_kernel, len(offsets), [array(tile_ids, wp.int32), room], [array(offsets, wp.int32)])
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, tile_size, columns, exact, kind)
@@ -173,38 +166,36 @@ def _tile_polygons(
 
 
 def _sorted_entries(
-    order: torch.Tensor,
+    ends: torch.Tensor,
     emit: wp.Kernel,
     emission: list[Argument],
+    threads: int,
     room: int,
     tiles: int,
-    sharing: int,
     exact: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Emit `room` entries and sort them by tile; return `Tiles.surfel_ids`, `Tiles.entries` and the sorted tiles."""
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    values, tile_ids = order.new_empty(2 * room), order.new_empty(2 * room)
-    values[:room] = 0
-    tile_ids[:room] = tiles
+    values, tile_ids = ends.new_empty(2 * room), ends.new_empty(2 * room)
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
-    surfels = array(order.new_zeros(room) if exact else None, wp.int32)
+    surfels = array(ends.new_empty(room) if exact else None, wp.int32)
     emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
-    launch(order, emit, len(order) * sharing, emission, emitted, even=False)
+    launch(ends, emit, threads, emission, [array(ends, wp.int32), *emitted], even=False)
+    if not threads:
+        values[:room] = 0
+        tile_ids[:room] = tiles
     _sort(tile_ids, values, room, tiles.bit_length())
     if not exact:
         return values[:room], values[:0], tile_ids[:room]
-    surfel_ids = order.new_empty(room)
-    launch(order, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
+    surfel_ids = ends.new_empty(room)
+    launch(ends, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
     return surfel_ids, values[:room], tile_ids[:room]
 
 
-def _with_distances(centers: torch.Tensor) -> torch.Tensor:
-    """Return centres (N, 3) with their distances from the camera in place of their z-depths."""
-    return torch.cat([centers[:, :2], centers.norm(dim=-1, keepdim=True)], dim=-1)
-
-
-def _depth_order(centers: torch.Tensor) -> torch.Tensor:
-    """Indices of surfels by signed depth, ties by index (the sort is stable)."""
+def _depth_order(centers: torch.Tensor, blending: Order) -> torch.Tensor:
+    """Indices of surfels by signed depth, or distance, of their centres (N, 3), ties by index (the sort is stable)."""
+    if blending == "distance":
+        centers = torch.cat([centers[:, :2], centers.norm(dim=-1, keepdim=True)], dim=-1)
     t = types(real_of(centers))
     count = len(centers)
     keys, order = (torch.empty(2 * count, dtype=torch.int32, device=centers.device) for _ in range(2))
@@ -218,36 +209,23 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     """Sort the first `count` pairs by the low `bits` bits of their keys, stably, in place."""
     if count == 0:
         return
-    sorted_keys, sorted_values = wp.from_torch(keys, dtype=wp.uint32), wp.from_torch(values, dtype=wp.int32)
+    sorted_keys, sorted_values = warp_array(keys, wp.uint32), warp_array(values, wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
-        wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)  # type: ignore[arg-type]  # no ctypes
-
-
-def _ends(counts: torch.Tensor, sharing: int, most: int) -> torch.Tensor:
-    """Turn the counts of each surfel's `sharing` threads into ends, in place, and return the surfels' ends (N,).
-
-    Of very many entries, which may be as many as `most`, the last end is the largest int32 if it is larger.
-    """
-    total = counts.sum().clamp_max(LARGEST_INT).view(1) if most > LARGEST_INT else None
-    _scan(counts)
-    ends = counts[sharing - 1 :: sharing]
-    if total is not None:
-        ends[-1:] = total
-    return ends
+        wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)
 
 
 def _scan(counts: torch.Tensor) -> None:
     """Turn counts into ends in place."""
     if len(counts) == 0:
         return
-    ends = wp.from_torch(counts, dtype=wp.int32)
+    ends = warp_array(counts, wp.int64)
     with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
-        wp.utils.array_scan(ends, ends, inclusive=True)  # type: ignore[arg-type]  # no ctypes
+        wp.utils.array_scan(ends, ends, inclusive=True)
 
 
-def _total(ends: torch.Tensor, tiles: int) -> int:
-    total = check_entries(int(ends[-1]), len(ends), tiles) if len(ends) else 0
-    check_memory(BYTES_AN_ENTRY * total, ends.device, f"a list of {total:,} (tile, surfel) entries")
+def _total(totals: torch.Tensor, tiles: int) -> int:
+    total = check_entries(int(totals[-1]), len(totals), tiles) if len(totals) else 0
+    check_memory(BYTES_AN_ENTRY * total, totals.device, f"a list of {total:,} (tile, surfel) entries")
     return total
 
 
@@ -255,54 +233,66 @@ def _total(ends: torch.Tensor, tiles: int) -> int:
 class _Need:
     """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later.
 
-    `room` is what was given to them, `most` the largest number that is known.
+    `room` is what was given to them, `most` the largest number that is known; `asked` while a count is on its way.
     """
 
     room: int
     total: torch.Tensor
     copied: torch.cuda.Event
     most: int = 0
+    asked: bool = False
 
 
 _needs: dict[tuple[int | None, int, int, int, bool], _Need] = {}
 
 
-def _room(ends: torch.Tensor, kind: tuple[int, int, bool]) -> int:
+def _room(totals: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     """Capacity of lists on CUDA: what renderings of this kind needed so far, and half as much again.
 
     Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
     of two). A later one that needs more than there is room for is still right, since the walk then goes over all
     surfels, but slow; the next one finds more room.
+
+    Args:
+        totals: (N,) integers, the last one is the number of entries of this rendering.
+        kind: as in `ListCapacity`.
     """
-    if len(ends) == 0:
+    if len(totals) == 0:
         return 0
-    key = _key(ends, kind)
+    key = _key(totals, kind)
     need = _needs.get(key)
     if torch.cuda.is_current_stream_capturing():
         if need is None:
             raise RuntimeError("expected a rendering of its kind before one is captured")
         return need.room
-    arrived = need is not None and need.copied.query()
-    if need is not None and arrived and int(need.total) > MAX_ENTRIES:
-        # That rendering was right, but no list can be as long: count again whether this one's can be made.
-        del _needs[key]
-        need = None
+    if need is not None and need.asked and need.copied.query():
+        need.asked = False
+        if int(need.total) > MAX_ENTRIES:
+            # That rendering was right, but no list can be as long: count again whether this one's can be made.
+            del _needs[key]
+            need = None
+        else:
+            need.most = max(need.most, int(need.total))
+            need.room = max(need.room, _with_margin(need.most))
     if need is None:
-        room = _with_margin(_total(ends, kind[0] * kind[1]))
+        room = _with_margin(_total(totals, kind[0] * kind[1]))
         # A scene that grew by splitting has at least the needs it had: one view may show little of it.
         if fewer := _needs.get((key[0], key[1] - 1, *kind)):
             room = max(room, fewer.room)
         with torch.inference_mode(False):  # later renderings write to it in any mode
             total = torch.empty(1, dtype=torch.int32, pin_memory=True)
         need = _needs[key] = _Need(room, total, torch.cuda.Event())
-    elif arrived:
-        need.most = max(need.most, int(need.total))
-        need.room = max(need.room, _with_margin(need.most))
-    else:
-        return need.room
+    return need.room
+
+
+def _ask(ends: torch.Tensor, kind: tuple[int, int, bool]) -> None:
+    """Ask the GPU for the number of entries that a rendering of a kind needed, unless an answer is on its way."""
+    need = _needs.get(_key(ends, kind))
+    if need is None or need.asked or torch.cuda.is_current_stream_capturing():
+        return
     need.total.copy_(ends[-1:], non_blocking=True)
     need.copied.record(torch.cuda.current_stream(ends.device))
-    return need.room
+    need.asked = True
 
 
 def _key(ends: torch.Tensor, kind: tuple[int, int, bool]) -> tuple[int | None, int, int, int, bool]:
@@ -311,7 +301,9 @@ def _key(ends: torch.Tensor, kind: tuple[int, int, bool]) -> tuple[int | None, i
 
 def fits(room: ListCapacity) -> bool:
     """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay."""
-    return _room(room.ends, room.kind) <= room.entries
+    enough = _room(room.ends, room.kind) <= room.entries
+    _ask(room.ends, room.kind)
+    return enough
 
 
 def held(room: ListCapacity) -> bool:
@@ -322,6 +314,7 @@ def held(room: ListCapacity) -> bool:
     if len(room.ends) == 0:
         return True
     _room(room.ends, room.kind)
+    _ask(room.ends, room.kind)
     need = _needs.get(_key(room.ends, room.kind))
     return need is None or need.most <= room.entries
 

@@ -57,6 +57,26 @@ _FROM_LANE = """
 #endif
 """
 
+_RUNNING_SUM = """
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31;
+    for (int o = 1; o < 32; o <<= 1) {
+        const int below = __shfl_up_sync(0xffffffffu, x, o);
+        if (lane >= o) x += below;
+    }
+#endif
+    return x;
+"""
+
+_OWNER = """
+    int owner = 0;
+#if defined(__CUDA_ARCH__)
+    for (int o = 16; o > 0; o >>= 1)
+        if (__shfl_sync(0xffffffffu, start, owner + o) <= place) owner += o;
+#endif
+    return owner;
+"""
+
 _MAX = """
 #if defined(__CUDA_ARCH__)
     for (int o = 16; o > 0; o >>= 1) x = max(x, __shfl_xor_sync(0xffffffffu, x, o));
@@ -149,6 +169,18 @@ def lowest_lane(mask: wp.int32) -> wp.int32:
 @wp.func_native(_FROM_LANE)
 def from_lane(x: wp.int32, source: wp.int32) -> wp.int32:
     """Return the value that x has in the lane `source`."""
+    ...
+
+
+@wp.func_native(_RUNNING_SUM)
+def warp_running_sum(x: wp.int32) -> wp.int32:
+    """Return the sum of x over this lane and those below it."""
+    ...
+
+
+@wp.func_native(_OWNER)
+def owner_lane(start: wp.int32, place: wp.int32) -> wp.int32:
+    """Return the highest lane whose `start` is at most `place`, where starts do not decrease and lane 0 has 0."""
     ...
 
 
