@@ -16,11 +16,13 @@ LAYERS = [line.split() for line in reversed(BLOCK.splitlines())]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 EXEMPT = {"__init__", "__main__"}
 PURE = {
+    "ctypes",
     "math",
     "collections",
     "functools",
     "concurrent",
     "os",
+    "threading",
     "typing",
     "dataclasses",
     "types",
