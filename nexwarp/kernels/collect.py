@@ -19,10 +19,10 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_size
+from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, overflowed, walk, walk_functions
+from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
 
 
 @functools.cache
@@ -42,6 +42,8 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         grid_stride=False,
         module="unique",
         module_options={"fast_math": real is wp.float32},
+        # As many blocks at once as 64 registers allow.
+        launch_bounds=(BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 else BLOCK_DIM,
     )
     def collect(
         first: wp.int32,
@@ -88,7 +90,7 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         for batch in range(bounds[0], bounds[1], width):
             if any_in_warp(wp.where(transmittance >= TRANSMITTANCE_MIN, 1, 0)) == 0:
                 break
-            mine = w.candidate(
+            batch_size = w.stage(
                 batch + lane,
                 bounds[1],
                 surfel_ids,
@@ -102,15 +104,13 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                 half,
                 focal,
             )
-            left = ballot(wp.where(mine >= 0, 1, 0))
-            while left != 0:
-                source = lowest_lane(left)
-                left = left & (left - 1)
-                i = from_lane(mine, source)
-                ra = load(records, i, 0)
-                rb = load(records, i, 1)
-                rn = load(records, i, 2)
-                rc = load(records, i, 3)
+            for k in range(batch_size[0]):
+                name = w.staged(k, batch_size[1], batch)
+                i = name[0]
+                ra = w.staged_row(k, 0, records, i)
+                rb = w.staged_row(k, 1, records, i)
+                rn = w.staged_row(k, 2, records, i)
+                rc = w.staged_row(k, 3, records, i)
                 u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
                 alpha = real(0.0)
                 # On a GPU some lane nearly always needs the exponentials.
@@ -122,24 +122,25 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
                 if alpha >= ALPHA_MIN and depth > near and transmittance >= TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)
-                    stop = batch + source + 1
-                    # Insert into the buffer before the first lighter hit, and move that and all behind it down by one,
-                    # so that of equal ones the nearer stays; what falls out is blended as plain.
-                    displaced = bool(False)
+                    stop = name[1] + 1
                     out_id = int(i)
                     out_weight = real(weight)
-                    for j in range(wp.static(max_hits)):
-                        w_ = buffer_weights[j]
-                        i_ = buffer_ids[j]
-                        displaced = displaced or out_weight > w_
-                        buffer_weights[j] = wp.where(displaced, out_weight, w_)
-                        buffer_ids[j] = wp.where(displaced, out_id, i_)
-                        out_weight = wp.where(displaced, w_, out_weight)
-                        out_id = wp.where(displaced, i_, out_id)
-                    # Its colour is read again: colours in the buffer would cost registers and moves. Out of an empty
-                    # slot comes the weight 0.
                     if wp.static(max_hits > 0):
-                        rc = load(records, wp.max(out_id, 0), 3)
+                        if weight > buffer_weights[wp.static(max_hits - 1)]:
+                            # Insert into the buffer before the first lighter hit, and move that and all behind it down
+                            # by one, so that of equal ones the nearer stays; what falls out is blended as plain.
+                            displaced = bool(False)
+                            for j in range(wp.static(max_hits)):
+                                w_ = buffer_weights[j]
+                                i_ = buffer_ids[j]
+                                displaced = displaced or out_weight > w_
+                                buffer_weights[j] = wp.where(displaced, out_weight, w_)
+                                buffer_ids[j] = wp.where(displaced, out_id, i_)
+                                out_weight = wp.where(displaced, w_, out_weight)
+                                out_id = wp.where(displaced, i_, out_id)
+                            # Its colour is read again: colours in the buffer would cost registers and moves. Out of an
+                            # empty slot comes the weight 0.
+                            rc = load(records, wp.max(out_id, 0), 3)
                     color += vec3(rc[0], rc[1], rc[2]) * out_weight
         if not inside:
             return

@@ -28,13 +28,9 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.native.fixed_point import fixed_point_add, fixed_point_record_sum
-from nexwarp.kernels.native.vector_loads import record_row_function
 from nexwarp.kernels.native.warp import (
     any_in_warp,
-    ballot,
-    from_lane,
     lane_index,
-    lowest_lane,
     warp_max,
     warp_record_sum,
     warp_size,
@@ -42,7 +38,7 @@ from nexwarp.kernels.native.warp import (
 )
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import buffer_types, overflowed, walk, walk_functions
+from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
 
 
 @functools.cache
@@ -62,7 +58,6 @@ def collect_backward_kernel(
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
     h = hit_functions(real, low_pass)
-    load = record_row_function(real)
     vec, ivec, _ = buffer_types(real, max_hits)
     w = walk_functions(real, low_pass, tile_size)
     pixels = w.pixels
@@ -79,6 +74,7 @@ def collect_backward_kernel(
         grid_stride=False,
         module="unique",
         module_options={"fast_math": real is wp.float32},
+        launch_bounds=BLOCK_DIM,
     )
     def collect_backward(
         first: wp.int32,
@@ -144,7 +140,7 @@ def collect_backward_kernel(
         lane = lane_index()
         last = wp.min(warp_max(stop), bounds[1])
         for batch in range(bounds[0], last, width):
-            mine = w.candidate(
+            batch_size = w.stage(
                 batch + lane,
                 last,
                 surfel_ids,
@@ -158,16 +154,14 @@ def collect_backward_kernel(
                 half,
                 focal,
             )
-            left = ballot(wp.where(mine >= 0, 1, 0))
-            while left != 0:
-                source = lowest_lane(left)
-                left = left & (left - 1)
-                i = from_lane(mine, source)
-                k = batch + source
-                ra = load(records, i, 0)
-                rb = load(records, i, 1)
-                rn = load(records, i, 2)
-                rc = load(records, i, 3)
+            for staged in range(batch_size[0]):
+                name = w.staged(staged, batch_size[1], batch)
+                i = name[0]
+                k = name[1]
+                ra = w.staged_row(staged, 0, records, i)
+                rb = w.staged_row(staged, 1, records, i)
+                rn = w.staged_row(staged, 2, records, i)
+                rc = w.staged_row(staged, 3, records, i)
                 center = vec3()
                 if wp.static(low_pass):
                     center = centers[i]

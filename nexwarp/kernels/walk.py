@@ -2,8 +2,8 @@
 
 A thread is a pixel. The 32 threads of a warp are a block of 8 x 4 pixels, the warps of a tile cover its pixels, and the
 tiles cover the image, so that some threads lie outside of it. A warp culls the list together: each lane tests one entry
-against the whole block, then all lanes walk along the entries that are left, about half of a tile's. On a CPU a warp is
-one thread, which tests nothing here, since the hit itself is as cheap.
+against the whole block, then all lanes walk along the entries that are left, about half of a tile's, whose records wait
+in shared memory. On a CPU a warp is one thread, which tests nothing here, since the hit itself is as cheap.
 
 Read: the lists of `nexwarp.ops.Tiles`, and the records of `surfel`. Nothing here is written or differentiated; which
 entries are walked is frozen for the backward pass.
@@ -14,8 +14,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.native.staging import lanes_below, population, staging_functions, sync_warp
 from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import warp_size
+from nexwarp.kernels.native.warp import ballot, warp_size
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 
@@ -60,7 +61,7 @@ def walk_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNamespac
     vec2, vec3, vec4, mat33, HALF = t.vec2, t.vec3, t.vec4, t.mat33, t.HALF
     intrinsics_of = frame_functions(real).intrinsics_of
     misses_block = hit_functions(real, low_pass).misses_block
-    load = record_row_function(real)
+    load, staged = record_row_function(real), staging_functions(real, BLOCK_DIM)
     # Half of the distances between the outer pixel centres of a block, and a little.
     HALF_WIDTH, HALF_HEIGHT = wp.constant(real(3.51)), wp.constant(real(1.51))
     pixels = tile_size * tile_size
@@ -125,7 +126,42 @@ def walk_functions(real: type, low_pass: bool, tile_size: int) -> SimpleNamespac
                     i = int(-1)
         return i
 
-    return SimpleNamespace(pixel_of=pixel_of, block_of=block_of, candidate=candidate, pixels=pixels)
+    @wp.func
+    def stage(
+        k: wp.int32,
+        end: wp.int32,
+        surfel_ids: wp.array(dtype=wp.int32),
+        order: wp.array(dtype=wp.int32),
+        overflow: wp.bool,
+        records: wp.array2d(dtype=vec4),
+        centers: wp.array(dtype=vec3),
+        limits: wp.array(dtype=real),
+        reaches: wp.array(dtype=vec2),
+        middle: vec2,
+        half: vec2,
+        focal: vec2,
+    ):
+        """(number of surfels staged, this lane's surfel): what `candidate` leaves of the lanes' places k."""
+        i = candidate(k, end, surfel_ids, order, overflow, records, centers, limits, reaches, middle, half, focal)
+        chosen = ballot(wp.where(i >= 0, 1, 0))
+        sync_warp()  # the batch before has been read
+        if i >= 0:
+            a = load(records, i, 0)
+            b = load(records, i, 1)
+            n = load(records, i, 2)
+            staged.put(lanes_below(chosen), i, k, a, b, n, load(records, i, 3), records)
+        sync_warp()
+        return wp.vec2i(population(chosen), i)
+
+    return SimpleNamespace(
+        pixel_of=pixel_of,
+        block_of=block_of,
+        candidate=candidate,
+        stage=stage,
+        staged=staged.name,
+        staged_row=staged.row,
+        pixels=pixels,
+    )
 
 
 @functools.cache

@@ -1,0 +1,137 @@
+"""Records that a warp walks along, staged in shared memory: each lane brings one, then all lanes read one by one.
+
+A record that is read from shared memory needs no address of its own, and neither shuffles nor votes are between one
+record and the next, so that the compiler computes two at once. On a CPU a warp is one thread, which stages nothing and
+reads the record itself.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+_POPULATION = """
+#if defined(__CUDA_ARCH__)
+    return __popc(mask);
+#else
+    return mask != 0;
+#endif
+"""
+
+_SLOT = """
+#if defined(__CUDA_ARCH__)
+    return __popc(mask & ((1u << (threadIdx.x & 31)) - 1u));
+#else
+    return 0;
+#endif
+"""
+
+# One function writes and reads, since a shared array belongs to the function that declares it: step 0 writes, step
+# j + 1 reads row j. Rows of neighbouring slots are neighbours, so that writes meet no bank twice.
+_ROW = """
+#if defined(__CUDA_ARCH__)
+    struct __align__(16) Row { REAL x, y, z, w; };
+    __shared__ Row rows[WARPS * 4 * 32];
+    Row* mine = rows + (threadIdx.x >> 5) * 128 + slot;
+    if (step == 0) {
+        mine[0] = {a.c[0], a.c[1], a.c[2], a.c[3]};
+        mine[32] = {b.c[0], b.c[1], b.c[2], b.c[3]};
+        mine[64] = {n.c[0], n.c[1], n.c[2], n.c[3]};
+        mine[96] = {c.c[0], c.c[1], c.c[2], c.c[3]};
+        return a;
+    }
+    const Row row = mine[32 * (step - 1)];
+    return wp::vec_t<4, REAL>(row.x, row.y, row.z, row.w);
+#else
+    return step == 0 ? a : records.data[4 * (size_t)i + step - 1];
+#endif
+"""
+
+_NAME = """
+#if defined(__CUDA_ARCH__)
+    __shared__ int2 names[WARPS * 32];
+    int2* mine = names + (threadIdx.x >> 5) * 32 + slot;
+    if (step == 0) *mine = make_int2(i, place);
+    const int2 name = *mine;
+    return wp::vec_t<2, int>(name.x, name.y);
+#else
+    return wp::vec_t<2, int>(i, place);
+#endif
+"""
+
+_SYNC = """
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+"""
+
+
+@wp.func_native(_POPULATION)
+def population(mask: wp.int32) -> wp.int32:
+    """Return the number of lanes in a ballot."""
+    ...
+
+
+@wp.func_native(_SLOT)
+def lanes_below(mask: wp.int32) -> wp.int32:
+    """Return the number of lanes in a ballot that are lower than this one."""
+    ...
+
+
+@wp.func_native(_SYNC)
+def sync_warp():
+    """Wait for all lanes of the warp, and make what they have written to shared memory visible to each other."""
+    ...
+
+
+@functools.cache
+def staging_functions(real: type, threads: int) -> SimpleNamespace:
+    """Make the functions that stage records (four vec4 each, see `surfel`) in blocks of `threads` threads.
+
+    `put(slot, i, place, a, b, n, c)` stages the surfel i, which is at a place of the walk, with the rows of its record.
+    `name(slot, i, place)` returns (i, place) of a slot, and `row(slot, j, records, i)` row j of its record. On a CPU
+    these return what they are given, and the record i's.
+    """
+    vec4 = wp.types.vector(length=4, dtype=real)
+    kind = "float" if real is wp.float32 else "double"
+    snippet = _ROW.replace("REAL", kind).replace("WARPS", str(threads // 32))
+
+    @wp.func_native(snippet)
+    def access(
+        step: wp.int32,
+        slot: wp.int32,
+        a: vec4,
+        b: vec4,
+        n: vec4,
+        c: vec4,
+        records: wp.array2d(dtype=vec4),
+        i: wp.int32,
+    ) -> vec4: ...
+
+    @wp.func_native(_NAME.replace("WARPS", str(threads // 32)))
+    def access_name(step: wp.int32, slot: wp.int32, i: wp.int32, place: wp.int32) -> wp.vec2i: ...
+
+    @wp.func
+    def put(
+        slot: wp.int32,
+        i: wp.int32,
+        place: wp.int32,
+        a: vec4,
+        b: vec4,
+        n: vec4,
+        c: vec4,
+        records: wp.array2d(dtype=vec4),
+    ):
+        access(0, slot, a, b, n, c, records, i)
+        access_name(0, slot, i, place)
+
+    @wp.func
+    def name(slot: wp.int32, i: wp.int32, place: wp.int32):
+        return access_name(1, slot, i, place)
+
+    @wp.func
+    def row(slot: wp.int32, j: wp.int32, records: wp.array2d(dtype=vec4), i: wp.int32):
+        none = vec4()
+        return access(j + 1, slot, none, none, none, none, records, i)
+
+    return SimpleNamespace(put=put, name=name, row=row)
