@@ -6,8 +6,8 @@ Added to:
     grad_records, grad_centers    gradients of the surfels' records and, with the low-pass, centres
     error_sums                    with_errors: sum over pixels of weight * error, as `splat_error` gives
 
-Gradients of the walk's place k go to gradient slot gradient_slots[k], which one CPU thread owns and `reduce` adds up in
-a fixed order; without `gradient_slots`, as on CUDA, they go to the surfel, by atomics after a sum over the warp.
+With `by_place`, gradients of the walk's place k go to gradient slot gradient_slots[k], which one CPU thread owns and
+`reduce` adds up in a fixed order. Without, as on CUDA, they go to the surfel, by atomics after a sum over the warp.
 
 Warp's own adjoint of such a loop is silently wrong, since it does not replay a carried transmittance. The recurrence
 is therefore written by hand. With q_i = dL/dw_i,
@@ -43,7 +43,13 @@ from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk
 
 @functools.cache
 def collect_backward_kernel(
-    real: type, max_hits: int, low_pass: bool, tile_size: int, with_errors: bool = False, fixed_point: bool = False
+    real: type,
+    max_hits: int,
+    low_pass: bool,
+    tile_size: int,
+    with_errors: bool = False,
+    fixed_point: bool = False,
+    by_place: bool = False,
 ) -> wp.Kernel:
     """Make the backward kernel.
 
@@ -54,6 +60,7 @@ def collect_backward_kernel(
         tile_size: pixels along a tile's side.
         with_errors: also add up weight * error.
         fixed_point: add up pairs of integers, see `native.fixed_point`, so that sums do not depend on any order.
+        by_place: give each place of the walk a slot of its own, `gradient_slots[k]`, instead of one to each surfel.
     """
     t = types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
@@ -206,7 +213,7 @@ def collect_backward_kernel(
                     r2 = vec4(gt * d[0], gt * d[1], gt, g2)
                     r3 = vec4(g[0] * weight, g[1] * weight, g[2] * weight, gm)
                     slot = int(i)
-                    if k < gradient_slots.shape[0]:
+                    if wp.static(by_place):
                         slot = gradient_slots[k]
                     if wp.static(fixed_point):
                         put_record(grad_records, slot, r0, r1, r2, r3, bad)

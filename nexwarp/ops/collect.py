@@ -294,7 +294,7 @@ class _Collect(torch.autograd.Function):
             width = strip_width(tiles.tile_size)
             launch_walk(records, collect_simd_backward_kernel(*variant), tiles, inputs, outputs, width)
         else:
-            kernel = collect_backward_kernel(*variant, sums.fixed_point)
+            kernel = collect_backward_kernel(*variant, sums.fixed_point, tiles.exact)
             launch_walk(records, kernel, tiles, inputs, [*outputs, sums.bad_array])
         if error_sums is not None:
             request.sums_after_backward = sums.reduce(error_sums[:, None], real)[:, 0]

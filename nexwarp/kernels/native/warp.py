@@ -106,7 +106,7 @@ GATHER_RECORD = """
 
 _ADD_RECORD = """
     GATHER
-    REAL* target = reinterpret_cast<REAL*>(&wp::index(records, slot, 0));
+    REAL* target = reinterpret_cast<REAL*>(records.data + 4 * (size_t)(unsigned)slot);
 #if defined(__CUDA_ARCH__)
     const int lane = threadIdx.x & 31;
     EXCHANGES
@@ -203,7 +203,7 @@ def warp_sum(dtype: type) -> wp.Function:
 
 @functools.cache
 def warp_record_sum(real: type) -> wp.Function:
-    """Make a function that adds the sum over all lanes of four vec4 to the four of records[slot]."""
+    """Make a function that adds the sum over all lanes of four vec4 to the four of records[slot], (N, 4) contiguous."""
     vec4 = wp.types.vector(length=4, dtype=real)
     name = "float" if real is wp.float32 else "double"
 
