@@ -18,7 +18,7 @@ import warp as wp
 import nexwarp as nw
 from nexwarp.determinism import deterministic
 from nexwarp.kernels import launch as launching
-from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds
+from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_tile_builds
 from nexwarp.kernels.rays import collect_rays_kernel, ray_list_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.tsdf import fuse_kernel
@@ -65,7 +65,8 @@ def compile_catalogue(device: torch.device, hits: Sequence[int] = range(MAX_HITS
     """Compile the kernels, several at a time, so that a sweep only launches them."""
     wp.init()
     walks = ("collect", "splat_error", "surface")
-    blocks = {kernel.module.name: threads for kernel, threads in fused_kernel_builds()}
+    own_blocks = (*fused_kernel_builds(), *ssim_tile_builds())
+    blocks = {kernel.module.name: threads for kernel, threads in own_blocks}
     builds = [
         Build(k, blocks.get(k.module.name, BLOCK_DIM if k.key.startswith(walks) else 256))
         for k in catalogue(device, hits)

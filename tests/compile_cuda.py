@@ -11,7 +11,7 @@ from pathlib import Path
 
 import warp as wp
 
-from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, thread_kernels, walk_kernels
+from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.tiles import TILE_SIZE
 
@@ -31,10 +31,10 @@ def one_run() -> Iterator[wp.Kernel]:
         features=(2, 4),
         clamps=(False,),
         low_passes=(False,),
-        ssim_lengths=(1,),
+        ssim_lengths=(),
     )
     yield from walk_kernels(wp.float32, TILE_SIZE, (2,), low_passes=(False,))
-    yield from (kernel for kernel, _ in fused_kernel_builds((4,)))
+    yield from (kernel for kernel, _ in (*fused_kernel_builds((4,)), *ssim_tile_builds()))
 
 
 CHOICES = {"all": all_kernels, "usual": usual, "one run": one_run}

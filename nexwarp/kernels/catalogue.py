@@ -31,6 +31,8 @@ from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
+from nexwarp.kernels.ssim_tiles import THREADS as SSIM_THREADS
+from nexwarp.kernels.ssim_tiles import ssim_tile_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
@@ -47,7 +49,11 @@ def all_kernels(
     cpu: bool = False,
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
-    yield from thread_kernels(real, storage, tile_size, ssim_lengths=(1, SIMD_WIDTH) if cpu else (1,), cpu=cpu)
+    in_tiles = not cpu and real is wp.float32
+    lengths = () if in_tiles else (1, SIMD_WIDTH) if cpu else (1,)
+    yield from thread_kernels(real, storage, tile_size, ssim_lengths=lengths, cpu=cpu)
+    if in_tiles:
+        yield from (kernel for kernel, _ in ssim_tile_builds())
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
     if not cpu:
         yield from (kernel for kernel, _ in fused_kernel_builds())
@@ -109,6 +115,12 @@ def thread_kernels(
         lists = list_kernels(real, low_pass, tile_size)
         yield tile_polygon_kernel(real, low_pass, tile_size)
         yield from (lists.count, lists.emit)
+
+
+def ssim_tile_builds() -> Iterator[tuple[wp.Kernel, int]]:
+    """Yield the kernels of D-SSIM for GPUs in float32, with the threads of their blocks."""
+    kernels = ssim_tile_kernels()
+    yield from ((kernel, SSIM_THREADS) for kernel in (kernels.score, kernels.gradient))
 
 
 def fused_kernel_builds(features: Sequence[int] = (2, 4)) -> Iterator[tuple[wp.Kernel, int]]:

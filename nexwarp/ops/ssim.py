@@ -6,6 +6,7 @@ from torch.autograd.function import once_differentiable
 
 from nexwarp.checks import check_tensors
 from nexwarp.kernels.ssim import PAD, SIMD_WIDTH, rows_a_thread, ssim_kernels
+from nexwarp.kernels.ssim_tiles import THREADS, blocks_of, ssim_tile_kernels
 from nexwarp.ops._interop import Argument, Context, array, launch, real_of, uses_simd
 
 
@@ -67,27 +68,59 @@ class _Blocks:
         )
 
 
+def _score_tiles(
+    image: torch.Tensor, target: torch.Tensor, scale: float, derivatives: torch.Tensor | None
+) -> torch.Tensor:
+    """Return the sum of (1 - s) scale of float32 images on a GPU; write ds/dmx, ds/dq, ds/dp."""
+    height, width = image.shape[0], 3 * image.shape[1]
+    threads = THREADS * blocks_of(height, width)
+    losses = image.new_empty(threads)
+    inputs = [*(array(x.view(-1), wp.float32) for x in (image, target)), height, width, scale]
+    outputs = [array(losses, wp.float32), array(derivatives, wp.float32)]
+    launch(image, ssim_tile_kernels().score, threads, inputs, outputs, block_dim=THREADS)
+    return losses.sum()
+
+
+def _gradient_tiles(
+    image: torch.Tensor, target: torch.Tensor, scale: float, derivatives: torch.Tensor, grad_loss: torch.Tensor
+) -> torch.Tensor:
+    """Return the gradient of what `_score_tiles` returned."""
+    height, width = image.shape[0], 3 * image.shape[1]
+    gradient = torch.empty_like(image)
+    inputs = [array(derivatives, wp.float32), *(array(x.view(-1), wp.float32) for x in (image, target))]
+    inputs += [height, width, scale, array(grad_loss.reshape(1), wp.float32)]
+    threads, outputs = THREADS * blocks_of(height, width), [array(gradient.view(-1), wp.float32)]
+    launch(image, ssim_tile_kernels().gradient, threads, inputs, outputs, block_dim=THREADS)
+    return gradient
+
+
 class _Context(Context):
     scale: float
+    tiles: bool
 
 
 class _DSSIM(torch.autograd.Function):
     @staticmethod
     def forward(ctx: _Context, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
+        derivatives = image.new_empty(3, image.numel()) if ctx.needs_input_grad[0] else None
+        ctx.scale = factor / image.numel()
+        ctx.tiles = image.is_cuda and image.dtype == torch.float32
+        if derivatives is not None:
+            ctx.save_for_backward(image, target, derivatives)
+        if ctx.tiles:
+            return _score_tiles(image, target, ctx.scale, derivatives)
         b = _Blocks(image)
         moments = b.blur_columns(b.kernels.moments, image.view(-1), target.view(-1))
         losses = image.new_empty(image.numel())
-        derivatives = image.new_empty(3, image.numel()) if ctx.needs_input_grad[0] else None
-        ctx.scale = factor / image.numel()
         b.blur_rows(b.kernels.score, moments, [b.width, ctx.scale], [b.array(losses), b.array(derivatives)])
-        if derivatives is not None:
-            ctx.save_for_backward(image, target, derivatives)
         return losses.sum()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: _Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         image, target, derivatives = ctx.saved_tensors
+        if ctx.tiles:
+            return _gradient_tiles(image, target, ctx.scale, derivatives, grad_loss), None, None
         b = _Blocks(image)
         blurred = b.blur_columns(b.kernels.blur, *derivatives)
         gradient = torch.empty_like(image)

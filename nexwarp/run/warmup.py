@@ -15,7 +15,7 @@ import warp as wp
 
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
-from nexwarp.kernels.catalogue import fused_kernel_builds, thread_kernels, walk_kernels
+from nexwarp.kernels.catalogue import fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
@@ -63,7 +63,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         features=(config.texture.features,) * textured,
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
-        ssim_lengths=(SIMD_WIDTH if cpu else 1,),
+        ssim_lengths=(SIMD_WIDTH,) * cpu,
         layered=not simd or config.refine_poses or config.blur_poses > 1,  # directions with gradients
         simd=simd,
         cpu=cpu,
@@ -75,6 +75,8 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
     builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
+    if not cpu:
+        builds += (Build(*build) for build in ssim_tile_builds())
     if textured and supported(device) and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
         builds += (Build(*build) for build in fused_kernel_builds((shape.features,)))
     return builds
