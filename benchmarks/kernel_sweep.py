@@ -25,6 +25,7 @@ from nexwarp.kernels.tsdf import fuse_kernel
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops._interop import array, launch
+from nexwarp.ops.expose import expose
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.rays import TILE_SIZE
 from nexwarp.ops.ssim import weighted_dssim
@@ -242,6 +243,8 @@ def _losses(device: torch.device, width: int, height: int) -> int:
     image, textured, target = torch.rand(3, height, width, 3, generator=generator).to(device)
     weights = torch.rand(height, width, 2, generator=generator).to(device)
     leaves = image, textured, weights = [x.clone().requires_grad_() for x in (image, textured, weights)]
+    if device.type == "cuda":  # elsewhere torch takes images to exposures
+        image, textured = expose(image, textured, target.new_full((3,), 1.1), target, 0.9)
     terms = photometric_terms(image, textured, weights, target, l1=1.0, texture=1.0, alpha=1.0)
     total = weighted_dssim(image, target, 0.2)
     for term in terms:

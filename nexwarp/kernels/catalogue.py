@@ -14,6 +14,7 @@ from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_si
 from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
 from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
 from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
+from nexwarp.kernels.expose import expose_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
@@ -94,6 +95,8 @@ def thread_kernels(
         yield surfel_ids_kernel
     yield from (reduce_slots_kernel(dtype) for dtype in (real, types(real).vec3, types(real).vec4))
     yield adam_kernel()
+    if not cpu:
+        yield from (expose_kernels(real).forward, expose_kernels(real).backward)
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
     for length in ssim_lengths:
         ssim = ssim_kernels(real, length)

@@ -4,6 +4,7 @@ from nexwarp.ops.activate import activate
 from nexwarp.ops.antialias import antialias
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
+from nexwarp.ops.expose import expose
 from nexwarp.ops.graphs import captured
 from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
@@ -30,6 +31,7 @@ __all__ = [
     "check_image",
     "collect",
     "compose",
+    "expose",
     "fits",
     "held",
     "intersect_tiles",

@@ -26,7 +26,7 @@ def moments(count: int) -> list[float]:
 
 
 def render_target(
-    model: Model, target: Target, poses: PoseCorrections | None, count: int
+    model: Model, target: Target, poses: PoseCorrections | None, count: int, *, plain: bool = True
 ) -> tuple[Rendering, Rendering]:
     """Render what a step compares with its photo.
 
@@ -35,6 +35,7 @@ def render_target(
         target: of the step, its camera corrected.
         poses: which hold the motions; None where there are none.
         count: of poses in an exposure, odd; 1 is a sharp photo.
+        plain: whether the plain colours are taken to the photo's exposure, too.
 
     Returns:
         The rendering from the middle of the exposure, and the same as the photo was taken: `image` and `textured` are
@@ -42,11 +43,11 @@ def render_target(
     """
     if poses is None or target.view is None or count == 1:
         out = _rendered(model, target)
-        return out, as_taken(out, target)
+        return out, as_taken(out, target, plain=plain)
     middle = _rendered(model, target)
     cameras = [poses.moment(target.camera, target.view, time) for time in moments(count) if time != 0.0]
     others = [_rendered(model, dataclasses.replace(target, camera=camera)) for camera in cameras]
-    return middle, clipped(blurred([exposed(out, target) for out in (middle, *others)]), target)
+    return middle, clipped(blurred([exposed(out, target, plain=plain) for out in (middle, *others)]), target)
 
 
 def _rendered(model: Model, target: Target) -> Rendering:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 import torch
 
+from nexwarp.ops import expose
 from nexwarp.render import Rendering
 from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import Surfels
@@ -37,21 +38,28 @@ def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]
     return dict(losses or {})
 
 
-def as_taken(out: Rendering, target: Target) -> Rendering:
-    """Return a rendering at the exposure of the photo that it is compared with.
+def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
+    """Return a rendering at the exposure of the photo that it is compared with; without `plain`, its plain colours not.
 
     Where the photo is saturated, a brighter image counts as equal to it: it has no error and no gradient there.
     Clipped photos of different exposures would otherwise ask for different colours of the same bright surface.
     """
-    return clipped(exposed(out, target), target)
-
-
-def exposed(out: Rendering, target: Target) -> Rendering:
-    """Return a rendering times the gains and the falloff of the photo that it is compared with."""
     if target.exposure is None:
         return out
-    image, plain, textured = (x * target.exposure for x in (out.image, out.plain, out.textured))
-    return dataclasses.replace(out, image=image, plain=plain, textured=textured)
+    if not out.image.is_cuda:  # where vector instructions make torch's passes faster than one kernel
+        return clipped(exposed(out, target, plain=plain), target)
+    image, textured = expose(out.image, out.textured, target.exposure, target.photo, SATURATION)
+    colors = out.plain * target.exposure if plain else out.plain
+    return dataclasses.replace(out, image=image, plain=colors, textured=textured)
+
+
+def exposed(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
+    """Return a rendering times the gains and the falloff of its photo; without `plain`, its plain colours not."""
+    if target.exposure is None:
+        return out
+    image, textured = out.image * target.exposure, out.textured * target.exposure
+    colors = out.plain * target.exposure if plain else out.plain
+    return dataclasses.replace(out, image=image, plain=colors, textured=textured)
 
 
 def clipped(out: Rendering, target: Target) -> Rendering:

@@ -219,7 +219,8 @@ class Trainer:
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             target = refined(target, self.poses)
-            out, taken = render_target(self.model(), target, self.poses, self.config.blur_poses)
+            plain, blur = bool(self.own_losses), self.config.blur_poses
+            out, taken = render_target(self.model(), target, self.poses, blur, plain=plain)
             given = (taken, target, self.surfels, self.texture, self.config)
             own, poses, grid = self.own_losses, self.poses, fused is None
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
