@@ -13,7 +13,7 @@ from nexwarp.ops.project import Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import DifferentiableSurface, Surface, surface
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import ListCapacity, Tiles, fits, held, intersect_tiles
+from nexwarp.ops.tiles import ListCapacity, Tiles, UnknownLengthError, fits, held, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "SplatErrorRequest",
     "Surface",
     "Tiles",
+    "UnknownLengthError",
     "activate",
     "antialias",
     "captured",

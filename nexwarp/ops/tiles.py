@@ -29,6 +29,10 @@ def check_order(order: object) -> None:
         raise ValueError(f"order: expected {' or '.join(get_args(Order))}, got {order!r:.60}")
 
 
+class UnknownLengthError(RuntimeError):
+    """A CUDA graph is captured before any rendering of its kind has told how long lists must be."""
+
+
 @dataclass(frozen=True)
 class ListCapacity:
     """Capacity of tile lists, and what tells whether it suffices; see `fits`.
@@ -263,7 +267,7 @@ def _room(totals: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     need = _needs.get(key)
     if torch.cuda.is_current_stream_capturing():
         if need is None:
-            raise RuntimeError("expected a rendering of its kind before one is captured")
+            raise UnknownLengthError("expected a rendering of its kind before one is captured")
         return need.room
     if need is not None and need.asked and need.copied.query():
         need.asked = False

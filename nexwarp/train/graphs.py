@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from typing import NamedTuple
 
@@ -23,6 +23,18 @@ FORGOTTEN = 1000
 
 # How often to start again without any graph when memory does not suffice.
 CHANCES = 3
+
+
+class GraphKey(NamedTuple):
+    """Key that decides whether a captured graph can be reused, beside its target's kind.
+
+    Attributes:
+        kernels: what decides which kernels a step launches.
+        tensors: what they read and write.
+    """
+
+    kernels: Hashable
+    tensors: Hashable
 
 
 class Gradients(NamedTuple):
@@ -81,9 +93,10 @@ class StepGraphs:
 
     A step launches hundreds of small kernels, which keeps the host busy for longer than the GPU. What differs from one
     step to the next, its target and the learning rates, is copied into tensors that the graph reads. Whatever else
-    changes, such as the number of surfels, needs a new graph: the first step after it is launched kernel by kernel, the
-    next one is captured. Both do the same arithmetic on the same numbers. Where memory does not suffice for graphs, or
-    a step cannot be captured, all later steps are launched kernel by kernel.
+    changes needs a new graph: the first step after it is launched kernel by kernel, the next one is captured. Where
+    only tensors have been replaced, as by a round of density control, the first one is captured. Both do the same
+    arithmetic on the same numbers. Where memory does not suffice for graphs, or a step cannot be captured, all later
+    steps are launched kernel by kernel.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -94,7 +107,7 @@ class StepGraphs:
         self.steps = 0
         self.chances = CHANCES
 
-    def run(self, target: Target, work: Callable[[Target], StepResult], state: Hashable) -> StepResult:
+    def run(self, target: Target, work: Callable[[Target], StepResult], state: GraphKey) -> StepResult:
         """Do a step.
 
         Args:
@@ -128,7 +141,7 @@ class StepGraphs:
         release_graphs()
         torch.cuda.empty_cache()
 
-    def _run(self, target: Target, work: Callable[[Target], StepResult], state: Hashable) -> StepResult:
+    def _run(self, target: Target, work: Callable[[Target], StepResult], state: GraphKey) -> StepResult:
         self.steps += 1
         kind = _kind(target)
         stage = self.stages.get(kind)
@@ -143,13 +156,17 @@ class StepGraphs:
             stage.take(target)
         stage.seen = self.steps
         if stage.state != state:
+            # Kernels that have been launched are loaded, which a capture must not do.
+            known = stage.graph is not None and stage.state is not None and stage.state.kernels == state.kernels
             stage.forget()
             stage.state = state
-            return work(stage.target)
+            if not known:
+                return work(stage.target)
         if stage.graph is None:
             self._keep_pool()
-            stage.capture(work, self.stream, self.pool)
-        return stage.replay()
+            with suppress(ops.UnknownLengthError):
+                stage.capture(work, self.stream, self.pool)
+        return work(stage.target) if stage.graph is None else stage.replay()
 
     def _keep_pool(self) -> None:
         """Make a graph that keeps the memory pool: torch frees a pool with its last graph."""
@@ -172,7 +189,7 @@ class _Stage:
         self.target = replace(target, camera=self.camera, **tensors)
         self.tensors = tensors
         self.seen = 0
-        self.state: Hashable = None
+        self.state: GraphKey | None = None
         self.graph: torch.cuda.CUDAGraph | None = None
         self.result: StepResult | None = None
         self.losses: torch.Tensor | None = None
@@ -215,6 +232,8 @@ def _capture_errors() -> Iterator[None]:
     """Turn errors of a capture into CaptureError."""
     try:
         yield
+    except ops.UnknownLengthError:
+        raise
     except (MemoryError, RuntimeError) as error:
         raise CaptureError(error) from None  # whose traceback would keep what the step had made
 
@@ -242,8 +261,8 @@ def can_capture(optimizer: torch.optim.Optimizer) -> bool:
 
 def graph_key(
     options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
-) -> Hashable:
-    """Key that decides whether a captured graph can be reused, beside its target's kind.
+) -> GraphKey:
+    """Return the key of a step.
 
     Args:
         options: how the step renders.
@@ -252,11 +271,10 @@ def graph_key(
         densify: whether the step adds to these sums.
     """
     moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
-    return (
-        densify,
-        options.max_hits,
-        options.sh_degree,
-        torch.are_deterministic_algorithms_enabled(),
-        *((x.data_ptr(), x.shape) for x in (*tensors, *moments)),
-        *(group["lr"].data_ptr() for group in optimizer.param_groups),
+    return GraphKey(
+        (densify, options.max_hits, options.sh_degree, torch.are_deterministic_algorithms_enabled()),
+        (
+            *((x.data_ptr(), x.shape) for x in (*tensors, *moments)),
+            *(group["lr"].data_ptr() for group in optimizer.param_groups),
+        ),
     )

@@ -7,7 +7,7 @@ change, so that all ranks change them alike. `Config.iterations` and all schedul
 import hashlib
 import json
 import math
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -21,7 +21,7 @@ from nexwarp.memory import needed_memory
 from nexwarp.model.frames import capturing
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
-from nexwarp.train.graphs import Gradients, StepResult, UpdateError
+from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
 from nexwarp.train.step_losses import OwnLoss
@@ -146,8 +146,9 @@ class ParallelTrainer(Trainer):
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]
 
-    def _graph_key(self) -> Hashable:
-        return super()._graph_key(), self.share
+    def _graph_key(self) -> GraphKey:
+        key = super()._graph_key()
+        return key._replace(kernels=(key.kernels, self.share))
 
     def check(self) -> None:
         """Raise DivergedError, the same one on all ranks, unless all numbers are finite.

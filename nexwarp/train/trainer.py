@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, reduce
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
 from nexwarp.train.floaters import FLOATERS_EVERY, floaters, nearest_depth
-from nexwarp.train.graphs import Gradients, StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.motion_blur import render_target
@@ -251,10 +251,10 @@ class Trainer:
                 self.densifier.accumulate(errors)
         return None
 
-    def _graph_key(self) -> Hashable:
+    def _graph_key(self) -> GraphKey:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
         key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
-        return key, self.texture.half_copy_key()
+        return key._replace(kernels=(key.kernels, self.texture.half_copy_key()))
 
     def _floaters_due(self) -> bool:
         """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
