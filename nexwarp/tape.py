@@ -23,7 +23,13 @@ from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
-from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tile_lists import (
+    depth_keys_kernel,
+    list_kernels,
+    list_threads,
+    surfel_ids_kernel,
+    tile_offsets_kernel,
+)
 from nexwarp.kernels.tiles import MAX_CORNERS, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernels
@@ -211,8 +217,7 @@ def intersect_tiles(
     _silent(tile_polygon_kernel(real, low_pass, tile_size), count, surfels, [reaches, *polygons])
     kernels = list_kernels(real, low_pass, tile_size)
     arguments = [order[:count], *polygons, wp.vec2i(columns, rows)]
-    # Whole warps, which work together.
-    threads = -(-count // 32) * 32 if means.device.is_cuda else count
+    threads = list_threads(count, means.device.is_cuda)
     totals = integers(count, wp.int64)
     total = 0
     if count:

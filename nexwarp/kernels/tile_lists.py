@@ -42,6 +42,11 @@ def depth_keys_kernel(real: type) -> wp.Kernel:
     return depth_keys
 
 
+def list_threads(surfels: int, on_gpu: bool) -> int:
+    """Return how many threads count and emit take: on a GPU whole warps, which work together."""
+    return -(-surfels // 32) * 32 if on_gpu else surfels
+
+
 @functools.cache
 def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     """Make the kernels that count and emit (tile, surfel) entries, a thread a surfel in depth order.

@@ -14,9 +14,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.staging import lanes_below, population, staging_functions, sync_warp
+from nexwarp.kernels.native.staging import staging_functions
 from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import ballot, warp_size
+from nexwarp.kernels.native.warp import ballot, lanes_below, population, sync_warp, warp_size
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 

@@ -6,7 +6,13 @@ from typing import Literal, get_args
 import torch
 import warp as wp
 
-from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
+from nexwarp.kernels.tile_lists import (
+    depth_keys_kernel,
+    list_kernels,
+    list_threads,
+    surfel_ids_kernel,
+    tile_offsets_kernel,
+)
 from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, warp_array, warp_streams
@@ -15,8 +21,6 @@ from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
 
 TILE_SIZE = 16
-# Threads that share their surfels' tile rows on a GPU.
-WARP = 32
 # Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
@@ -128,7 +132,7 @@ def intersect_tiles(
     kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
     arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows)]
-    threads = -(-count // WARP) * WARP if means.is_cuda else count
+    threads = list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
     launch(means, kernels.count, threads, arguments, [array(totals, wp.int64)], even=False)
     _scan(totals)

@@ -39,7 +39,7 @@ def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]
 
 
 def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
-    """Return a rendering at the exposure of the photo that it is compared with; without `plain`, its plain colours not.
+    """Return a rendering at the exposure of the photo that it is compared with; `plain` says whether `out.plain`, too.
 
     Where the photo is saturated, a brighter image counts as equal to it: it has no error and no gradient there.
     Clipped photos of different exposures would otherwise ask for different colours of the same bright surface.
@@ -54,7 +54,7 @@ def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering
 
 
 def exposed(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
-    """Return a rendering times the gains and the falloff of its photo; without `plain`, its plain colours not."""
+    """Return a rendering times the gains and the falloff of its photo; `plain` says whether `out.plain`, too."""
     if target.exposure is None:
         return out
     image, textured = out.image * target.exposure, out.textured * target.exposure

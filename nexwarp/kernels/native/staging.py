@@ -10,22 +10,6 @@ from types import SimpleNamespace
 
 import warp as wp
 
-_POPULATION = """
-#if defined(__CUDA_ARCH__)
-    return __popc(mask);
-#else
-    return mask != 0;
-#endif
-"""
-
-_SLOT = """
-#if defined(__CUDA_ARCH__)
-    return __popc(mask & ((1u << (threadIdx.x & 31)) - 1u));
-#else
-    return 0;
-#endif
-"""
-
 # One function writes and reads, since a shared array belongs to the function that declares it: step 0 writes, step
 # j + 1 reads row j. Rows of neighbouring slots are neighbours, so that writes meet no bank twice.
 _ROW = """
@@ -58,30 +42,6 @@ _NAME = """
     return wp::vec_t<2, int>(i, place);
 #endif
 """
-
-_SYNC = """
-#if defined(__CUDA_ARCH__)
-    __syncwarp();
-#endif
-"""
-
-
-@wp.func_native(_POPULATION)
-def population(mask: wp.int32) -> wp.int32:
-    """Return the number of lanes in a ballot."""
-    ...
-
-
-@wp.func_native(_SLOT)
-def lanes_below(mask: wp.int32) -> wp.int32:
-    """Return the number of lanes in a ballot that are lower than this one."""
-    ...
-
-
-@wp.func_native(_SYNC)
-def sync_warp():
-    """Wait for all lanes of the warp, and make what they have written to shared memory visible to each other."""
-    ...
 
 
 @functools.cache

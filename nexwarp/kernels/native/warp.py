@@ -77,6 +77,28 @@ _OWNER = """
     return owner;
 """
 
+_POPULATION = """
+#if defined(__CUDA_ARCH__)
+    return __popc(mask);
+#else
+    return mask != 0;
+#endif
+"""
+
+_SLOT = """
+#if defined(__CUDA_ARCH__)
+    return __popc(mask & ((1u << (threadIdx.x & 31)) - 1u));
+#else
+    return 0;
+#endif
+"""
+
+_SYNC = """
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+"""
+
 _MAX = """
 #if defined(__CUDA_ARCH__)
     for (int o = 16; o > 0; o >>= 1) x = max(x, __shfl_xor_sync(0xffffffffu, x, o));
@@ -181,6 +203,24 @@ def warp_running_sum(x: wp.int32) -> wp.int32:
 @wp.func_native(_OWNER)
 def owner_lane(start: wp.int32, place: wp.int32) -> wp.int32:
     """Return the highest lane whose `start` is at most `place`, where starts do not decrease and lane 0 has 0."""
+    ...
+
+
+@wp.func_native(_POPULATION)
+def population(mask: wp.int32) -> wp.int32:
+    """Return the number of lanes in a ballot."""
+    ...
+
+
+@wp.func_native(_SLOT)
+def lanes_below(mask: wp.int32) -> wp.int32:
+    """Return the number of lanes in a ballot that are lower than this one."""
+    ...
+
+
+@wp.func_native(_SYNC)
+def sync_warp():
+    """Wait for all lanes of the warp, and make what they have written to shared memory visible to each other."""
     ...
 
 
