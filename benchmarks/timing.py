@@ -23,13 +23,13 @@ MIB = 2**20
 
 @functools.cache
 def git_commit() -> str:
-    """Commit of the working tree, with a + when it was changed; "unknown" without git."""
+    """Commit of the working tree, with a + when it was changed; without git NEXWARP_COMMIT or else "unknown"."""
     try:
         git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10)
         head = git(["git", "rev-parse", "--short", "HEAD"]).stdout.strip()
         changed = git(["git", "status", "--porcelain"]).stdout.strip()
     except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        return os.environ.get("NEXWARP_COMMIT", "unknown")
     return head + ("+" if changed else "")
 
 

@@ -27,7 +27,7 @@ from nexwarp.train import presets
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.parallel import ParallelTrainer, scale_for_batch, view_seed
+from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside, view_seed
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import (
     CPU,
@@ -339,6 +339,19 @@ def test_ranks_that_may_not_join_are_told_once(tiny_folder: Path, tmp_path: Path
 
     wait(start_ranks(2, too_few, tmp_path / "b"))
     assert printed(tmp_path / "b", "out") == ["expected a GPU of its own"] and not run.exists()
+
+
+def test_many_gradients_are_summed_after_the_graph() -> None:
+    """61 numbers a surfel less its error are 60; the grid counts only where hits are textured."""
+    surfels, texture = make_surfels(random_scene(3)), NeuralTexture(levels=2, table_size=2**10, features=4)
+    ours = sum(x.numel() for x in texture.parameters())
+    most = (MOST_CAPTURED_BYTES // 4 - ours) // 60
+    for count, beside in ((most, False), (most + 1, True)):
+        config = Config(max_surfels=count)
+        assert sums_beside("nccl", surfels, texture, config) is beside
+        assert sums_beside("gloo", surfels, texture, config)
+    untextured = Config(max_surfels=most + 1, max_hits=0)
+    assert not sums_beside("nccl", surfels, texture, untextured)
 
 
 def _exit_code(arguments: list[str]) -> int:
