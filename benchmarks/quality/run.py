@@ -102,7 +102,8 @@ def run_job(
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
-        of GPU memory (torch's); `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest
+        of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either;
+        `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest
         of its settings, `removed_last`, the floaters that the last search removed, `train_psnr`, `zoom_psnr` and
         `quarter_psnr`; `together`, the rows and iterations of its shared start, if any; the metrics by view; device,
         date and commit.
@@ -117,9 +118,7 @@ def run_job(
         trained = _train_gsplat(job, row, scene, device)
     else:
         trained = _train_nexwarp(job, row, scene, device, models, start)
-    peak = {}
-    if device.type == "cuda":
-        peak["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
+    peak = _peak("peak_mib", device)
     views = _compare(job, trained.renderings, pictures)
     coded = _compare(job, trained.compact, None)
     return {
@@ -170,6 +169,11 @@ def _compare(
     return views
 
 
+def _peak(name: str, device: torch.device) -> dict[str, int]:
+    """Return the peak of a GPU's memory so far, in MiB, by a name; nothing on a CPU."""
+    return {name: round(torch.cuda.max_memory_allocated() / 2**20)} if device.type == "cuda" else {}
+
+
 def _train_nexwarp(
     job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None, start: SharedStart | None
 ) -> Trained:
@@ -184,8 +188,10 @@ def _train_nexwarp(
     trainer.run(until=trainer.config.iterations - 1)
     count = len(trainer.surfels)
     trainer.run()
+    memory = _peak("steps_mib", device)
     model = trainer.finish()
     seconds = before + time.perf_counter() - begin
+    memory |= _peak("training_mib", device)
 
     def image(camera: Camera) -> torch.Tensor:
         return model.render(camera).image
@@ -204,6 +210,7 @@ def _train_nexwarp(
         "train_psnr": train_psnr(scene, image),
         "zoom_psnr": zoom_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
+        **memory,
         **shared,
     }
     return Trained(
@@ -234,6 +241,7 @@ def _train_gsplat(job: TrainingJob, row: Row, scene: Scene, device: torch.device
     if device.type == "cuda":
         torch.cuda.synchronize()
     seconds = time.perf_counter() - begin
+    memory = _peak("training_mib", device)
 
     def image(camera: Camera) -> torch.Tensor:
         return gaussians.image(camera.to(device))
@@ -245,6 +253,7 @@ def _train_gsplat(job: TrainingJob, row: Row, scene: Scene, device: torch.device
         "seconds": seconds,
         "train_psnr": train_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
+        **memory,
     }
     compact = _renderings(scene, lambda camera: coded.image(camera.to(device)))
     return Trained(_renderings(scene, image), facts, compact, compact_bytes)

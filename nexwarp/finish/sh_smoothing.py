@@ -19,7 +19,7 @@ from nexwarp import ops
 from nexwarp.data import View
 from nexwarp.model.model import Model
 
-SURFELS = 2**15  # number of surfels whose equations are solved at once
+SURFELS = 2**13  # number of surfels whose equations are summed and solved at once: 2 kB each, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # 0 is allowed too; less is lost in the harmonics' rounding
 
