@@ -11,6 +11,7 @@ from nexwarp import ops
 from nexwarp.determinism import deterministic
 from nexwarp.kernels.native.fused_texture import FEATURES, OUTPUTS, logical_feature, logical_output
 from nexwarp.ops import fused_texture
+from nexwarp.ops._interop import graph_is_kept
 from tests.reference import hashgrid, sh
 from tests.tolerances import assert_close
 
@@ -91,14 +92,15 @@ def make_case(
     return Case(fused_texture.Shape(*size), leaves, given[0], given[1], given[2], given[3], clamp)
 
 
-def fused_on_cpu(case: Case) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def fused_on_cpu(case: Case, again: bool = False) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return colours and gradients as the kernels' CPU branch computes them."""
     positions, depths, grid, *weights = (x.detach() for x in case.leaves)
     points = (positions, depths, case.directions, grid.half())
     inputs = fused_texture.Inputs(*points, weights, case.resolutions, case.focal, case.shape)
     colors, kept = fused_texture.forward(inputs, 0.1, case.clamp, True)
-    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True)
-    assert grad_points is not None
+    features = kept.encoded.clone()
+    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True, again)
+    assert grad_points is not None and torch.equal(features, kept.encoded) is again
     return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
 
 
@@ -126,6 +128,35 @@ def test_emulated_kernels_agree_with_the_reference(
     expected = case.reference()
     references = torch.autograd.grad(expected, case.leaves, case.signal)
     assert_agree(*fused_on_cpu(case), expected, list(references))
+
+
+def test_gradients_may_overwrite_the_features() -> None:
+    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
+    for name, one, other in zip(NAMES, fused_on_cpu(case)[1], fused_on_cpu(case, again=True)[1], strict=True):
+        assert torch.equal(one, other), name
+
+
+def test_a_backward_pass_knows_whether_it_may_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kept graphs give the same gradients twice, as their features stay; torch without the question keeps them."""
+    told: list[bool] = []
+
+    class Ask(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: torch.autograd.function.FunctionCtx, x: torch.Tensor) -> torch.Tensor:
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx: torch.autograd.function.FunctionCtx, grad: torch.Tensor) -> torch.Tensor:
+            told.append(graph_is_kept())
+            return grad
+
+    x = torch.ones(1, requires_grad=True)
+    y = Ask.apply(x).sum()
+    for keep in (True, False):
+        y.backward(retain_graph=keep)
+    monkeypatch.delattr(torch._C._autograd, "_get_current_graph_task_keep_graph", raising=False)
+    Ask.apply(x).sum().backward()
+    assert told == [True, False, True] or (torch.__version__ < "2.5" and told == [True] * 3)
 
 
 def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,6 +201,10 @@ def test_fused_and_layered_agree(
     assert len(counted) == 1
     with torch.no_grad():
         assert torch.equal(case.texture(half=True, fused=True), colors)
+    colors = case.texture(half=True, fused=True)
+    for keep in (True, False):
+        again = torch.autograd.grad(colors, case.leaves, case.signal, retain_graph=keep)
+        assert_agree(colors, list(again), exact, references)
 
 
 @pytest.mark.cuda

@@ -3,7 +3,7 @@
 A warp takes the 16 points of a unit, see `fused_texture`; two neighbouring lanes share a point, one takes the four
 corners of its cell at the lower x, the other those at the upper x. The two rows of a table that differ in x alone
 mostly lie in one line of 128 bytes, which a load or an atomic then visits once. Read: gradients of the features
-(L, places) as `fused_texture` orders them, F halves each. Written:
+(units, L, 16, F) as `fused_texture` writes them. Written:
 
     grad_table     (L, T, F) added to, by atomics on CUDA; a CPU launches the whole range in one thread
     grad_points    (n) gradients of position and depth, 0 for points of depth 0
@@ -86,7 +86,7 @@ _PROGRAM = """
         wp::float32* sums = const_cast<wp::float32*>(opaque(grad_table.data + first_row * F));
         const float per_scale = focal_length * reciprocal(scale);
         const unsigned* incoming = reinterpret_cast<const unsigned*>(grad_encoded.data)
-            + ((size_t)level * places + (size_t)unit * 16) * (F / 2);
+            + (size_t)unit * 256 + level * 16 * (F / 2);
         int cell[3][LANES], held[LANES], whole[LANES], wide[LANES];
         unsigned slot[4][LANES];
         wp::float32 v[4 * F][LANES];
@@ -266,7 +266,6 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
         focal: Reals,
         mask: wp.uint32,
         grad_encoded: Halves,
-        places: wp.int32,
         unscale: Reals,
         width: wp.int32,
         height: wp.int32,
@@ -290,7 +289,6 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
         focal: Reals,
         mask: wp.uint32,
         grad_encoded: Halves,
-        places: wp.int32,
         unscale: Reals,
         width: wp.int32,
         height: wp.int32,
@@ -311,7 +309,6 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
             focal,
             mask,
             grad_encoded,
-            places,
             unscale,
             width,
             height,

@@ -2,8 +2,7 @@
 
 For L * F = 32 features of F = 2 or 4, two hidden layers of 64, and half-precision tables, matrices and activations,
 summed in float32. A warp takes 16 neighbouring pixels, a tile, and one hit of each at a time: 16 points are the rows
-of every product. Tiles are 8 x 2 pixels of an image, or 16 x 1 where the height is 1. `unit` = tile * K + hit, and the
-place of a point in what the kernels hand to each other is unit * 16 + row.
+of every product. Tiles are 8 x 2 pixels of an image, or 16 x 1 where the height is 1. `unit` = tile * K + hit.
 
 Columns of the first matrix are permuted so that a lane looks up whole levels of its two points and finds its features
 in its own fragments; rows of the last one, so that a lane has all channels of the SH coefficients q, q + 4, q + 8, ...
@@ -11,9 +10,10 @@ of its two points. `logical_feature` and `logical_output` name what stands where
 last matrix.
 
     fused_forward    writes colours and, for the backward pass, the features as fragments (64 bytes a point)
-    fused_backward   repeats the hidden layers from the features. Written: gradients of the features (L, places, F),
-                     and of the matrices, in permuted order, a slot for each block. Four warps of a block share the
-                     sums of matrix gradients: each holds a fourth of them and reads all four's activations
+    fused_backward   repeats the hidden layers from the features. Written: gradients of the features (units, L, 16, F),
+                     which may overwrite the features, and of the matrices, in permuted order, a slot for each block.
+                     Four warps of a block share the sums of matrix gradients: each holds a fourth of them and reads
+                     all four's activations
     fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is one unit, two threads a
                      point. On a CPU atomics are none: one thread launches it whole
 """

@@ -35,6 +35,12 @@ def real_of(tensor: torch.Tensor) -> type:
     return REALS[tensor.dtype]
 
 
+def graph_is_kept() -> bool:
+    """Whether the running backward pass keeps its graph, and so may be repeated; True where torch does not tell."""
+    ask = getattr(torch._C._autograd, "_get_current_graph_task_keep_graph", None)  # not in torch 2.4
+    return ask is None or bool(ask())
+
+
 # Descriptors by layout: copying one costs a quarter of making it anew, and a step makes hundreds.
 _layouts: dict[tuple[object, ...], Any] = {}
 _MOST_LAYOUTS = 4096

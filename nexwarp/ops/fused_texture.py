@@ -31,7 +31,7 @@ from nexwarp.kernels.native.fused_texture import (
     logical_output,
 )
 from nexwarp.kernels.tiles import LARGEST_INT
-from nexwarp.ops._interop import Context, array, device_of, launch
+from nexwarp.ops._interop import Context, array, device_of, graph_is_kept, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
@@ -182,7 +182,8 @@ class _Colors(torch.autograd.Function):
         need_positions, need_depths, need_grid, *_ = ctx.needs_input_grad
         inputs = Inputs(positions, depths, directions, table, weights, resolutions, focal, ctx.shape)
         kept, need_points = Kept(encoded, packed, result), need_positions or need_depths
-        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), inputs, kept, need_points)
+        again = graph_is_kept()
+        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), inputs, kept, need_points, again)
         return (
             grad_points[:, :3] if need_positions and grad_points is not None else None,
             grad_points[:, 3] if need_depths and grad_points is not None else None,
@@ -231,7 +232,7 @@ def forward(inputs: Inputs, offset: float, clamp: bool, keep: bool) -> tuple[tor
 
 
 def backward(
-    grad_colors: torch.Tensor, inputs: Inputs, kept: Kept, need_points: bool
+    grad_colors: torch.Tensor, inputs: Inputs, kept: Kept, need_points: bool, again: bool
 ) -> tuple[torch.Tensor, torch.Tensor | None, list[torch.Tensor]]:
     """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices.
 
@@ -240,9 +241,11 @@ def backward(
         inputs: of `forward`.
         kept: of `forward`.
         need_points: whether positions or depths need a gradient.
+        again: whether `kept` will be needed again; otherwise the features are overwritten by their gradients.
     """
     scale, unscale = _scales(grad_colors)
-    grad_encoded, sums = _mlp_backward(grad_colors, scale, inputs, kept)
+    grad_encoded = torch.empty_like(kept.encoded) if again else kept.encoded
+    sums = _mlp_backward(grad_colors, scale, inputs, kept, grad_encoded)
     order = _order(inputs.table.shape[2], len(inputs.weights[-1]), grad_colors.device)
     flat = grad_colors.new_empty(len(order))
     given = [array(sums, wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
@@ -253,11 +256,10 @@ def backward(
 
 
 def _mlp_backward(
-    grad_colors: torch.Tensor, scale: torch.Tensor, inputs: Inputs, kept: Kept
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the gradients of the features (L, places, F), and those of the matrices in permuted order, both scaled."""
-    shape, (levels, _, features) = inputs.shape, inputs.table.shape
-    grad_encoded = torch.empty(levels, shape.units * 16, features, dtype=torch.float16, device=scale.device)
+    grad_colors: torch.Tensor, scale: torch.Tensor, inputs: Inputs, kept: Kept, grad_encoded: torch.Tensor
+) -> torch.Tensor:
+    """Write the gradients of the features, and return those of the matrices in permuted order, both scaled."""
+    shape, features = inputs.shape, inputs.table.shape[2]
     warps = _warps(grad_colors, shape.units, BACKWARD_BLOCKS * WARPS)
     sums = grad_colors.new_empty(warps // (WARPS if grad_colors.is_cuda else 1), sum(GRADIENTS))
     _launch(
@@ -274,10 +276,10 @@ def _mlp_backward(
             array(kept.colors, wp.vec3),
             array(grad_colors, wp.vec3),
         ],
-        [array(grad_encoded.view(torch.int32).view(-1), wp.int32), array(sums.view(-1), wp.float32)],
+        [array(grad_encoded, wp.int32), array(sums.view(-1), wp.float32)],
         BACKWARD_THREADS,
     )
-    return grad_encoded, sums.sum(0)
+    return sums.sum(0)
 
 
 def _scatter(
@@ -297,8 +299,7 @@ def _scatter(
         array(inputs.resolutions, wp.float32),
         array(inputs.focal, wp.float32),
         wp.uint32(size - 1),
-        array(grad_encoded.view(-1), wp.float16),
-        shape.units * 16,
+        array(grad_encoded.view(torch.float16), wp.float16),
         array(unscale, wp.float32),
         *shape,
         shape.shift,

@@ -219,15 +219,15 @@ class Trainer:
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             target = refined(target, self.poses)
-            plain, blur = bool(self.own_losses), self.config.blur_poses
-            out, taken = render_target(self.model(), target, self.poses, blur, plain=plain)
+            own, poses, blur, grid = self.own_losses, self.poses, self.config.blur_poses, fused is None
+            out, taken = render_target(self.model(), target, poses, blur, plain=bool(own))
             given = (taken, target, self.surfels, self.texture, self.config)
-            own, poses, grid = self.own_losses, self.poses, fused is None
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
-            request = None
+            image, room, request = taken.image.detach(), out.intermediates.tiles.room, None
             if self.densifier.active(self.iteration):
-                errors = (taken.image.detach() - target.photo).abs().mean(dim=-1)
+                errors = (image - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
+            del out, taken, given  # so that what the backward pass does not need is freed
             self._weighted(reduce(torch.add, losses.values())).backward()
             kept = self._update(None if request is None else request.sums_after_backward)
         finally:
@@ -236,7 +236,7 @@ class Trainer:
         losses = {name: value.detach() for name, value in losses.items()}
         if kept is None and fused is not None and fused.grid_loss is not None:
             losses["grid"], fused.grid_loss = fused.grid_loss, None
-        return StepResult(losses, taken.image.detach(), out.intermediates.tiles.room, kept)
+        return StepResult(losses, image, room, kept)
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss

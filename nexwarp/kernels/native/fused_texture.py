@@ -240,12 +240,12 @@ EACH_LANE {
     UNROLL
     for (int i = 0; i < 2; ++i) {
         const unsigned word = halves(d[2 * i][l], d[2 * i + 1][l]);
-        const int place = unit * 16 + (lane >> 2) + 8 * i;
-        unsigned* to = reinterpret_cast<unsigned*>(grad_encoded.data);
+        const int row = (lane >> 2) + 8 * i;
+        unsigned* to = reinterpret_cast<unsigned*>(grad_encoded.data) + (size_t)unit * 256;
         if (F == 2) {
-            if (here) to[(size_t)(4 * n + (lane & 3)) * places + place] = word;
+            if (here) to[(4 * n + (lane & 3)) * 16 + row] = word;
         } else if (n & 1) {
-            to += 2 * ((size_t)(2 * (n - 1) + (lane & 3)) * places + place);
+            to += 2 * ((2 * (n - 1) + (lane & 3)) * 16 + row);
 #if defined(__CUDA_ARCH__)
             if (here) *reinterpret_cast<uint2*>(to) = make_uint2(even[i][l], word);
 #else
@@ -348,7 +348,6 @@ _BACKWARD = """
     const float scaled = scale.data[0];
     const int across = (width + (1 << shift) - 1) >> shift;
     const int units = across * ((height + (16 >> shift) - 1) >> (4 - shift)) * hits;
-    const size_t places = (size_t)units * 16;
     // Two pairs of stages take turns, so that one barrier a layer suffices.
     unsigned (*stage)[WARPS * 16 * ROW] = stages;
     #pragma unroll 1
