@@ -64,7 +64,8 @@ def wanted_jobs() -> list[TrainingJob]:
     pairs += [(scene, EVEN, 10_000) for scene in SECONDS]
     pairs += [(scene, row.name, size) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN]
     jobs = [TrainingJob(scene, "", row, size, 0, 30_000) for scene, row, size in dict.fromkeys(pairs)]
-    return jobs[: len(SECONDS)] + seeds + jobs[len(SECONDS) :]
+    first = len(sizes) * len(SECONDS)
+    return jobs[:first] + seeds + jobs[first:]
 
 
 def kind_of(job: TrainingJob) -> str:
