@@ -302,7 +302,7 @@ def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -
     if limits is None or not len(surfels):
         return shape
     row = camera.viewmat[2].to(shape.means)
-    depths = torch.addmv(row[3], shape.means, row[:3])
+    depths = (shape.means * row[:3]).sum(-1) + row[3]
     blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, camera.pixel_focal)
     return Activated(shape.means, shape.quats, *blurred)
 

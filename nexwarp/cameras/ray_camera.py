@@ -74,7 +74,7 @@ class RayCamera:
     @property
     def position(self) -> torch.Tensor:
         """(3,) centre of the camera in the world frame; for parallel rays, the middle of the plane where they start."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return -(self.viewmat[:3, :3] * self.viewmat[:3, 3:]).sum(0)  # not a product: see `Camera.position`
 
     def to(self, *args: Any, **kwargs: Any) -> "RayCamera":
         """Return a copy with `viewmat` and `rays` moved or converted; arguments as of `torch.Tensor.to`."""

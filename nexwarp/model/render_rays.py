@@ -137,7 +137,7 @@ def _distances(means: torch.Tensor, camera: RayCamera) -> torch.Tensor:
     if camera.parallel:
         return torch.ones_like(means[:, 0])
     row = camera.viewmat[2]
-    return torch.addmv(row[3], means, row[:3])
+    return (means * row[:3]).sum(-1) + row[3]
 
 
 def _eye(means: torch.Tensor, camera: RayCamera) -> torch.Tensor:

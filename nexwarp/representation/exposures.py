@@ -143,7 +143,7 @@ class Exposures(nn.Module):
         position, direction = poses_of(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)
         squares = (self.positions - position).square().sum(1) + turned.square().sum(1)
-        log_gains = self.mean + matern_kernel(squares, self.lengths[1]) @ self.coefficients
+        log_gains = self.mean + (matern_kernel(squares, self.lengths[1])[..., None] * self.coefficients).sum(-2)
         return log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
 
     @torch.no_grad()
@@ -210,4 +210,4 @@ def fit_process(
 def poses_of(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return positions and viewing directions (..., 3) of world-to-camera matrices (..., 4, 4)."""
     rotation, shift = viewmats[..., :3, :3], viewmats[..., :3, 3:]
-    return -(rotation.mT @ shift)[..., 0], rotation[..., 2, :]
+    return -(rotation * shift).sum(-2), rotation[..., 2, :]
