@@ -14,7 +14,7 @@ import torch
 
 import nexwarp as nw
 from benchmarks import __main__ as command
-from benchmarks import bench_cpu, bench_frame, bench_peers, bench_sizes
+from benchmarks import bench_cpu, bench_frame, bench_kernels, bench_peers, bench_sizes
 from benchmarks.gpu_time import busy
 from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
 from benchmarks.suite import Options, table
@@ -356,3 +356,17 @@ def away(camera: Camera) -> Camera:
     viewmat = camera.viewmat.clone()
     viewmat[2, 3] = -1000.0
     return Camera(viewmat, camera.K, camera.width, camera.height)
+
+
+def test_kernels_of_a_call_are_summed_by_short_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed = ("collect_kernel__locals__collect_0a1b2c3d_cuda_kernel_forward", "collect_kernel__locals__collect")
+    sums = "void at::native::reduce_kernel<512, 1, at::native::ReduceOp<float> >(at::native::ReduceOp<float>)"
+    found = {hashed[0]: 2.0, sums: 1.0, sums.replace("<512", "<256"): 0.5, "rare_kernel(int)": 0.001}
+    monkeypatch.setattr(bench_kernels, "gpu_time", lambda call, repeats: (3.501, found))
+    scene = cloud(10, 8, 8)
+    rows = [*bench_kernels.kernels("frame", lambda: None, scene, Options(CPU))]
+    told = {row.name: (row.median, row.note) for row in rows[1:]}
+    assert rows[0].median == 3.501 and told == {
+        f"frame: {hashed[1]}": (2.0, "57.1 % of the call"),
+        "frame: reduce_kernel<ReduceOp": (1.5, "42.8 % of the call"),
+    }

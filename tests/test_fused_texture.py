@@ -137,7 +137,7 @@ def test_gradients_may_overwrite_the_features() -> None:
 
 
 def test_a_backward_pass_knows_whether_it_may_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kept graphs give the same gradients twice, as their features stay; torch without the question keeps them."""
+    """Torch tells whether the graph is kept; a torch that cannot tell counts as keeping it."""
     told: list[bool] = []
 
     class Ask(torch.autograd.Function):
