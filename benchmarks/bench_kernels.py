@@ -70,7 +70,7 @@ def kernels(name: str, call: Callable[[], Any], scene: SurfelScene, options: Opt
 
 
 def short(kernel: str) -> str:
-    """Return a kernel's name without hash, namespaces and arguments; of a template, its name and that of the next one."""
+    """Return a kernel's name without hash, namespaces and arguments; of a template, its name and the next one's."""
     if found := re.match(r"(\w+?)_[0-9a-f]{8}_cuda_kernel_(forward|backward)", kernel):
         return f"{found[1]} ({found[2]})" if found[2] == "backward" else found[1]
     plain = re.sub(r"^void ", "", kernel.replace("(anonymous namespace)::", "")).split("(")[0]
