@@ -33,7 +33,7 @@ class LossWeights:
     """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
     empty: float = 0.1
     """Factor of the opacity in pixels that a mask declares as background."""
-    depth: float = 0.1
+    depth: float = 0.3
     """Factor of the relative depth error at the points that were triangulated from the photo."""
     normals: float = 0.0
     """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
