@@ -40,6 +40,8 @@ TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 ITERATIONS = (10_001, 10_100)
 SURFELS = 200
 PACKAGED = ("nvidia/cu13/compute-sanitizer", "nvidia/cuda_sanitizer_api/bin")  # nvidia-cuda-sanitizer-api, by version
+VERSION = re.compile(r"^Version (\d+(?:\.\d+)+)", re.M)
+BROKEN_RACECHECK = "2025."  # CUDA 13.0's ends with an internal error, whichever kernels it checks
 PLACES = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
 # Racecheck checks shared memory; restricted to our kernels, since others are slow to check and give false reports.
 OURS = ("--kernel-name", "kernel_substring=_cuda_kernel_")
@@ -93,6 +95,13 @@ def find_tool() -> str | None:
     packages = [str(Path(folder) / place) for folder in sys.path for place in PACKAGED]
     places = [os.environ.get("PATH", ""), *([f"{home}/bin", f"{home}/compute-sanitizer"] if home else [])]
     return shutil.which("compute-sanitizer", path=os.pathsep.join([*packages, *places, *PLACES]))
+
+
+def version_of(sanitizer: str) -> str:
+    """Return the version that a compute-sanitizer tells, such as "2026.4.0"."""
+    told = subprocess.run([sanitizer, "--version"], capture_output=True, text=True, errors="replace").stdout
+    found = VERSION.search(told)
+    return found[1] if found else "of an unknown version"
 
 
 def work(device: torch.device) -> dict[str, int]:
@@ -251,6 +260,12 @@ class Sanitize:
         sanitizer = find_tool()
         if sanitizer is None:
             print("compute-sanitizer: expected on the PATH or in a CUDA toolkit, found none", file=sys.stderr)
+            return 2
+        version = version_of(sanitizer)
+        print(f"compute-sanitizer {version}: {sanitizer}", flush=True)
+        if "racecheck" in tools and version.startswith(BROKEN_RACECHECK):
+            told = "pip install nvidia-cuda-sanitizer-api==13.5.25, and see that its program may be executed"
+            print(f"--tool racecheck: expected version 2026 or newer, got {version}: {told}", file=sys.stderr)
             return 2
         command = [sys.executable, "-m", "benchmarks.sanitize", "--device", self.device]
         command += ["--sweep"] * self.sweep

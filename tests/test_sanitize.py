@@ -48,10 +48,11 @@ def test_what_stands_in_place_of_a_summary_is_told():
     assert parse("").told == "no output of compute-sanitizer"
 
 
-def stub(folder: Path, body: str) -> str:
-    """A compute-sanitizer that notes its arguments, then does as `body` says."""
+def stub(folder: Path, body: str, version: str = "2026.4.0.0") -> str:
+    """A compute-sanitizer that tells its version, or notes its arguments and then does as `body` says."""
     file = folder / "compute-sanitizer"
-    file.write_text(f'#!/bin/sh\necho "$@ $PYTORCH_NO_CUDA_MEMORY_CACHING" >> {folder}/asked\n{body}\n')
+    told = f'if [ "$1" = --version ]; then echo "Version {version} (build 1)"; exit; fi'
+    file.write_text(f'#!/bin/sh\n{told}\necho "$@ $PYTORCH_NO_CUDA_MEMORY_CACHING" >> {folder}/asked\n{body}\n')
     file.chmod(file.stat().st_mode | stat.S_IXUSR)
     return str(file)
 
@@ -128,6 +129,19 @@ def test_all_tools_run_whatever_the_first_one_found(tmp_path, monkeypatch, capsy
     assert "memcheck: ERROR SUMMARY: 1 error: NOT CLEAN" in out and "(0 errors, 0 warnings): clean" in out
     assert out.splitlines()[-1] == "1 errors found in 2 runs"
     assert Sanitize(tool="racecheck")() == 0
+
+
+@pytest.mark.parametrize(("tool", "version", "code"), [("racecheck", "2025.3.1.0", 2), ("memcheck", "2025.3.1.0", 0)])
+def test_racecheck_of_a_version_that_fails_is_refused(tmp_path, monkeypatch, capsys, tool, version, code):
+    path = stub(tmp_path, 'echo "========= ERROR SUMMARY: 0 errors"', version)
+    monkeypatch.setattr(sanitize, "find_tool", lambda: path)
+    monkeypatch.setattr(sys, "executable", "true")
+    assert Sanitize(tool=tool)() == code
+    out, err = capsys.readouterr()
+    assert out.startswith(f"compute-sanitizer {version}: {path}\n")
+    assert bool(err) == bool(code)
+    if code:
+        assert err.startswith("--tool racecheck: expected version 2026 or newer, got 2025.3.1.0: pip install")
 
 
 def test_a_tool_that_is_missing_or_unknown_is_one_line(monkeypatch, capsys):
