@@ -34,10 +34,13 @@ def blocks(results: Results) -> dict[str, str]:
 
 
 def figures(found: Cell) -> str:
-    """Return PSNR of each seed, mean SSIM and mean FLIP."""
+    """Return PSNR of each seed, or mean and range of more than two; mean SSIM and mean FLIP."""
     if not found:
         return MISSING
     each = " and ".join(f"{x['psnr']:.2f}" for x in found)
+    if len(found) > 2:
+        least, most = (of(x["psnr"] for x in found) for of in (min, max))
+        each = f"{mean(found, 'psnr'):.2f} ({least:.2f} to {most:.2f}, {len(found)} seeds)"
     return f"{each}, {mean(found, 'ssim'):.4f}, {mean(found, 'flip'):.4f}"
 
 
@@ -50,8 +53,8 @@ def difference(one: Cell, other: Cell) -> str:
 
 
 def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    rows = [header, ["---"] * len(header), *lines]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+    head, *rest = (f"| {' | '.join(cells)} |" for cells in (header, *lines))
+    return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
 def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterable[str]) -> str:
@@ -177,16 +180,17 @@ def _short(results: Results) -> str:
 
 
 def _readme(results: Results) -> str:
-    """Return the table of README.md: 40,000 primitives, beside the best gsplat row of each scene."""
+    """Return the table of README.md: means, 40,000 primitives, beside the best gsplat row of each scene."""
     columns = ["PSNR [dB]", "SSIM", "FLIP", "MB"]
-    lines = []
+    lines, named = [], {DEFAULT.name}
     for scene in SCENES:
         own = seeds_of(results, scene, DEFAULT.name, SIZES[0])
         best = best_peer(results, scene, SIZES[0])
+        named |= set() if best is None else {best[0]}
         cells = [scene]
         for found in (own, [] if best is None else best[1]):
-            size = f"{mean(found, 'megabytes'):.1f}" if found else ""
-            cells += [*figures(found).split(", "), size] if found else [MISSING, "", "", ""]
+            metrics = (("psnr", 2), ("ssim", 4), ("flip", 4), ("megabytes", 1))
+            cells += [f"{mean(found, m):.{n}f}" for m, n in metrics] if found else [MISSING, "", "", ""]
         lines.append(cells)
     header = ["scene", f"nexwarp: {columns[0]}", *columns[1:], f"gsplat: {columns[0]}", *columns[1:]]
-    return f"{_table(header, lines)}\n\n{_measured(results, 'peers', SIZES[:1], (DEFAULT.name, *PEER_NAMES))}"
+    return f"{_table(header, lines)}\n\n{_measured(results, 'peers', SIZES[:1], named)}"
