@@ -22,7 +22,7 @@ HEADINGS = {
     "gsplat default": "gsplat default, background",
     "gsplat 2DGS": "gsplat 2DGS, background",
 }
-Cell = list[Mapping[str, float]]
+Cell = Sequence[Mapping[str, float]]
 
 
 def blocks(results: Results) -> dict[str, str]:
