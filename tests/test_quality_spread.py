@@ -33,6 +33,11 @@ def test_the_tables_trainings_come_by_value() -> None:
     jobs = wanted_jobs()
     assert len(jobs) == len(set(jobs)) and all(job.row in ROWS and expected_seconds(job) > 0 for job in jobs)
     assert [(job.row, job.size) for job in jobs[:8]] == [("default", 40_000)] * 4 + [("default", 10_000)] * 4
+    seeds = {(job.scene, job.row) for job in jobs if job.seed == 1}
+    assert seeds == {
+        ("fox", "default"),
+        *((s, r) for s in ("kitchen25", "saharov") for r in ("default", module.EXPOSED)),
+    }
     even = {"ours": 1.0, "gsplat": 1.0}
     assert next_job(jobs, "ours", even, 1e9) == jobs[0]
     first = next_job(jobs, "gsplat", even, 1e9)
