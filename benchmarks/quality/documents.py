@@ -182,14 +182,15 @@ def _short(results: Results) -> str:
 def _readme(results: Results) -> str:
     """Return the table of README.md: means, 40,000 primitives, beside the best gsplat row of each scene."""
     columns = ["PSNR [dB]", "SSIM", "FLIP", "MB"]
+    metrics = (("psnr", 2), ("ssim", 4), ("flip", 4), ("megabytes", 1))
     lines, named = [], {DEFAULT.name}
     for scene in SCENES:
         own = seeds_of(results, scene, DEFAULT.name, SIZES[0])
         best = best_peer(results, scene, SIZES[0])
-        named |= set() if best is None else {best[0]}
+        if best is not None:
+            named.add(best[0])
         cells = [scene]
         for found in (own, [] if best is None else best[1]):
-            metrics = (("psnr", 2), ("ssim", 4), ("flip", 4), ("megabytes", 1))
             cells += [f"{mean(found, m):.{n}f}" for m, n in metrics] if found else [MISSING, "", "", ""]
         lines.append(cells)
     header = ["scene", f"nexwarp: {columns[0]}", *columns[1:], f"gsplat: {columns[0]}", *columns[1:]]
