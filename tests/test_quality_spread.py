@@ -32,7 +32,8 @@ open(out, "w").write(json.dumps(line) + "\\n")
 def test_the_tables_trainings_come_by_value() -> None:
     jobs = wanted_jobs()
     assert len(jobs) == len(set(jobs)) and all(job.row in ROWS and expected_seconds(job) > 0 for job in jobs)
-    assert [(job.row, job.size) for job in jobs[:8]] == [("default", 40_000)] * 4 + [("default", 10_000)] * 4
+    sizes = [400_000] + [40_000] * 4 + [10_000] * 4
+    assert [(job.row, job.size) for job in jobs[:9]] == [("default", size) for size in sizes]
     seeds = {(job.scene, job.row) for job in jobs if job.seed == 1}
     assert seeds == {
         ("fox", "default"),

@@ -54,7 +54,7 @@ class Running:
 
 
 def wanted_jobs() -> list[TrainingJob]:
-    """Return all trainings, those of the most value first."""
+    """Return all trainings: the longest first, lest it end last; then those of the most value."""
     default, sizes = DEFAULT.name, (40_000, 10_000)
     pairs = [(scene, default, size) for size in sizes for scene in SECONDS]
     seeds = [TrainingJob("fox", "", default, 40_000, seed, 30_000) for seed in (1, 2, 3)]
@@ -62,13 +62,14 @@ def wanted_jobs() -> list[TrainingJob]:
     few = [(scene, row) for scene in ("kitchen25", "saharov") for row in (default, EXPOSED)]
     seeds += [TrainingJob(scene, "", row, 40_000, 1, 30_000) for scene, row in few]
     pairs += [(scene, EXPOSED, 10_000) for scene in SECONDS]
-    pairs += [("train", default, 400_000), ("train", EXPOSED, 400_000)]
+    pairs += [("train", EXPOSED, 400_000)]
     pairs += [(scene, default, size) for size in (100_000, 20_000, 5_000) for scene in SECONDS]
     pairs += [(scene, EVEN, 10_000) for scene in SECONDS]
     pairs += [(scene, row.name, size) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN]
     jobs = [TrainingJob(scene, "", row, size, 0, 30_000) for scene, row, size in dict.fromkeys(pairs)]
     first = len(sizes) * len(SECONDS)
-    return jobs[:first] + seeds + jobs[first:]
+    largest = TrainingJob("train", "", default, 400_000, 0, 30_000)
+    return [largest, *jobs[:first], *seeds, *jobs[first:]]
 
 
 def kind_of(job: TrainingJob) -> str:
