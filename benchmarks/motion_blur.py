@@ -85,7 +85,6 @@ def main(argv: list[str] | None = None) -> int:
     """Print PSNR, SSIM and the errors of the motions of each training."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, nargs="+", default=[1, 3, 5])
-    parser.add_argument("--rates", type=float, nargs="+", default=[0.5], help="first rates of the motions, pixels")
     parser.add_argument("--refine-poses", action="store_true")
     parser.add_argument("--turn", type=float, default=5.0, help="pixels")
     parser.add_argument("--shift", type=float, default=1.0, help="pixels")
@@ -94,17 +93,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args(argv)
     scene, true = blurred_demo(options.turn, options.shift, downscale=options.downscale)
-    trials = [(count, rate) for count in options.poses for rate in (options.rates if count > 1 else options.rates[:1])]
-    for count, rate in trials:
-        settings = {"iterations": options.iterations, "refine_poses": options.refine_poses}
-        settings |= {"blur_poses": count, "rates.motions": [rate, rate / 25]}
+    for count in options.poses:
+        settings = {"iterations": options.iterations, "refine_poses": options.refine_poses, "blur_poses": count}
         config = with_settings(preset("default"), DEMO_SETTINGS | settings)
         start = time.perf_counter()
         trainer = nw.Trainer(scene, config, options.device)
         trainer.run()
         seconds = time.perf_counter() - start
         scores = evaluate(trainer.finish(), scene.test)
-        line = f"blur_poses={count}, rate {rate:g}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {seconds:.0f} s"
+        line = f"blur_poses={count}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {seconds:.0f} s"
         if trainer.poses is not None and trainer.poses.motions is not None:
             found = trainer.poses.motions.detach().cpu()
             line += f", motions off by {motion_errors(found, true).median():.2f} (median)"

@@ -86,7 +86,6 @@ def test_rates_are_those_of_the_settings(trainer, scene, tmp_path):
         expected = {
             name: value[end] if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(CONFIG.rates).items()
-            if name not in ("poses", "motions")  # which are not learned
         }
         expected["means"] *= scene.scale
         assert rates == pytest.approx(expected)

@@ -31,7 +31,7 @@ from tests import scenes
 from tests.cli.support import FLAGS, SMALL
 from tests.narrowing import present
 from tests.ranks_support import CPU, digest, run_ranks
-from tests.test_poses import RATES, model, shown  # noqa: F401  # fixtures
+from tests.test_poses import STILL, model, shown  # noqa: F401  # fixtures
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
@@ -149,7 +149,7 @@ def test_without_motion_it_is_the_sharp_training(tiny_scene: Scene):
 
 @pytest.mark.parametrize("refine", [False, True])
 def test_resuming_a_blurred_training_changes_nothing(tiny_scene: Scene, tmp_path: Path, refine: bool):
-    config = small(refine_poses=refine, blur_poses=3, rates=RATES)
+    config = small(refine_poses=refine, blur_poses=3)
     straight = trained(tiny_scene, config)
     start = motions_of(Trainer(tiny_scene, config, "cpu"))
     assert (motions_of(straight) - start).abs().amin(1).max() > 1e-4
@@ -166,7 +166,7 @@ def test_resuming_a_blurred_training_changes_nothing(tiny_scene: Scene, tmp_path
 
 
 def test_ranks_learn_the_same_motions(tiny_scene: Scene, tmp_path: Path):
-    config = small(iterations=8, refine_poses=True, blur_poses=3, rates=RATES)
+    config = small(iterations=8, refine_poses=True, blur_poses=3)
 
     def work(ranks: Any) -> object:
         trainer = ParallelTrainer(tiny_scene, config, CPU, ranks)
@@ -182,10 +182,8 @@ def test_ranks_learn_the_same_motions(tiny_scene: Scene, tmp_path: Path):
 
 def test_motions_come_back_in_training(shown: Scene, model: nw.Model):  # noqa: F811
     """With surfels that are right, motions of about 5 pixels are found but for their direction in time."""
-    still: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(RATES)}
-    still |= dict.fromkeys(("means", "grid", "mlp", "poses"), (0.0, 0.0))
     config = small(iterations=320, max_hits=0, blur_poses=5, exposures=False, sh_every=1, background=(0.0, 0.0, 0.0))
-    config = dataclasses.replace(config, rates=LearningRates(**still | {"motions": (0.2, 0.01)}))
+    config = dataclasses.replace(config, rates=LearningRates(**STILL))
     config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False))
     cameras = [view.camera for view in shown.train]
     ways = torch.nn.functional.normalize(

@@ -29,6 +29,8 @@ from nexwarp.model.model_file import load
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
+from nexwarp.train.schedules import MOTION_RATES, POSE_RATES
+from nexwarp.train.step_losses import POSE_PRIOR
 from nexwarp.train.trainer import Trainer
 
 
@@ -143,8 +145,10 @@ def file_name(job: TrainingJob) -> str:
 
 
 def config_name(config: Config) -> str:
-    """Return a digest of settings, whatever the seed."""
+    """Return a digest of settings, whatever the seed; constants that once were settings count, as in older results."""
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"}
+    settings["losses"] |= {"poses": POSE_PRIOR}
+    settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -43,10 +43,6 @@ class LearningRates:
     """First and last learning rate of the hash grid."""
     mlp: tuple[float, float] = (1e-3, 1e-4)
     """First and last learning rate of the MLP."""
-    poses: tuple[float, float] = (2e-4, 2e-6)
-    """With `refine_poses`: first and last learning rate of the pose corrections, radians and scene scales."""
-    motions: tuple[float, float] = (0.5, 0.02)
-    """With `blur_poses`: first and last learning rate of the motions during exposures, pixels."""
 
     def __post_init__(self) -> None:
         for rate in dataclasses.fields(self):

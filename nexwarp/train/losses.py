@@ -41,13 +41,10 @@ class LossWeights:
     distortion: float = 0.0
     """Factor of the depth distortion of 2DGS, relative to the depth: how far apart the hits of a pixel are. Counts from
     a tenth of the run on."""
-    poses: float = 0.1
-    """With `refine_poses` or `blur_poses`: factor of the squared pose correction, which keeps poses near the given
-    ones, and of the squared motion during the exposure."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals", "distortion"):
             check_range(name, getattr(self, name), 0.0)
 
 

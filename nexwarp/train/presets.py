@@ -27,7 +27,6 @@ DEMO_SETTINGS: dict[str, object] = {
     "rates.shN": 6e-4,
     "rates.grid": (2e-2, 2e-4),
     "rates.mlp": (3e-3, 3e-4),
-    "rates.poses": (1e-3, 5e-5),
 }
 
 PARTS = ("losses", "rates", "texture", "densify")

@@ -14,7 +14,7 @@ from nexwarp.representation.poses import PoseCorrections
 from nexwarp.representation.surfels import PARAMETERS, Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam, grid_factors
-from nexwarp.train.config import Config
+from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
@@ -22,6 +22,9 @@ from nexwarp.train.densify import DensifyConfig
 # learned, "poses" and "motions"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
+# First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps, and of motions
+# during exposures, pixels.
+POSE_RATES, MOTION_RATES = (2e-4, 2e-6), (0.5, 0.02)
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 
@@ -94,6 +97,8 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         scale: of the scene, world units, which the means' rates follow.
     """
     rates = config.rates
+    # Adam moves a pose by at most its rate a step: a short run needs longer steps.
+    longer = math.sqrt(REFERENCE_ITERATIONS / config.iterations)
     return {
         "means": (rates.means[0] * scale, rates.means[1] * scale),
         "raw_quats": (rates.quats,) * 2,
@@ -104,8 +109,8 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "shN": (rates.shN,) * 2,
         "grid": rates.grid,
         "mlp": rates.mlp,
-        "poses": rates.poses,
-        "motions": rates.motions,
+        "poses": (POSE_RATES[0] * longer, POSE_RATES[1] * longer),
+        "motions": MOTION_RATES,
     }
 
 

@@ -18,6 +18,8 @@ from nexwarp.train.target import Target
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
+# Factor of the squared pose corrections, which keeps poses near the given ones, and of the squared motions.
+POSE_PRIOR = 0.1
 BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses")
 
 
@@ -122,8 +124,8 @@ def step_losses(
         losses["normals"] = normals * normal_loss(out, target.counts)
     if distortion > 0:
         losses["distortion"] = distortion * distortion_loss(out, target.counts)
-    if poses is not None and target.view is not None and factors.poses > 0:
-        losses["poses"] = factors.poses * poses.prior(target.view)
+    if poses is not None and target.view is not None:
+        losses["poses"] = POSE_PRIOR * poses.prior(target.view)
     for name, loss in (own or {}).items():
         losses[name] = _scalar(name, loss(out, target), out.image.device)
     return losses
