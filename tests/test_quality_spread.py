@@ -10,8 +10,8 @@ import pytest
 from benchmarks.quality import spread as module
 from benchmarks.quality.jobs import TrainingJob
 from benchmarks.quality.results import read_results
-from benchmarks.quality.rows import ROWS
-from benchmarks.quality.spread import expected_seconds, kind_of, next_job, spread, wanted_jobs
+from benchmarks.quality.rows import CHANGES, ROWS
+from benchmarks.quality.spread import command_of, expected_seconds, kind_of, next_job, spread, undone_jobs, wanted_jobs
 
 FAILS, HANGS = 10_000, 20_000  # sizes
 
@@ -34,11 +34,12 @@ def test_the_tables_trainings_come_by_value() -> None:
     assert len(jobs) == len(set(jobs)) and all(job.row in ROWS and expected_seconds(job) > 0 for job in jobs)
     sizes = [400_000] + [40_000] * 4 + [10_000] * 4
     assert [(job.row, job.size) for job in jobs[:9]] == [("default", size) for size in sizes]
-    seeds = {(job.scene, job.row) for job in jobs if job.seed == 1}
+    seeds = {(job.scene, job.row) for job in jobs if job.seed == 1 and job.size == 40_000}
     assert seeds == {
         ("fox", "default"),
         *((s, r) for s in ("kitchen25", "saharov") for r in ("default", module.EXPOSED)),
     }
+    assert {(job.scene, job.seed) for job in jobs[-8:]} == {("saharov", 1), ("kitchen25", 1)}
     even = {"ours": 1.0, "gsplat": 1.0}
     assert next_job(jobs, "ours", even, 1e9) == jobs[0]
     first = next_job(jobs, "gsplat", even, 1e9)
@@ -46,6 +47,17 @@ def test_the_tables_trainings_come_by_value() -> None:
     quick = next_job(jobs, "ours", even, 100.0)
     assert quick is not None and expected_seconds(quick) < 100 < expected_seconds(jobs[0])
     assert next_job(jobs, "ours", even | {"ours": 1e6}, 1000.0) is None
+
+
+def test_each_change_is_undone_on_validation_views() -> None:
+    jobs = undone_jobs()
+    assert len(jobs) == len(set(jobs)) and {job.variant for job in jobs} == {"inner"}
+    rows = list(dict.fromkeys(job.row for job in jobs))
+    assert rows[:2] == ["default", "floaters left"]
+    assert {row.name for row in CHANGES} - set(rows) == set(module.NOT_UNDONE)
+    assert {(job.scene, job.row) for job in jobs} == {(scene, row) for scene in module.SECONDS for row in rows}
+    inner, test = (command_of(each[0], Path("data"), Path("out.jsonl")) for each in (jobs, wanted_jobs()))
+    assert inner[inner.index("--variant") + 1] == "inner" and "--variant" not in test
 
 
 def test_results_are_kept_failures_told_and_the_rest_cut_off(

@@ -1,6 +1,8 @@
 """Runs the trainings that the documents' tables need on all GPUs of a machine, in the order of their value.
 
-    python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR
+    python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR [--undone]
+
+--undone judges each change of the default in its place: trainings without it, on validation views.
 
 On each GPU one training of ours, which the GPU limits, runs beside one of gsplat, which the host limits; two beside
 three where CUDA MPS lets kernels of several processes overlap. Seconds are not comparable then. Each result is appended
@@ -23,7 +25,7 @@ import torch
 
 from benchmarks.quality.jobs import TrainingJob
 from benchmarks.quality.results import drop_unfinished, read_results, result_line
-from benchmarks.quality.rows import DEFAULT, MEGABYTES, PEERS, ROWS
+from benchmarks.quality.rows import CHANGES, DEFAULT, MEGABYTES, PEERS, ROWS
 from benchmarks.timing import ROOT
 
 # Seconds of our training with 40,000 surfels on an H100, roughly; the spread corrects them by what it sees.
@@ -32,6 +34,10 @@ PEER_SECONDS = 230
 MPS = "CUDA_MPS_PIPE_DIRECTORY" in os.environ
 SLOTS = {"ours": 2 if MPS else 1, "gsplat": 3 if MPS else 1}  # trainings at once on a GPU
 EXPOSED, EVEN = PEERS[2].name, PEERS[3].name
+# Of the changes, those about which short and small runs say least come first.
+UNDONE_FIRST = ("floaters left", "no depth jitter", "constant MLP rate", "no filter of points", "no exposures")
+# These say what a view from elsewhere shows, or how a file is made, not how well a training goes.
+NOT_UNDONE = ("no footprints", "no SH smoothing", "paper's table")
 
 
 @dataclass
@@ -69,7 +75,19 @@ def wanted_jobs() -> list[TrainingJob]:
     jobs = [TrainingJob(scene, "", row, size, 0, 30_000) for scene, row, size in dict.fromkeys(pairs)]
     first = len(sizes) * len(SECONDS)
     largest = TrainingJob("train", "", default, 400_000, 0, 30_000)
-    return [largest, *jobs[:first], *seeds, *jobs[first:]]
+    # Whether more surfels hurt is less than what a seed changes there.
+    last = [
+        TrainingJob(scene, "", default, size, 1, 30_000)
+        for size in (20_000, 10_000, 100_000, 5_000)
+        for scene in ("saharov", "kitchen25")
+    ]
+    return [largest, *jobs[:first], *seeds, *jobs[first:], *last]
+
+
+def undone_jobs() -> list[TrainingJob]:
+    """Return trainings of the default and of each change undone, judged on validation views, by value."""
+    names = dict.fromkeys([DEFAULT.name, *UNDONE_FIRST, *(row.name for row in CHANGES if row.name not in NOT_UNDONE)])
+    return [TrainingJob(scene, "inner", row, 40_000, 0, 9_000) for row in names for scene in SECONDS]
 
 
 def kind_of(job: TrainingJob) -> str:
@@ -81,7 +99,7 @@ def expected_seconds(job: TrainingJob) -> float:
     """Return how long a training takes on an H100, roughly."""
     if kind_of(job) == "gsplat":
         return PEER_SECONDS * (1.0 if job.size < 200_000 else 1.5)
-    return SECONDS[job.scene] * (0.55 + 0.45 * (job.size / 40_000) ** 0.5)
+    return SECONDS[job.scene] * (0.55 + 0.45 * (job.size / 40_000) ** 0.5) * job.iterations / 30_000
 
 
 def next_job(jobs: Sequence[TrainingJob], kind: str, slowness: Mapping[str, float], left: float) -> TrainingJob | None:
@@ -96,6 +114,7 @@ def command_of(job: TrainingJob, data: Path, out: Path) -> list[str]:
     named = f"{row.name}:{row.preset or 'gsplat'}:{json.dumps(row.settings)}"
     command = [sys.executable, "-m", "benchmarks.quality", "train", "--row", named, "--scenes", job.scene]
     command += ["--seeds", str(job.seed), "--size", str(job.size), "--iterations", str(job.iterations)]
+    command += ["--variant", job.variant] if job.variant else []
     return [*command, "--data", str(data), "--out", str(out)]
 
 
@@ -165,13 +184,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, required=True, help="of wall time")
+    parser.add_argument("--undone", action="store_true", help="judge each change of the default on validation views")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
     have = {}
     if given.out.exists():
         drop_unfinished(given.out)
         have = read_results([given.out])
-    jobs = [job for job in wanted_jobs() if job not in have]
+    jobs = [job for job in (undone_jobs() if given.undone else wanted_jobs()) if job not in have]
     failed = spread(given.out, given.data, given.seconds, torch.cuda.device_count(), jobs)
     print(f"{len(jobs)} trainings were not begun, {failed} have no result")
     return 1 if failed else 0
