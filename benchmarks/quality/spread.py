@@ -61,27 +61,23 @@ class Running:
 
 def wanted_jobs() -> list[TrainingJob]:
     """Return all trainings: the longest first, lest it end last; then those of the most value."""
-    default, sizes = DEFAULT.name, (40_000, 10_000)
-    pairs = [(scene, default, size) for size in sizes for scene in SECONDS]
-    seeds = [TrainingJob("fox", "", default, 40_000, seed, 30_000) for seed in (1, 2, 3)]
-    # Scenes of four test views, where one seed cannot tell.
-    few = [(scene, row) for scene in ("kitchen25", "saharov") for row in (default, EXPOSED)]
-    seeds += [TrainingJob(scene, "", row, 40_000, 1, 30_000) for scene, row in few]
-    pairs += [(scene, EXPOSED, 10_000) for scene in SECONDS]
-    pairs += [("train", EXPOSED, 400_000)]
-    pairs += [(scene, default, size) for size in (100_000, 20_000, 5_000) for scene in SECONDS]
-    pairs += [(scene, EVEN, 10_000) for scene in SECONDS]
-    pairs += [(scene, row.name, size) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN]
-    jobs = [TrainingJob(scene, "", row, size, 0, 30_000) for scene, row, size in dict.fromkeys(pairs)]
-    first = len(sizes) * len(SECONDS)
-    largest = TrainingJob("train", "", default, 400_000, 0, 30_000)
-    # Whether more surfels hurt is less than what a seed changes there.
-    last = [
-        TrainingJob(scene, "", default, size, 1, 30_000)
-        for size in (20_000, 10_000, 100_000, 5_000)
-        for scene in ("saharov", "kitchen25")
+    ours, few = DEFAULT.name, ("saharov", "kitchen25")
+    wanted = [
+        ("train", ours, 400_000, 0),
+        *((scene, ours, size, 0) for size in (40_000, 10_000) for scene in SECONDS),
+        *(("fox", ours, size, seed) for size in (40_000, 10_000) for seed in (1, 2, 3)),
+        # Four test views each, so that one seed cannot tell.
+        *((scene, row, 40_000, 1) for scene in few for row in (ours, EXPOSED)),
+        *((scene, EXPOSED, 10_000, 0) for scene in SECONDS),
+        ("train", EXPOSED, 400_000, 0),
+        *((scene, ours, size, 0) for size in (100_000, 20_000, 5_000) for scene in SECONDS),
+        *((scene, EVEN, 10_000, 0) for scene in SECONDS),
+        *((scene, row.name, size, 0) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN),
+        *((scene, EVEN, 40_000, 0) for scene in ("fox", *few)),
+        *(("fox", row, size, seed) for seed in (1, 2, 3) for row, size in ((EXPOSED, 40_000), (EVEN, 10_000))),
+        *((scene, ours, size, 1) for size in (20_000, 10_000, 100_000, 5_000) for scene in few),
     ]
-    return [largest, *jobs[:first], *seeds, *jobs[first:], *last]
+    return [TrainingJob(scene, "", row, size, seed, 30_000) for scene, row, size, seed in dict.fromkeys(wanted)]
 
 
 def undone_jobs() -> list[TrainingJob]:
