@@ -20,7 +20,7 @@ from nexwarp.train.config import LearningRates
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.initial import initial_poses
 from nexwarp.train.presets import DEMO_SETTINGS, preset
-from nexwarp.train.schedules import make_optimizer
+from nexwarp.train.schedules import make_optimizer, rate_ends
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import with_cameras
@@ -98,6 +98,11 @@ def test_a_common_motion_and_scale_of_all_cameras_is_no_correction(tiny_scene):
     alone.load(torch.randn(1, 6))
     alone.keep_gauge()
     assert alone.corrections.abs().max() < 1e-5  # a single camera has no pose of its own to refine
+
+
+def test_short_runs_take_longer_steps():
+    for iterations, expected in ((30_000, (2e-4, 2e-6)), (1_200, (1e-3, 1e-5))):
+        assert rate_ends(nw.Config(iterations=iterations), 7.0)["poses"] == pytest.approx(expected)
 
 
 def test_resuming_a_refinement_changes_nothing(tiny_scene, tmp_path):
