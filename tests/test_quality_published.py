@@ -82,8 +82,11 @@ def test_more_surfels_and_equal_megabytes(tmp_path: Path) -> None:
     assert rows_of(tables["sizes"])["train"][-1] == MISSING
     rows = rows_of(tables["megabytes"])
     assert rows["fox"][:3] == ["30.50, 0.8000, 0.2000", "30.25, 0.8000, 0.2000", "+0.25 dB, +0.0000, +0.0000"]
-    assert rows["mean of the scenes that have both"][2] == "+0.00 dB, +0.0000, +0.0000"
-    assert rows["mean of the scenes that have both"][-1] == MISSING
+    assert rows["mean"] == ["", "", MISSING] * 2, "two scenes are no mean of four"
+    lines += [line(scene, "5 MB", 37_000, 21.0) for scene in ("saharov", "kitchen25")]
+    lines += [line(scene, EXPOSED, 68_400, 21.0) for scene in ("saharov", "kitchen25")]
+    rows = rows_of(blocks(of_one_default([read(lines, tmp_path / "y.jsonl")]))["megabytes"])
+    assert rows["mean"] == ["", "", "+0.00 dB, +0.0000, +0.0000", "", "", MISSING]
 
 
 def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
