@@ -136,7 +136,7 @@ def _megabytes(results: Results) -> str:
     means = ["mean"]
     for name in BUDGETS:
         each = [sum(x) / len(x) for x in zip(*sums[name], strict=True)]
-        whole = len(sums[name]) == len(SCENES)  # fewer would favour a side by their choice
+        whole = len(sums[name]) == len(SCENES)  # a mean of some would favour one side
         means += ["", "", f"{each[0]:+.2f} dB, {each[1]:+.4f}, {each[2]:+.4f}" if whole else MISSING]
     header = ["scene", *(f"{n}: {x}" for n in BUDGETS for x in ("nexwarp", "best gsplat", "difference"))]
     rows = (*BUDGETS, *PEER_NAMES)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR [--undone]
 
---undone judges each change of the default in its place: trainings without it, on validation views.
+--undone does others in their place: each change of the default undone, judged on validation views.
 
 On each GPU one training of ours, which the GPU limits, runs beside one of gsplat, which the host limits; two beside
 three where CUDA MPS lets kernels of several processes overlap. Seconds are not comparable then. Each result is appended
@@ -34,9 +34,9 @@ PEER_SECONDS = 230
 MPS = "CUDA_MPS_PIPE_DIRECTORY" in os.environ
 SLOTS = {"ours": 2 if MPS else 1, "gsplat": 3 if MPS else 1}  # trainings at once on a GPU
 EXPOSED, EVEN = PEERS[2].name, PEERS[3].name
-# Of the changes, those about which short and small runs say least come first.
+# The changes about which short and small runs say least.
 UNDONE_FIRST = ("floaters left", "no depth jitter", "constant MLP rate", "no filter of points", "no exposures")
-# These say what a view from elsewhere shows, or how a file is made, not how well a training goes.
+# Detail limits and SH smoothing show in other views than these; the paper's table is a matter of the file's size.
 NOT_UNDONE = ("no footprints", "no SH smoothing", "paper's table")
 
 
@@ -180,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, required=True, help="of wall time")
-    parser.add_argument("--undone", action="store_true", help="judge each change of the default on validation views")
+    parser.add_argument("--undone", action="store_true", help="undo each change of the default, on validation views")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
     have = {}
