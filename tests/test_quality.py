@@ -245,7 +245,10 @@ def test_validation_views_are_training_views(scene: Scene) -> None:
     part = inner_validation(scene)
     names = [view.name for view in scene.train]
     assert [view.name for view in part.test] == names[::8]
-    assert sorted(view.name for view in (*part.test, *part.train)) == names
+    folds = [VARIANTS[name](scene) for name in ("inner", *(f"inner{first}" for first in range(1, 8)))]
+    for fold in folds:
+        assert sorted(view.name for view in (*fold.test, *fold.train)) == names
+    assert sorted(view.name for fold in folds for view in fold.test) == names
 
 
 def test_an_arc_starts_from_what_its_training_views_show(scene: Scene) -> None:

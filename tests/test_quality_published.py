@@ -18,7 +18,7 @@ from benchmarks.timing import ROOT
 
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
-SAME = {"2c43c13", "d143342"}  # commits of the same default and kernels
+SAME = {"2c43c13", "d143342", "563f908"}  # commits of the same default and kernels
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 
 

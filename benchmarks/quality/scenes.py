@@ -1,7 +1,7 @@
 """The quality benchmark's scenes: loaded, with other test views, scaled or moved."""
 
 import dataclasses
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
@@ -15,10 +15,10 @@ from nexwarp.data.scene import TEST_EVERY
 ARC_VIEWS = 8
 
 
-def inner_validation(scene: Scene) -> Scene:
-    """Hold out every 8th training view, to choose settings by; the test views are left out."""
-    test = scene.train[::TEST_EVERY]
-    train = [view for index, view in enumerate(scene.train) if index % TEST_EVERY]
+def inner_validation(scene: Scene, first: int = 0) -> Scene:
+    """Hold out every 8th training view from the `first` on, to choose settings by; the test views are left out."""
+    test = scene.train[first::TEST_EVERY]
+    train = [view for index, view in enumerate(scene.train) if index % TEST_EVERY != first]
     return dataclasses.replace(scene, train=train, test=test)
 
 
@@ -89,6 +89,8 @@ def with_near(scene: Scene, near: float = 0.2) -> Scene:
 
 VARIANTS = {
     "inner": inner_validation,
+    # The other folds: with all eight, every training view is held out once.
+    **{f"inner{first}": partial(inner_validation, first=first) for first in range(1, TEST_EVERY)},
     "arc": held_out_arc,
     "near": with_near,
     "x100": lambda scene: moved(scene, factor=100.0),
