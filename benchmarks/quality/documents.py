@@ -57,8 +57,8 @@ def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
-def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterable[str]) -> str:
-    """Return the line below a table: command, devices, dates, commits and seeds of what it shows."""
+def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterable[str], short: bool = False) -> str:
+    """Return the line below a table: command, devices, dates, and unless `short` commits and seeds of what it shows."""
     sizes, rows = set(sizes), set(rows)
     shown = {job: x for job, x in results.items() if job.size in sizes and job.row in rows}
     if not shown:
@@ -68,10 +68,11 @@ def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterabl
     for kind, preset in kinds.items():
         of = {job: x for job, x in shown.items() if ROWS[job.row].preset == preset}
         if of:
-            what = [sorted({str(x[key]) for x in of.values()}) for key in ("device", "date", "commit")]
+            keys = ("device", "date") if short else ("device", "date", "commit")
+            named = ", ".join(" and ".join(sorted({str(x[key]) for x in of.values()})) for key in keys)
             seeds = sorted({job.seed for job in of})
-            named = ", ".join(" and ".join(part) for part in what)
-            facts.append(f"{kind} {named}, seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}")
+            of_seeds = "" if short else f", seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+            facts.append(f"{kind} {named}{of_seeds}")
     return f"*Measured by* `python -m benchmarks.quality train --tables {tables}`: {'; '.join(facts)}."
 
 
@@ -182,7 +183,10 @@ def _short(results: Results) -> str:
 
 
 def _readme(results: Results) -> str:
-    """Return the table of README.md: means, 40,000 primitives, beside the best gsplat row of each scene."""
+    """Return the table of README.md: means, 40,000 primitives, beside the best gsplat row of each scene.
+
+    Commits and seeds are on the page of all tables.
+    """
     columns = ["PSNR [dB]", "SSIM", "FLIP", "MB"]
     metrics = (("psnr", 2), ("ssim", 4), ("flip", 4), ("megabytes", 1))
     lines, named = [], {DEFAULT.name}
@@ -196,4 +200,4 @@ def _readme(results: Results) -> str:
             cells += [f"{mean(found, m):.{n}f}" for m, n in metrics] if found else [MISSING, "", "", ""]
         lines.append(cells)
     header = ["scene", f"nexwarp: {columns[0]}", *columns[1:], f"gsplat: {columns[0]}", *columns[1:]]
-    return f"{_table(header, lines)}\n\n{_measured(results, 'peers', SIZES[:1], named)}"
+    return f"{_table(header, lines)}\n\n{_measured(results, 'peers', SIZES[:1], named, short=True)}"
