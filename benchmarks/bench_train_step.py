@@ -1,7 +1,4 @@
-"""One default training step in the middle of a run: SH of degree 3, splat errors, all losses, Adam.
-
-And one search for floaters, which training repeats once densification is over.
-"""
+"""One default training step in the middle of a run: SH of degree 3, splat errors, all losses, Adam."""
 
 import sys
 import time
@@ -17,7 +14,6 @@ from benchmarks.timing import Measurement, figure, synchronize
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
 from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.floaters import floaters, nearest_depth
 from nexwarp.train.trainer import Trainer
 
 MIDDLE = 10_000  # iteration
@@ -47,23 +43,7 @@ def step(scene: SurfelScene, options: Options) -> list[Measurement]:
     rate = count / (time.perf_counter() - start)
     note = f"{count} steps in a row, density control included as it falls due. {scene.note}".strip()
     facts = scene.facts | {"note": note}
-    return [
-        one,
-        figure("training rate", rate, options.device, unit="it/s", **facts),
-        floater_search(scene, trainer, options),
-    ]
-
-
-def floater_search(scene: SurfelScene, trainer: Trainer, options: Options) -> Measurement:
-    """Time the trainer's search for floaters, in all training views and at least as many views between them."""
-    cameras = [view.camera for view in trainer.scene.train]
-    nearest = [nearest_depth(view, trainer.scene.points) for view in trainer.scene.train]
-    model = trainer.model()
-
-    def find() -> None:
-        floaters(model, cameras, nearest, torch.Generator().manual_seed(0))
-
-    return options.time("look for floaters", find, **scene.facts)
+    return [one, figure("training rate", rate, options.device, unit="it/s", **facts)]
 
 
 def make_trainer(scene: SurfelScene, options: Options) -> Trainer:

@@ -19,7 +19,7 @@ import nexwarp as nw
 from nexwarp.data import Scene, write_demo
 from nexwarp.finish import auto_exposure
 from nexwarp.kernels import launch
-from nexwarp.train import floaters, presets
+from nexwarp.train import presets
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
 
@@ -93,17 +93,15 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def few_looks() -> Iterator[None]:
-    """Looks for floaters and places of predicted exposures are few: they take seconds, which few tests are about."""
+def few_places() -> Iterator[None]:
+    """Places of predicted exposures are few: they take seconds, which few tests are about."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(floaters, "PROBES", 6)
-        patch.setattr(floaters, "LAST_PROBES", 12)
         patch.setattr(auto_exposure, "PLACES", 12)
         yield
 
 
 @pytest.fixture(scope="module")
-def small_preset(request: pytest.FixtureRequest, one_torch_thread: None, few_looks: None) -> Iterator[None]:
+def small_preset(request: pytest.FixtureRequest, one_torch_thread: None, few_places: None) -> Iterator[None]:
     """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.PRESETS, "default", request.module.SMALL)

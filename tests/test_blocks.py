@@ -21,7 +21,7 @@ from tests.scenes import make_texture as random_texture
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
@@ -113,7 +113,7 @@ def test_a_block_keeps_to_its_cell(tiny_scene: Scene) -> None:
         near = inside(part.points, grown(cell, 0.1 * tiny_scene.scale))
         assert near.sum() == inside(tiny_scene.points, grown(cell, 0.1 * tiny_scene.scale)).sum()
         assert 0 < (~near).sum() < 0.6 * (len(tiny_scene.points) - near.sum())
-    often = small(iterations=12, max_surfels=120, densify=DensifyConfig(every=3, floaters=False))
+    often = small(iterations=12, max_surfels=120, densify=DensifyConfig(every=3))
     trainer = BlockTrainer(part, often, "cpu", cell, overlap=0.1)
     trainer.run(until=2)
     errors, reached = trainer.densifier.errors, inside(trainer.surfels.means.detach(), trainer.reach)

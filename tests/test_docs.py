@@ -95,7 +95,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "densify.prune_opacity": ("", "4.3"),
     "densify.prune_at_cap": ("", "code"),
     "densify.relocate": ("", ""),
-    "densify.floaters": ("", ""),
 }
 
 INTRODUCTION = """\

@@ -25,7 +25,7 @@ def trained(scene: Scene, smooth_sh: float = Config().smooth_sh) -> nw.Model:
     return trainer.finish()
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_looks")
+@pytest.mark.usefixtures("one_torch_thread", "few_places")
 def test_the_benchmark_finishes_a_model_as_training_does(scene: Scene) -> None:
     """Its figures at full size are those of the trained model; the stages change the smaller renderings."""
     model = trained(scene)
@@ -49,7 +49,7 @@ def test_the_benchmark_finishes_a_model_as_training_does(scene: Scene) -> None:
     assert all(len(figures) == len(finished_model.FACTORS) for figures in found.values())
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_looks")
+@pytest.mark.usefixtures("one_torch_thread", "few_places")
 def test_sh_that_are_not_smooth_are_smoothed(scene: Scene, tmp_path: Path) -> None:
     smooth, rough = trained(scene), trained(scene, smooth_sh=0.0)
     assert not torch.equal(smooth.surfels.shN, rough.surfels.shN)

@@ -62,7 +62,6 @@ def masked(scene: Scene) -> Scene:
         {"max_hits": 0},
         {"max_hits": 4, "depth_jitter": 0.0},
         {"low_pass": True, "losses.depth": 0.0},
-        {"densify.floaters": False},
         {"coarse": 0.5},
         {"refine_poses": True},
         {"blur_poses": 3},

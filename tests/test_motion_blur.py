@@ -35,7 +35,7 @@ from tests.test_poses import STILL, model, shown  # noqa: F401  # fixtures
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
 
 
 def motions_of(trainer: Trainer) -> torch.nn.Parameter:
@@ -184,7 +184,7 @@ def test_motions_come_back_in_training(shown: Scene, model: nw.Model):  # noqa: 
     """With surfels that are right, motions of about 5 pixels are found but for their direction in time."""
     config = small(iterations=320, max_hits=0, blur_poses=5, exposures=False, sh_every=1, background=(0.0, 0.0, 0.0))
     config = dataclasses.replace(config, rates=LearningRates(**STILL))
-    config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False))
+    config = dataclasses.replace(config, densify=DensifyConfig(stop=0))
     cameras = [view.camera for view in shown.train]
     ways = torch.nn.functional.normalize(
         torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(1)), dim=-1

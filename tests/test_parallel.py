@@ -45,7 +45,7 @@ from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
 
 # The command line has no flags for the texture's shape.
 SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
@@ -58,7 +58,7 @@ def scene(tiny_scene: Scene) -> Scene:
 
 
 def long_config(size: int, steps: int) -> Config:
-    """Rounds of density control and a search for floaters."""
+    """Rounds of density control."""
     return small(iterations=steps * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
 
 

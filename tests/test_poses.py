@@ -29,7 +29,7 @@ from tests.cli.support import FLAGS, SMALL
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
 
 # Surfels and texture stay as they are.
 STILL: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(LearningRates)}
@@ -139,7 +139,7 @@ def test_disturbed_poses_come_back_in_training(shown, model):
     """With surfels that are right, the training poses return to the true ones, up to the gauge."""
     rates = LearningRates(**STILL)
     config = small(iterations=240, max_hits=0, refine_poses=True, exposures=False, rates=rates)
-    config = dataclasses.replace(config, densify=DensifyConfig(stop=0, floaters=False), sh_every=1)
+    config = dataclasses.replace(config, densify=DensifyConfig(stop=0), sh_every=1)
     config = dataclasses.replace(config, background=(0.0, 0.0, 0.0))
     # Surfels that stand still hold the gauge at the true one: so no pose is off by what all are off by.
     given = initial_poses(shown, config, torch.device("cpu"))

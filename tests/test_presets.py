@@ -54,13 +54,12 @@ def test_paper_is_the_paper():
         prune_opacity=0.005,
         prune_at_cap=False,
         relocate=0.0,
-        floaters=False,
     )
 
 
 def test_default_prunes_at_the_cap_and_filters_points():
     p = preset("default")
-    assert p == Config() and p.densify.prune_at_cap and p.densify.floaters and p.filter_points and not p.clamp_image
+    assert p == Config() and p.densify.prune_at_cap and p.filter_points and not p.clamp_image
     assert p.texture.min_resolution is None and p.texture.max_resolution is None
     assert p.texture.residual and p.background is None and p.losses.depth > 0
 

@@ -106,7 +106,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(found["views"]) == {view.name for view in nw.load_scene(folder / "tiny").test}
     mean = sum(view["psnr"] for view in found["views"].values()) / len(found["views"])
     assert found["psnr"] == pytest.approx(mean) and found["primitives"] <= 60 and found["flip"] > 0
-    assert found["removed_last"] == 0 and found["config"] != config_name(preset("default"))
+    assert found["config"] != config_name(preset("default"))
     assert len(list((tmp_path / "pictures").iterdir())) == len(found["views"])
     (model,) = (tmp_path / "models").glob("*/model.safetensors")
     assert found["megabytes"] == pytest.approx(model.stat().st_size / 1e6)
@@ -142,7 +142,7 @@ def quarter_psnr(model: nw.Model, folder: Path) -> float:
 
 
 def test_rows_that_differ_late_share_their_first_iterations() -> None:
-    """Until K or the removal of floaters takes effect, 25,000 of 30,000 iterations; other rows train alone."""
+    """Until K takes effect, 25,000 of 30,000 iterations; other rows train alone."""
     jobs = list(table_jobs("hits", ("fox", "car"), (0, 1), 30_000, 40))
     groups = group_jobs(jobs, ROWS)
     assert sorted(map(str, jobs)) == sorted(str(job) for group in groups for job in group.jobs)
@@ -162,19 +162,21 @@ def test_rows_of_finishing_share_their_first_iterations() -> None:
     jobs = list(table_jobs("changes", ("fox",), (0,), 300, 40))
     shared = {tuple(job.row for job in g.jobs): g.iterations for g in group_jobs(jobs, ROWS) if g.iterations}
     finished = ("no footprints", "no SH smoothing")
-    assert shared == {("default", *finished, "floaters left"): 249}
+    assert shared == {("default", *finished): 249}
 
 
-def test_rows_without_texture_or_with_an_earlier_stop_share_their_own() -> None:
+def test_rows_without_texture_share_their_own() -> None:
     job = TrainingJob("fox", "", "default", 40, 0, 300)
-    few = {"none": {"max_hits": 0}, "none, left": {"max_hits": 0, "densify.floaters": False}, "one": {"max_hits": 1}}
-    early = {"early": {"densify.stop": 20_000}, "early, left": {"densify.stop": 20_000, "densify.floaters": False}}
-    rows = {name: Row(name, settings=settings) for name, settings in (few | early).items()}
+    few: dict[str, dict[str, float]] = {
+        "none": {"max_hits": 0},
+        "none, rough": {"max_hits": 0, "smooth_sh": 0.0},
+        "one": {"max_hits": 1},
+    }
+    rows = {name: Row(name, settings=settings) for name, settings in few.items()}
     groups = group_jobs([dataclasses.replace(job, row=name) for name in rows], rows)
     assert [([job.row for job in group.jobs], group.iterations) for group in groups] == [
-        (["none", "none, left"], 249),
+        (["none", "none, rough"], 249),
         (["one"], 0),
-        (["early", "early, left"], 199),
     ]
     four = Row("four", "paper", {"max_hits": 4})  # which takes effect from the start there
     rows = {"paper": ROWS["paper"], "four": four}
@@ -190,7 +192,7 @@ def test_a_training_from_a_shared_start_is_the_training(
     threads = torch.get_num_threads()
     out, models = tmp_path / "out.jsonl", tmp_path / "models"
     small = {"texture.levels": 4, "texture.table_size": 1024}
-    differ: dict[str, dict[str, int]] = {"2 hits": {}, "3 hits": {"max_hits": 3}, "left": {"densify.floaters": False}}
+    differ: dict[str, dict[str, float]] = {"2 hits": {}, "3 hits": {"max_hits": 3}, "rough": {"smooth_sh": 0.0}}
     rows = {name: settings | small for name, settings in differ.items()}
     command = ["train", "--scenes", "tiny", "--seeds", "1", "--size", "60", "--iterations", "12", "--data", str(folder)]
     command += ["--out", str(out), "--models", str(models)]

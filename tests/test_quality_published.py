@@ -19,6 +19,7 @@ from benchmarks.timing import ROOT
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
 SAME = {"2c43c13", "d143342", "563f908"}  # commits of the same default and kernels
+OLDER = True  # the tables are of a default with other settings than today's
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 
 
@@ -103,6 +104,7 @@ def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
         assert {x["commit"] for job, x in of_one_default(files, "abc").items() if job.row == "default"} == {"abc"}
     with pytest.raises(ValueError, match=r"fox default 40000 seed 0 \(abc\): expected the settings of today, got"):
         of_one_default([read([line("fox", "default", 40_000, 32.0, config="other")], tmp_path / "y.jsonl")])
+    assert len(of_one_default([read_results([tmp_path / "y.jsonl"])], older=True)) == 1
     short = [
         line("fox", "default", 40_000, 32.0, iterations=1000),
         line("fox", "default", 40_000, 3.0, variant="inner"),
@@ -144,7 +146,8 @@ def test_the_pages_hold_the_tables_of_the_kept_results() -> None:
     kept = [read_results([file]) for file in files]
     commit, *same = {x["commit"] for x in kept[-1].values() if ROWS[x["row"]].preset == "default"}
     assert {commit, *same} <= SAME
-    tables = blocks(of_one_default(kept, commit, same))
+    tables = blocks(of_one_default(kept, commit, same, OLDER))
     for page in PAGES:
         text = (ROOT / page).read_text(encoding="utf-8")
+        assert ("of an older default" in " ".join(text.split())) == OLDER, f"{page}: say whose tables these are"
         assert fill(text, tables) == text, f"{page}: fill it by benchmarks.quality publish"

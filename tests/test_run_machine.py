@@ -50,7 +50,7 @@ from tests.subprocesses import python_path
 
 SMALL = Config(
     texture=TextureConfig(levels=2, table_size=2**6, width=8),
-    densify=DensifyConfig(every=2, floaters=False),
+    densify=DensifyConfig(every=2),
     sh_degree=1,
     exposures=False,
     smooth_sh=0.0,

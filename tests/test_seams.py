@@ -20,7 +20,7 @@ from tests.narrowing import present
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_looks")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
 
 
 def test_seams_are_where_cells_meet() -> None:

@@ -18,7 +18,7 @@ from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels
 from nexwarp.run import warmup
 from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.densify import Densifier
 from nexwarp.train.presets import PRESETS
 from nexwarp.train.trainer import Trainer
 
@@ -104,7 +104,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
 SETTINGS = {
     **PRESETS,
     "no texture": Config(max_hits=0),
-    "no texture, floaters left": Config(max_hits=0, densify=DensifyConfig(floaters=False)),
+    "no texture, no detail limits": Config(max_hits=0, footprints=False),
     "K = 3": Config(max_hits=3),
     "poses": Config(refine_poses=True),
     "deterministic": Config(deterministic=True),

@@ -10,13 +10,13 @@
 
 `--variant inner` holds out every 8th training photo in place of the test views, to choose settings by.
 `train` appends one JSON line per training and skips the trainings that the file already holds: it can be stopped and
-resumed, and run on several machines. Rows that differ only in K, in the removal of floaters or in how a model is
-finished train alike until the difference takes effect (`more_hits_from`, `densify.stop`); until there they share one
-training. The table `demo` needs no data: it holds out neighbouring cameras of the built-in scene and takes minutes on a
-CPU. `table` makes Markdown of the results: means and spreads over seeds, and the difference of each row from the
-default, or from the row `--against`, averaged over the scenes. Two tables never train the same job twice. `curve` draws
-a metric over the number of primitives. `publish` fills the marked blocks of the documents with results of one commit of
-the default, says "not run" where there is none, and refuses results of other commits or settings.
+resumed, and run on several machines. Rows that differ only in K or in how a model is finished train alike until K
+takes effect (`more_hits_from`); until there they share one training. The table `demo` needs no data: it holds out
+neighbouring cameras of the built-in scene and takes minutes on a CPU. `table` makes Markdown of the results: means and
+spreads over seeds, and the difference of each row from the default, or from the row `--against`, averaged over the
+scenes. Two tables never train the same job twice. `curve` draws a metric over the number of primitives. `publish` fills
+the marked blocks of the documents with results of one commit of the default, says "not run" where there is none, and
+refuses results of other commits or settings.
 
 Metrics are those of `nexwarp.run.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had.
 Speed and memory of a training count only when it ran alone (`--jobs 1`).

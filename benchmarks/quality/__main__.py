@@ -117,7 +117,7 @@ def curve(given: argparse.Namespace) -> int:
 def publish(given: argparse.Namespace) -> int:
     """Fill the marked blocks of pages with the tables of one default."""
     files = [read_results([file]) for file in given.results]
-    results = of_one_default(files, given.commit, given.same.split(",") if given.same else ())
+    results = of_one_default(files, given.commit, given.same.split(",") if given.same else (), given.older)
     tables = blocks(results)
     filled = {page: fill(page.read_text(encoding="utf-8"), tables) for page in given.page or ()}
     for page, text in filled.items():
@@ -160,6 +160,7 @@ def _add_publish(parser: argparse.ArgumentParser) -> None:
     add("results", type=Path, nargs="+")
     add("--commit", help="of the default's trainings; default: the only one in the results")
     add("--same", help="comma-separated: further commits whose default computes the same")
+    add("--older", action="store_true", help="the default had other settings then; the page has to say so")
     add("--page", type=Path, action="append", help="file with lines <!-- results: NAME --> to fill; several times")
     add("--show", help="comma-separated blocks to print: short, readme, peers-40000, peers-10000, sizes, train, ...")
 

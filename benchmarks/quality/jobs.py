@@ -141,8 +141,8 @@ def config_of(job: TrainingJob, row: Row) -> Config:
 def group_jobs(jobs: Iterable[TrainingJob], rows: Mapping[str, Row]) -> list[JobGroup]:
     """Group jobs that share their first iterations, in the order of each group's first job.
 
-    They share them where their settings differ only in K (2 or more), in the removal of floaters, or in how a model is
-    finished. Other jobs come alone.
+    They share them where their settings differ only in K (2 or more) or in how a model is finished. Other jobs come
+    alone.
 
     Args:
         jobs: different ones.
@@ -160,14 +160,12 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
     if row.preset is None:
         return job, 0
     config = config_of(job, row)
-    first_search = config.scaled(config.densify.stop)  # for floaters
-    shared = min(config.settled - 1, first_search - 1, job.iterations)
+    shared = min(config.settled - 1, job.iterations)
     if shared <= 0:
         return job, 0
     alike = dataclasses.replace(
         config,
         max_hits=min(config.max_hits, 2),
-        densify=dataclasses.replace(config.densify, floaters=False),
         footprints=False,
         smooth_sh=0.0,
     )

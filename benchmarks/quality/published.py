@@ -13,7 +13,9 @@ PEER_NAMES = tuple(row.name for row in PEERS)
 ITERATIONS = 30_000
 
 
-def of_one_default(files: Iterable[Results], commit: str | None = None, same: Collection[str] = ()) -> Results:
+def of_one_default(
+    files: Iterable[Results], commit: str | None = None, same: Collection[str] = (), older: bool = False
+) -> Results:
     """Return the results that may stand in one table: those of known rows at full size, our presets' from one commit.
 
     gsplat and the paper's preset, which change less than the default, may have been trained at other commits; the
@@ -23,6 +25,7 @@ def of_one_default(files: Iterable[Results], commit: str | None = None, same: Co
         files: results of each file; of one job in several files, the later one counts.
         commit: of the default's trainings; None takes the only one that there is.
         same: further commits with the same arithmetic of the default.
+        older: the default had other settings than today's, which the page has to say.
 
     Raises:
         ValueError: the default's results are of several commits and none is named, there is none of the named commit,
@@ -38,7 +41,7 @@ def of_one_default(files: Iterable[Results], commit: str | None = None, same: Co
     if commit is not None and not any(x["commit"] == commit for x in chosen.values()):
         raise ValueError(f"--commit: expected one of {', '.join(commits) or 'none'}, got {commit}")
     for job, result in chosen.items():
-        if result.get("config") != config_name(config_of(job, ROWS[job.row])):
+        if not older and result.get("config") != config_name(config_of(job, ROWS[job.row])):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
             raise ValueError(f"{told}: expected the settings of today, got others")
     return chosen | {job: x for job, x in full if not _is_default(job)}

@@ -69,7 +69,6 @@ CHANGES = (
     Row("random rotations", settings={"orient_points": False}),
     Row("clamped image", settings={"clamp_image": True}),
     Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
-    Row("floaters left", settings={"densify.floaters": False}),
     Row("no depth jitter", settings={"depth_jitter": 0.0}),
     Row("paper's table", settings={"texture.table_size": 2**20}),
     Row("16 levels of 2 features", settings={"texture.levels": 16, "texture.features": 2}),

@@ -105,10 +105,9 @@ def run_job(
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
         of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either;
-        `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest
-        of its settings, `removed_last`, the floaters that the last search removed, `train_psnr`, `zoom_psnr` and
-        `quarter_psnr`; `together`, the rows and iterations of its shared start, if any; the metrics by view; device,
-        date and commit.
+        `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest of its settings,
+        `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its shared start, if any;
+        the metrics by view; device, date and commit.
     """
     device = _device()
     scene = scene_of(job, data)
@@ -188,9 +187,6 @@ def _train_nexwarp(
         _restore(trainer, start.folder)
         shared = {"together": {"rows": start.rows, "iterations": start.iterations}}
     before = trainer.seconds  # of the shared start
-    # The last search for floaters is part of the last iteration.
-    trainer.run(until=trainer.config.iterations - 1)
-    count = len(trainer.surfels)
     trainer.run()
     memory = _peak("steps_mib", device)
     model = trainer.finish()
@@ -207,7 +203,6 @@ def _train_nexwarp(
         compact, compact_bytes = load(coded).to(device), coded.stat().st_size
     facts = {
         "primitives": len(trainer.surfels),
-        "removed_last": count - len(trainer.surfels),
         "megabytes": megabytes,
         "seconds": seconds,
         "config": config_name(trainer.config),

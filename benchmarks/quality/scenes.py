@@ -1,6 +1,7 @@
 """The quality benchmark's scenes: loaded, with other test views, scaled or moved."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -87,7 +88,7 @@ def with_near(scene: Scene, near: float = 0.2) -> Scene:
     return dataclasses.replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test])
 
 
-VARIANTS = {
+VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "inner": inner_validation,
     # The other folds: with all eight, every training view is held out once.
     **{f"inner{first}": partial(inner_validation, first=first) for first in range(1, TEST_EVERY)},

@@ -181,10 +181,6 @@ class Ranks:
         dist.all_reduce(values, dist.ReduceOp.MAX)
         return values
 
-    def union(self, chosen: torch.Tensor) -> torch.Tensor:
-        """Return (N,) bool, True where any rank's `chosen` (N,) bool is."""
-        return self.largest(chosen.to(torch.uint8)) > 0
-
     def agree(self, number: int | None, *, now: bool = False) -> int | None:
         """Return the largest number that ranks gave in their previous call; the same on all ranks.
 

@@ -25,7 +25,6 @@ from nexwarp.ops.startup import start_warp
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
-from nexwarp.train.floaters import floaters
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 
@@ -71,8 +70,8 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     )
     low_passes = (config.low_pass,)
     hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
-    if config.densify.floaters or config.footprints:
-        hits.add(max(config.max_hits, 1))  # floater removal and detail limits render with K >= 1
+    if config.footprints:
+        hits.add(max(config.max_hits, 1))  # detail limits render with K >= 1
     walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
     builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
     if not cpu:
@@ -109,13 +108,11 @@ def rehearse(config: Config, device: torch.device) -> None:
     """Train for a few steps, evaluate and render on a tiny scene with these settings; seed the generators like a run.
 
     The steps cover every SH degree, both photo sizes, rounds of density control and steps after the last round, in the
-    order of a full run. The detection of floaters and the choice of surfels to relocate run too.
+    order of a full run. The choice of surfels to relocate runs too.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
     trainer.run()
-    if config.densify.floaters:
-        floaters(trainer.model(), trainer.views.cameras, [1.0], torch.Generator())
     if config.densify.relocate:
         least_contributing(trainer.model(), trainer.views.cameras, config.densify.relocate)
     model = trainer.finish()

@@ -32,9 +32,6 @@ class DensifyConfig:
     relocate: float = 0.1
     """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
     that contribute least to the training views. Others are split in their place. 0 removes none."""
-    floaters: bool = True
-    """Remove floaters: surfels that are visible, in training views or views between them, at less than 0.6 times the
-    depth of the nearest points."""
 
     def __post_init__(self) -> None:
         check_range("every", self.every, 1)

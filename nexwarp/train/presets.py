@@ -96,7 +96,7 @@ PRESETS: dict[str, Config] = {
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),
         losses=LossWeights(depth=0.0),
-        densify=DensifyConfig(prune_at_cap=False, relocate=0.0, floaters=False),
+        densify=DensifyConfig(prune_at_cap=False, relocate=0.0),
     ),
 }
 

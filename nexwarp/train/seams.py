@@ -83,7 +83,7 @@ class SeamTrainer(Trainer):
             more_hits_from=0,
             max_surfels=max(config.max_surfels, len(model.surfels)),
             losses=dataclasses.replace(config.losses, grid=0.0),
-            densify=dataclasses.replace(config.densify, start=0, stop=0, floaters=False),
+            densify=dataclasses.replace(config.densify, start=0, stop=0),
         )
         super().__init__(seam_scene(scene, cells, band), config, model.device)
 

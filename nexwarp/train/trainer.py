@@ -28,7 +28,6 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import calibrate_exposures
-from nexwarp.train.floaters import FLOATERS_EVERY, floaters, nearest_depth
 from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
@@ -187,8 +186,6 @@ class Trainer:
                     cameras, share = self.views.refined_cameras(self.poses), self.config.densify.relocate
                     unneeded = least_contributing(self.model(), cameras, share, self.ranks)
                 self.densifier.step(self.surfels, self.optimizer, self.generator, unneeded)
-            if self._floaters_due():
-                self._remove_floaters(last=self.iteration == self.config.iterations)
             report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
             return StepReport(*report, self.views_a_step)
 
@@ -255,25 +252,6 @@ class Trainer:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
         key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
         return key._replace(kernels=(key.kernels, self.texture.half_copy_key()))
-
-    def _floaters_due(self) -> bool:
-        """Whether to search for floaters: once densification, which would make others, is over; and at the end."""
-        densify, last = self.densifier.config, self.iteration == self.config.iterations
-        due = last or self.iteration % (FLOATERS_EVERY * densify.every) < self.views_a_step
-        return due and densify.floaters and self.iteration >= densify.stop and any(self._nearest)
-
-    @cached_property
-    def _nearest(self) -> list[float]:
-        # Computed on the first search: it takes a second where photos and points are many.
-        return [nearest_depth(view, self.scene.points) for view in self.scene.train]
-
-    def _remove_floaters(self, last: bool) -> None:
-        # The surfels behind a floater have to be trained: at the end only large ones go, which can hide a whole view.
-        # A generator of its own: a search that finds no floaters changes nothing.
-        cameras = self.views.refined_cameras(self.poses)
-        generator = torch.Generator().manual_seed(self.config.seed ^ self.iteration)
-        chosen = floaters(self.model(), cameras, self._nearest, generator, last=last, ranks=self.ranks)
-        self.densifier.remove(self.surfels, self.optimizer, chosen)
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
