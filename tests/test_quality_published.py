@@ -82,7 +82,9 @@ def test_more_surfels_and_equal_megabytes(tmp_path: Path) -> None:
     assert row[2] == MISSING and row[-1] == "0.30 dB", "a size that was not run is passed over"
     assert rows_of(tables["sizes"])["train"][-1] == MISSING
     rows = rows_of(tables["megabytes"])
-    assert rows["fox"][:3] == ["30.50, 0.8000, 0.2000", "30.25, 0.8000, 0.2000", "+0.25 dB, +0.0000, +0.0000"]
+    peer = "30.25, 0.8000, 0.2000 (exposures, 68,400)"
+    assert rows["fox"][:3] == ["30.50, 0.8000, 0.2000", peer, "+0.25 dB, +0.0000, +0.0000"]
+    assert rows["fox"][4] == peer, "the smaller file is the better one of at most 10 MB, too"
     assert rows["mean"] == ["", "", MISSING] * 2, "two scenes are no mean of four"
     lines += [line(scene, "5 MB", 37_000, 21.0) for scene in ("saharov", "kitchen25")]
     lines += [line(scene, EXPOSED, 68_400, 21.0) for scene in ("saharov", "kitchen25")]
@@ -105,6 +107,9 @@ def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"fox default 40000 seed 0 \(abc\): expected the settings of today, got"):
         of_one_default([read([line("fox", "default", 40_000, 32.0, config="other")], tmp_path / "y.jsonl")])
     assert len(of_one_default([read_results([tmp_path / "y.jsonl"])], older=True)) == 1
+    mixed = [line("fox", "default", 40_000, 32.0, seed, config=config) for seed, config in enumerate(("one", "other"))]
+    with pytest.raises(ValueError, match=r"seed 1 .*: expected the settings of its others, got others"):
+        of_one_default([read(mixed, tmp_path / "m.jsonl")], older=True)
     short = [
         line("fox", "default", 40_000, 32.0, iterations=1000),
         line("fox", "default", 40_000, 3.0, variant="inner"),

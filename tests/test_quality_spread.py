@@ -1,5 +1,6 @@
 """Trainings spread over GPUs: by value, within the time, each result kept at once."""
 
+import dataclasses
 import json
 import sys
 import time
@@ -8,10 +9,20 @@ from pathlib import Path
 import pytest
 
 from benchmarks.quality import spread as module
-from benchmarks.quality.jobs import TrainingJob
+from benchmarks.quality.jobs import TrainingJob, config_of
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import CHANGES, PEERS, ROWS, SUSPECTS
-from benchmarks.quality.spread import command_of, expected_seconds, kind_of, next_job, spread, undone_jobs, wanted_jobs
+from benchmarks.quality.run import config_name
+from benchmarks.quality.spread import (
+    command_of,
+    expected_seconds,
+    kind_of,
+    next_job,
+    of_today,
+    spread,
+    undone_jobs,
+    wanted_jobs,
+)
 
 FAILS, HANGS = 10_000, 20_000  # sizes
 
@@ -47,6 +58,14 @@ def test_the_tables_trainings_come_by_value() -> None:
     quick = next_job(jobs, "ours", even, 100.0)
     assert quick is not None and expected_seconds(quick) < 100 < expected_seconds(jobs[0])
     assert next_job(jobs, "ours", even | {"ours": 1e6}, 1000.0) is None
+
+
+def test_results_of_other_settings_are_trained_anew() -> None:
+    ours, peer = (next(job for job in wanted_jobs() if kind_of(job) == kind) for kind in ("ours", "gsplat"))
+    today = {"config": config_name(config_of(ours, ROWS[ours.row]))}
+    assert of_today(ours, today) and of_today(peer, {})
+    assert not of_today(ours, {"config": "other"}) and not of_today(ours, {})
+    assert not of_today(dataclasses.replace(ours, row="floaters left"), today), "a row that is no more"
 
 
 def test_each_change_is_undone_on_validation_views() -> None:

@@ -103,7 +103,7 @@ def curve(given: argparse.Namespace) -> int:
     if given.commit is None:
         results = read_results(given.results)
     else:
-        results = of_one_default([read_results([file]) for file in given.results], given.commit)
+        results = _of_one_default(given)
     curves = curves_of(results, given.scene, given.metric, given.iterations)
     if not curves:
         print(f"--scene: expected one with results of {given.iterations:,} iterations, got {given.scene}")
@@ -116,8 +116,7 @@ def curve(given: argparse.Namespace) -> int:
 
 def publish(given: argparse.Namespace) -> int:
     """Fill the marked blocks of pages with the tables of one default."""
-    files = [read_results([file]) for file in given.results]
-    results = of_one_default(files, given.commit, given.same.split(",") if given.same else (), given.older)
+    results = _of_one_default(given)
     tables = blocks(results)
     filled = {page: fill(page.read_text(encoding="utf-8"), tables) for page in given.page or ()}
     for page, text in filled.items():
@@ -127,6 +126,11 @@ def publish(given: argparse.Namespace) -> int:
     missing = {name: text.count(MISSING) for name, text in tables.items()}
     print("cells not run: " + ", ".join(f"{name} {count}" for name, count in missing.items() if count))
     return 0
+
+
+def _of_one_default(given: argparse.Namespace) -> Results:
+    files = [read_results([file]) for file in given.results]
+    return of_one_default(files, given.commit, given.same.split(",") if given.same else (), given.older)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -148,7 +152,7 @@ def make_parser() -> argparse.ArgumentParser:
     curves.add_argument("--scene", default="fox", help="default: %(default)s")
     curves.add_argument("--metric", default="flip", choices=METRICS, help="default: %(default)s")
     curves.add_argument("--iterations", type=int, default=30_000, help="default: %(default)s")
-    curves.add_argument("--commit", help="of the default's trainings; default: all of them")
+    _add_default(curves, "all of them")
     curves.add_argument("--out", type=Path, required=True, help="picture to write")
     return parser
 
@@ -158,11 +162,17 @@ def _add_publish(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.set_defaults(run=publish)
     add("results", type=Path, nargs="+")
-    add("--commit", help="of the default's trainings; default: the only one in the results")
-    add("--same", help="comma-separated: further commits whose default computes the same")
-    add("--older", action="store_true", help="the default had other settings then; the page has to say so")
+    _add_default(parser, "the only one in the results")
     add("--page", type=Path, action="append", help="file with lines <!-- results: NAME --> to fill; several times")
     add("--show", help="comma-separated blocks to print: short, readme, peers-40000, peers-10000, sizes, train, ...")
+
+
+def _add_default(parser: argparse.ArgumentParser, commit: str) -> None:
+    """Add the options that name a default."""
+    add = parser.add_argument
+    add("--commit", help=f"of the default's trainings; default: {commit}")
+    add("--same", help="comma-separated: further commits whose default computes the same")
+    add("--older", action="store_true", help="the default had other settings then; the page has to say so")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:

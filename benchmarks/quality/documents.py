@@ -4,15 +4,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 from benchmarks.quality.jobs import CURVE, SCENES
-from benchmarks.quality.published import PEER_NAMES, best_peer, mean, seeds_of
+from benchmarks.quality.published import PEER_NAMES, best_peer, best_peer_file, mean, seeds_of
 from benchmarks.quality.results import Results
 from benchmarks.quality.rows import DEFAULT, MEGABYTES, PAPER, ROWS, SUSPECTS
 
 MISSING = "not run"
 SIZES = (40_000, 10_000)  # of the comparison with gsplat
-BUDGETS = {"5 MB": 0, "10 MB": 1}  # of compact files: our row, and which of gsplat's sizes
+BUDGETS = {"5 MB": 5.0, "10 MB": 10.0}  # of compact files, by our rows
 COUNTS = {row.name: count for row, count in MEGABYTES if row.preset is not None}
-PEER_COUNTS = sorted({count for row, count in MEGABYTES if row.preset is None})
 PUBLISHED = {("train", 400_000): "21.50, 0.802"}  # arXiv:2512.13796, table of Tanks and Temples
 HEADINGS = {
     "gsplat MCMC": "gsplat MCMC as in its example",
@@ -123,16 +122,19 @@ def _train(results: Results) -> str:
 
 def _megabytes(results: Results) -> str:
     lines: list[list[str]] = []
+    shown = set(BUDGETS)
     sums: dict[str, list[list[float]]] = {name: [] for name in BUDGETS}
     for scene in SCENES:
         cells = [scene]
-        for name, place in BUDGETS.items():
+        for name, budget in BUDGETS.items():
             own = seeds_of(results, scene, name, COUNTS[name], part="compact")
-            best = best_peer(results, scene, PEER_COUNTS[place], part="compact")
-            peer = [] if best is None else best[1]
+            best = best_peer_file(results, scene, budget)
+            row, peer = ("", []) if best is None else best
+            shown.add(row.rpartition(", ")[0])
             if own and peer:
                 sums[name].append([mean(own, m) - mean(peer, m) for m in ("psnr", "ssim", "flip")])
-            cells += [figures(own), figures(peer), difference(own, peer)]
+            told = f"{figures(peer)} ({row.removeprefix('gsplat MCMC, ')})" if row else MISSING
+            cells += [figures(own), told, difference(own, peer)]
         lines.append(cells)
     means = ["mean"]
     for name in BUDGETS:
@@ -140,8 +142,7 @@ def _megabytes(results: Results) -> str:
         whole = len(sums[name]) == len(SCENES)  # a mean of some would favour one side
         means += ["", "", f"{each[0]:+.2f} dB, {each[1]:+.4f}, {each[2]:+.4f}" if whole else MISSING]
     header = ["scene", *(f"{n}: {x}" for n in BUDGETS for x in ("nexwarp", "best gsplat", "difference"))]
-    rows = (*BUDGETS, *PEER_NAMES)
-    caption = _measured(results, "megabytes", (*COUNTS.values(), *PEER_COUNTS), rows)
+    caption = _measured(results, "megabytes", {job.size for job in results if job.row in shown}, shown)
     return f"{_table(header, [*lines, means])}\n\n{caption}"
 
 

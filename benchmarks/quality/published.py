@@ -1,4 +1,4 @@
-"""The documents' tables of today's default: which results they may hold, and the blocks of a page that they fill."""
+"""The documents' tables of one default: which results they may hold, and the blocks of a page that they fill."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -29,7 +29,7 @@ def of_one_default(
 
     Raises:
         ValueError: the default's results are of several commits and none is named, there is none of the named commit,
-            or one was trained with other settings than today's.
+            or one was trained with other settings than today's (`older`: than another one of its row and size).
     """
     full = [(job, x) for file in files for job, x in file.items() if job.row in ROWS and _at_full_size(job)]
     own = [(job, x) for job, x in full if _is_default(job)]
@@ -40,10 +40,13 @@ def of_one_default(
     chosen = {job: x for job, x in own if x["commit"] in allowed}
     if commit is not None and not any(x["commit"] == commit for x in chosen.values()):
         raise ValueError(f"--commit: expected one of {', '.join(commits) or 'none'}, got {commit}")
+    digests: dict[tuple[str, int], str | None] = {}
     for job, result in chosen.items():
-        if not older and result.get("config") != config_name(config_of(job, ROWS[job.row])):
+        digest = result.get("config")
+        expected = config_name(config_of(job, ROWS[job.row]))
+        if digest != (digests.setdefault((job.row, job.size), digest) if older else expected):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
-            raise ValueError(f"{told}: expected the settings of today, got others")
+            raise ValueError(f"{told}: expected the settings of {'its others' if older else 'today'}, got others")
     return chosen | {job: x for job, x in full if not _is_default(job)}
 
 
@@ -98,6 +101,16 @@ def best_peer(
     """Return the gsplat row with the best mean PSNR, and its cell as of `seeds_of`; None where there is none."""
     cells = [(name, seeds_of(results, scene, name, size, part=part)) for name in PEER_NAMES]
     return max((pair for pair in cells if pair[1]), key=lambda pair: mean(pair[1], "psnr"), default=None)
+
+
+def best_peer_file(results: Results, scene: str, megabytes: float) -> tuple[str, list[Mapping[str, float]]] | None:
+    """Return the gsplat row and size, and its cell, with the best mean PSNR of compact files of at most a size."""
+    sizes = sorted({job.size for job in results if job.row in PEER_NAMES})
+    named = [
+        (f"{name}, {n:,}", seeds_of(results, scene, name, n, part="compact")) for name in PEER_NAMES for n in sizes
+    ]
+    small = (pair for pair in named if pair[1] and mean(pair[1], "megabytes") <= megabytes)
+    return max(small, key=lambda pair: mean(pair[1], "psnr"), default=None)
 
 
 def mean(found: Collection[Mapping[str, float]], metric: str) -> float:

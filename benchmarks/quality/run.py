@@ -147,6 +147,7 @@ def config_name(config: Config) -> str:
     """Return a digest of settings, whatever the seed; constants that once were settings count, as in older results."""
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"}
     settings["losses"] |= {"poses": POSE_PRIOR}
+    settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 

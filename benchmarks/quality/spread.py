@@ -1,12 +1,13 @@
 """Runs the trainings that the documents' tables need on all GPUs of a machine, in the order of their value.
 
-    python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR [--undone]
+    python -m benchmarks.quality.spread OUT.jsonl --seconds 800 --data DIR [--have FILES] [--undone]
 
 --undone does others in their place: each change of the default undone, judged on validation views.
 
 On each GPU one training of ours, which the GPU limits, runs beside one of gsplat, which the host limits; two beside
 three where CUDA MPS lets kernels of several processes overlap. Seconds are not comparable then. Each result is appended
-to OUT at once. Trainings that OUT holds are passed over, and none is begun that would not end in time.
+to OUT at once. Trainings that OUT or the files of --have hold are passed over, those of our presets only if they had
+today's settings; none is begun that would not end in time.
 """
 
 import argparse
@@ -20,12 +21,14 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from benchmarks.quality.jobs import TrainingJob
+from benchmarks.quality.jobs import TrainingJob, config_of
 from benchmarks.quality.results import drop_unfinished, read_results, result_line
 from benchmarks.quality.rows import CHANGES, DEFAULT, MEGABYTES, PAPER, PEERS, ROWS, SUSPECTS
+from benchmarks.quality.run import config_name
 from benchmarks.timing import ROOT
 
 # Seconds of our training with 40,000 surfels on an H100, roughly; the spread corrects them by what it sees.
@@ -66,7 +69,7 @@ def wanted_jobs() -> list[TrainingJob]:
     wanted = [
         ("train", ours, 400_000, 0),
         *((scene, ours, size, 0) for size in (40_000, 10_000) for scene in SECONDS),
-        *((scene, row.name, size, 0) for row, size in MEGABYTES for scene in SECONDS if row.name != EVEN),
+        *((scene, row.name, size, 0) for row, size in MEGABYTES for scene in SECONDS),
         *(("fox", ours, size, seed) for size in (40_000, 10_000) for seed in (1, 2, 3)),
         # Four test views each, so that one seed cannot tell.
         *((scene, row, 40_000, 1) for scene in few for row in (ours, EXPOSED)),
@@ -92,6 +95,12 @@ def undone_jobs() -> list[TrainingJob]:
     """Return trainings of the default and of each change undone, judged on validation views, by value."""
     names = dict.fromkeys([DEFAULT.name, *UNDONE_FIRST, *(row.name for row in CHANGES if row.name not in NOT_UNDONE)])
     return [TrainingJob(scene, "inner", row, 40_000, 0, 9_000) for row in names for scene in SECONDS]
+
+
+def of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
+    """Whether a result of a known row was trained with today's settings."""
+    row = ROWS.get(job.row)
+    return row is not None and (row.preset is None or result.get("config") == config_name(config_of(job, row)))
 
 
 def kind_of(job: TrainingJob) -> str:
@@ -190,13 +199,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, required=True, help="of wall time")
     parser.add_argument("--undone", action="store_true", help="undo each change of the default, on validation views")
+    parser.add_argument("--have", help="comma-separated: further files of results, such as those of gsplat")
+    parser.add_argument(
+        "--slots", help="of ours and of gsplat's at once on a GPU; default: 2,3 with CUDA MPS, else 1,1"
+    )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
-    have = {}
     if given.out.exists():
         drop_unfinished(given.out)
-        have = read_results([given.out])
+    files = [*([given.out] if given.out.exists() else []), *map(Path, given.have.split(",") if given.have else ())]
+    have = [job for file in files for job, result in read_results([file]).items() if of_today(job, result)]
     jobs = [job for job in (undone_jobs() if given.undone else wanted_jobs()) if job not in have]
+    if given.slots:
+        SLOTS["ours"], SLOTS["gsplat"] = map(int, given.slots.split(","))
     failed = spread(given.out, given.data, given.seconds, torch.cuda.device_count(), jobs)
     print(f"{len(jobs)} trainings were not begun, {failed} have no result")
     return 1 if failed else 0

@@ -13,7 +13,7 @@ ALIKE = math.cos(math.radians(60.0))
 BEYOND = 0.5  # how far beyond either camera a new one may lie, as a share of their distance
 
 
-def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torch.Generator) -> list[Camera]:
+def between(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera]:
     """Draw for each camera a new one on the line through it and a neighbour.
 
     The new camera lies between the two or beyond either by at most half their distance. The neighbour is drawn from the
@@ -23,7 +23,6 @@ def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torc
 
     Args:
         cameras: at least one.
-        reaches: for each camera, the largest distance to its new one, world units, >= 0.
         generator: CPU generator of all random numbers.
 
     Returns:
@@ -43,8 +42,7 @@ def between(cameras: Sequence[Camera], reaches: Sequence[float], generator: torc
     choices = nearest.values.isfinite().sum(dim=1)
     chosen = (drawn * choices).long()[:, None]
     others = nearest.indices.gather(1, chosen)[:, 0].where(choices > 0, torch.arange(len(cameras)))
-    limits = (torch.tensor(reaches, dtype=torch.float64) / nearest.values.gather(1, chosen)[:, 0]).nan_to_num(0.0)
-    places = (places * (1 + 2 * BEYOND) - BEYOND).clamp(-limits, limits)
+    places = places * (1 + 2 * BEYOND) - BEYOND
     turned = Rotation.from_matrix(viewmats[:, :3, :3].numpy())
     turns = (turned[others.numpy()] * turned.inv()).as_rotvec() * places[:, None].numpy()
     rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned).as_matrix())

@@ -124,7 +124,7 @@ def with_auto_exposure(
     generator = torch.Generator().manual_seed(0)
     places: list[Camera] = []
     for _ in range(math.ceil(PLACES / len(cameras))):
-        places += between(cameras, [math.inf] * len(cameras), generator)
+        places += between(cameras, generator)
     places = places[:: -(-len(places) // room)]
     done, count = itertools.count(1), len(cameras) + len(places)
 
