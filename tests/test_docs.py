@@ -54,7 +54,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "depth_jitter": ("", ""),
     "low_pass": ("", ""),
     "order": ("", ""),
-    "clamp_image": ("", "code"),
     "filter_points": ("", ""),
     "orient_points": ("", ""),
     "seed": ("", "code"),

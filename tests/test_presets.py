@@ -18,7 +18,7 @@ def test_paper_is_the_paper():
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert p.more_hits_from == 0
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
-    assert (p.clamp_image, p.filter_points, p.orient_points) == (True, False, False)
+    assert (p.filter_points, p.orient_points) == (False, False)
     assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
     assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
@@ -59,7 +59,7 @@ def test_paper_is_the_paper():
 
 def test_default_prunes_at_the_cap_and_filters_points():
     p = preset("default")
-    assert p == Config() and p.densify.prune_at_cap and p.filter_points and not p.clamp_image
+    assert p == Config() and p.densify.prune_at_cap and p.filter_points
     assert p.texture.min_resolution is None and p.texture.max_resolution is None
     assert p.texture.residual and p.background is None and p.losses.depth > 0
 

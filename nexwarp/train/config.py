@@ -41,7 +41,7 @@ class LearningRates:
     """Learning rate of the plain colours' other SH coefficients."""
     grid: tuple[float, float] = (1e-3, 1e-5)
     """First and last learning rate of the hash grid."""
-    mlp: tuple[float, float] = (1e-3, 1e-4)
+    mlp: tuple[float, float] = (1e-3, 1e-3)
     """First and last learning rate of the MLP."""
 
     def __post_init__(self) -> None:
@@ -132,8 +132,6 @@ class Config:
     order: str = "depth"
     """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
     `distance` by their distance from the camera, for scenes that are shown as panoramas."""
-    clamp_image: bool = False
-    """Limit the rendering to [0, 1] before the loss, as the authors' code does."""
     filter_points: bool = True
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True

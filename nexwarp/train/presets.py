@@ -88,10 +88,8 @@ PRESETS: dict[str, Config] = {
         footprints=False,
         smooth_sh=0.0,
         exposures=False,
-        clamp_image=True,
         filter_points=False,
         orient_points=False,
-        rates=LearningRates(mlp=(1e-3, 1e-3)),
         texture=TextureConfig(
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),

@@ -103,7 +103,7 @@ def step_losses(
     textured, factors = config.max_hits > 0, config.losses
     grid_term = grid_term and textured and factors.grid > 0
     losses = training_losses(
-        image=out.image.clamp(0, 1) if config.clamp_image else out.image,
+        image=out.image.clamp(0, 1),  # as the authors' code does
         textured=out.textured,
         weights=out.weights,
         target=target.photo,
