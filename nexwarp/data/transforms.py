@@ -178,7 +178,9 @@ def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
             raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
         named = f"{images}/{named[7:]}"
     path = folder / named
-    candidates = [path, *(path.with_name(path.name + extension) for extension in EXTENSIONS)]
+    if path.is_file():
+        return path
+    candidates = (path.with_name(path.name + extension) for extension in EXTENSIONS)
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
