@@ -108,7 +108,7 @@ def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
         of_one_default([read([line("fox", "default", 40_000, 32.0, config="other")], tmp_path / "y.jsonl")])
     assert len(of_one_default([read_results([tmp_path / "y.jsonl"])], older=True)) == 1
     mixed = [line("fox", "default", 40_000, 32.0, seed, config=config) for seed, config in enumerate(("one", "other"))]
-    with pytest.raises(ValueError, match=r"seed 1 .*: expected the settings of its others, got others"):
+    with pytest.raises(ValueError, match=r"seed 1 .*: expected the settings of other trainings of the row, got"):
         of_one_default([read(mixed, tmp_path / "m.jsonl")], older=True)
     short = [
         line("fox", "default", 40_000, 32.0, iterations=1000),

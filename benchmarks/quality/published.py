@@ -46,7 +46,9 @@ def of_one_default(
         expected = config_name(config_of(job, ROWS[job.row]))
         if digest != (digests.setdefault((job.row, job.size), digest) if older else expected):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
-            raise ValueError(f"{told}: expected the settings of {'its others' if older else 'today'}, got others")
+            raise ValueError(
+                f"{told}: expected the settings of {'other trainings of the row' if older else 'today'}, got others"
+            )
     return chosen | {job: x for job, x in full if not _is_default(job)}
 
 
@@ -95,11 +97,9 @@ def seeds_of(
     return [found[seed] if part is None else found[seed][part] for seed in sorted(found)]
 
 
-def best_peer(
-    results: Results, scene: str, size: int, part: str | None = None
-) -> tuple[str, list[Mapping[str, float]]] | None:
+def best_peer(results: Results, scene: str, size: int) -> tuple[str, list[Mapping[str, float]]] | None:
     """Return the gsplat row with the best mean PSNR, and its cell as of `seeds_of`; None where there is none."""
-    cells = [(name, seeds_of(results, scene, name, size, part=part)) for name in PEER_NAMES]
+    cells = [(name, seeds_of(results, scene, name, size)) for name in PEER_NAMES]
     return max((pair for pair in cells if pair[1]), key=lambda pair: mean(pair[1], "psnr"), default=None)
 
 

@@ -36,7 +36,7 @@ SECONDS = {"kitchen25": 250, "train": 220, "fox": 120, "saharov": 140}
 PEER_SECONDS = 230
 PAPER_SLOWER = 1.4  # its table of 2^20 entries
 MPS = "CUDA_MPS_PIPE_DIRECTORY" in os.environ
-SLOTS = {"ours": 2 if MPS else 1, "gsplat": 3 if MPS else 1}  # trainings at once on a GPU
+SLOTS = {"ours": 2 if MPS else 1, "gsplat": 3 if MPS else 1}  # trainings at once on a GPU, by default
 EXPOSED, EVEN = PEERS[2].name, PEERS[3].name
 # The changes about which short and small runs say least.
 UNDONE_FIRST = ("no depth jitter", "no filter of points", "no exposures")
@@ -132,10 +132,12 @@ def command_of(job: TrainingJob, data: Path, out: Path) -> list[str]:
     return [*command, "--data", str(data), "--out", str(out)]
 
 
-def spread(out: Path, data: Path, seconds: float, gpus: int, jobs: list[TrainingJob]) -> int:
+def spread(
+    out: Path, data: Path, seconds: float, gpus: int, jobs: list[TrainingJob], slots: Mapping[str, int] = SLOTS
+) -> int:
     """Run the jobs; return how many ended without a result, those that were cut off included."""
     end, failed = time.monotonic() + seconds, 0
-    slowness = {"ours": 1.15 if SLOTS["ours"] == 1 else 0.9 * SLOTS["ours"], "gsplat": 1.1}
+    slowness = {"ours": 1.15 if slots["ours"] == 1 else 0.9 * slots["ours"], "gsplat": 1.1}
     running: list[Running] = []
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -144,8 +146,8 @@ def spread(out: Path, data: Path, seconds: float, gpus: int, jobs: list[Training
                     running.remove(one)
                     failed += not _collect(one, out, slowness)
                 for gpu in range(gpus):
-                    for kind, slots in SLOTS.items():
-                        while sum(x.gpu == gpu and kind_of(x.job) == kind for x in running) < slots:
+                    for kind, most in slots.items():
+                        while sum(x.gpu == gpu and kind_of(x.job) == kind for x in running) < most:
                             job = next_job(jobs, kind, slowness, left)
                             if job is None:
                                 break
@@ -191,6 +193,14 @@ def _collect(one: Running, out: Path, slowness: dict[str, float]) -> bool:
     return True
 
 
+def _slots(text: str) -> dict[str, int]:
+    try:
+        ours, gsplat = map(int, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected two numbers such as 2,3, got {text}") from None
+    return {"ours": ours, "gsplat": gsplat}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -201,7 +211,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--undone", action="store_true", help="undo each change of the default, on validation views")
     parser.add_argument("--have", help="comma-separated: further files of results, such as those of gsplat")
     parser.add_argument(
-        "--slots", help="of ours and of gsplat's at once on a GPU; default: 2,3 with CUDA MPS, else 1,1"
+        "--slots",
+        type=_slots,
+        default=SLOTS,
+        metavar="OURS,GSPLAT",
+        help="trainings at once on a GPU; default: 2,3 with CUDA MPS, else 1,1",
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
@@ -210,9 +224,7 @@ def main(arguments: list[str] | None = None) -> int:
     files = [*([given.out] if given.out.exists() else []), *map(Path, given.have.split(",") if given.have else ())]
     have = [job for file in files for job, result in read_results([file]).items() if of_today(job, result)]
     jobs = [job for job in (undone_jobs() if given.undone else wanted_jobs()) if job not in have]
-    if given.slots:
-        SLOTS["ours"], SLOTS["gsplat"] = map(int, given.slots.split(","))
-    failed = spread(given.out, given.data, given.seconds, torch.cuda.device_count(), jobs)
+    failed = spread(given.out, given.data, given.seconds, torch.cuda.device_count(), jobs, given.slots)
     print(f"{len(jobs)} trainings were not begun, {failed} have no result")
     return 1 if failed else 0
 
