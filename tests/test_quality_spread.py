@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -87,6 +88,10 @@ def test_results_are_kept_failures_told_and_the_rest_cut_off(
     script.write_text(STAND_IN)
     monkeypatch.setattr(module, "command_of", lambda *given: [sys.executable, str(script), *real(*given)[4:]])
     monkeypatch.setattr(module, "expected_seconds", lambda job: 0.5)
+    built, building = tmp_path / "built", "import time, pathlib; time.sleep(2); pathlib.Path({!r}).touch()"
+    monkeypatch.setattr(
+        module, "_build_gsplat", lambda: subprocess.Popen([sys.executable, "-c", building.format(str(built))])
+    )
     sizes = (40_000, FAILS, HANGS, 5_000)
     jobs = [TrainingJob("fox", "", "default", size, 0, 30_000) for size in sizes]
     jobs.append(TrainingJob("fox", "", module.EXPOSED, 40_000, 0, 30_000))
@@ -95,6 +100,8 @@ def test_results_are_kept_failures_told_and_the_rest_cut_off(
     assert spread(out, tmp_path, 6.0, 2, [*jobs]) == 2
     assert time.monotonic() - begun < 20
     assert set(read_results([out])) == {jobs[0], jobs[3], jobs[4]}
-    assert all(json.loads(line)["psnr"] == 30.0 for line in out.read_text().splitlines())
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
+    assert all(line["psnr"] == 30.0 for line in lines)
+    assert lines[-1]["row"] == module.EXPOSED and built.exists(), "gsplat begins once it is built"
     told = capsys.readouterr().out
     assert "failed: fox default 10000: no memory" in told and "cut off: fox default 20000" in told

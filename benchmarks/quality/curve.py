@@ -30,12 +30,13 @@ def curves_of(results: Results, scene: str, metric: str, iterations: int) -> Cur
 
 
 def draw_curves(curves: Curves, scene: str, metric: str, file: Path) -> None:
-    """Save a picture of curves; needs matplotlib."""
+    """Save a picture of the curves that have several points; needs matplotlib."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    curves = {name: points for name, points in curves.items() if len(points) > 1}
     figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
     for name, points in curves.items():
         sizes, means, spreads = zip(*points, strict=True)
@@ -45,7 +46,7 @@ def draw_curves(curves: Curves, scene: str, metric: str, file: Path) -> None:
     better = "lower is better" if metric in ("flip", "lpips") else "higher is better"
     axes.set(xscale="log", xlabel="primitives", ylabel=f"{UNITS[metric]}, {better}")
     axes.set_title(f"{scene}, test views; bars: standard deviation over seeds", fontsize="medium")
-    axes.set_xticks(ticks, [f"{size // 1000}K" for size in ticks])
+    axes.set_xticks(ticks, [f"{size / 1000:.0f}K" for size in ticks])
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.legend()

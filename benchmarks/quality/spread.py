@@ -7,7 +7,7 @@
 On each GPU one training of ours, which the GPU limits, runs beside one of gsplat, which the host limits; two beside
 three where CUDA MPS lets kernels of several processes overlap. Seconds are not comparable then. Each result is appended
 to OUT at once. Trainings that OUT or the files of --have hold are passed over, those of our presets only if they had
-today's settings; none is begun that would not end in time.
+today's settings; none is begun that would not end in time. gsplat's trainings begin once its extension is built.
 """
 
 import argparse
@@ -139,29 +139,39 @@ def spread(
     end, failed = time.monotonic() + seconds, 0
     slowness = {"ours": 1.15 if slots["ours"] == 1 else 0.9 * slots["ours"], "gsplat": 1.1}
     running: list[Running] = []
+    builder = _build_gsplat() if slots["gsplat"] and any(kind_of(job) == "gsplat" for job in jobs) else None
     with tempfile.TemporaryDirectory() as folder:
         try:
             while (left := end - time.monotonic()) > 0:
                 for one in [x for x in running if x.process.poll() is not None]:
                     running.remove(one)
                     failed += not _collect(one, out, slowness)
+                building = builder is not None and builder.poll() is None
+                open_slots = {kind: most for kind, most in slots.items() if kind != "gsplat" or not building}
                 for gpu in range(gpus):
-                    for kind, most in slots.items():
+                    for kind, most in open_slots.items():
                         while sum(x.gpu == gpu and kind_of(x.job) == kind for x in running) < most:
                             job = next_job(jobs, kind, slowness, left)
                             if job is None:
                                 break
                             jobs.remove(job)
                             running.append(_begin(job, gpu, data, Path(tempfile.mkdtemp(dir=folder))))
-                if not running:
+                if not running and not building:
                     break
                 time.sleep(0.5)
         finally:
+            if builder is not None:
+                builder.kill()
             for one in running:
                 os.killpg(one.process.pid, signal.SIGKILL)
                 one.process.wait()
                 print(f"cut off: {one.job.scene} {one.job.row} {one.job.size}", flush=True)
     return failed + len(running)
+
+
+def _build_gsplat() -> subprocess.Popen[bytes]:
+    # Several trainings that build it at once delete each other's files.
+    return subprocess.Popen([sys.executable, "-c", "import gsplat.cuda._backend"], stdout=subprocess.DEVNULL)
 
 
 def _begin(job: TrainingJob, gpu: int, data: Path, folder: Path) -> Running:
