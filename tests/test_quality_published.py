@@ -92,6 +92,18 @@ def test_more_surfels_and_equal_megabytes(tmp_path: Path) -> None:
     assert rows["mean"] == ["", "", "+0.00 dB, +0.0000, +0.0000", "", "", MISSING]
 
 
+def test_gsplat_with_our_seconds_stands_beside_us(tmp_path: Path) -> None:
+    today = line("fox", "default", 40_000, 32.5, seconds=94.2)
+    lines = [line("fox", "default", 40_000, 31.0, 1, config="other"), today, line("saharov", "default", 40_000, 22.0)]
+    lines += [line("fox", EXPOSED, 40_000, 30.0 + n / 1000, iterations=n, seconds=n / 150) for n in (1000, 3000)]
+    lines += [line("fox", EXPOSED, 40_000, 32.0, iterations=14_500, seconds=93.7)]
+    table = blocks({}, read(lines, tmp_path / "x.jsonl"))["seconds"]
+    own, peer = "32.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1000 (exposures, 14,500)"
+    assert rows_of(table)["fox"] == ["94 s", own, "94 s", peer, "+0.50 dB, +0.0000, +0.0000"]
+    assert rows_of(table)["saharov"] == rows_of(blocks({})["seconds"])["fox"] == [MISSING] * 5
+    assert table.endswith("*Measured by* `python -m benchmarks.quality.equal_seconds`: H200; 2026-11-25; abc.")
+
+
 def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
     lines = [line("fox", "default", 40_000, 32.0), line("saharov", "default", 40_000, 22.0, commit="def")]
     results = read([*lines, line("fox", "paper", 40_000, 31.0, commit="ghi")], tmp_path / "x.jsonl")

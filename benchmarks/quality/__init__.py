@@ -5,6 +5,7 @@
     python -m benchmarks.quality curve results.jsonl --scene fox --out curve.png
     python -m benchmarks.quality publish results.jsonl --commit HASH --page docs/quality.md
     python -m benchmarks.quality.spread results.jsonl --seconds 800 --data DIR
+    python -m benchmarks.quality.equal_seconds results.jsonl --data DIR
     python -m benchmarks.quality train --tables demo --seeds 0 --pictures DIR --out demo.jsonl
     python -m benchmarks.quality train --tables changes --variant inner --out inner.jsonl
 

@@ -117,7 +117,7 @@ def curve(given: argparse.Namespace) -> int:
 def publish(given: argparse.Namespace) -> int:
     """Fill the marked blocks of pages with the tables of one default."""
     results = _of_one_default(given)
-    tables = blocks(results)
+    tables = blocks(results, read_results([given.alone]) if given.alone else None)
     filled = {page: fill(page.read_text(encoding="utf-8"), tables) for page in given.page or ()}
     for page, text in filled.items():
         page.write_text(text, encoding="utf-8")
@@ -163,6 +163,7 @@ def _add_publish(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=publish)
     add("results", type=Path, nargs="+")
     _add_default(parser, "the only one in the results")
+    add("--alone", type=Path, help="results of benchmarks.quality.equal_seconds, for its table")
     add("--page", type=Path, action="append", help="file with lines <!-- results: NAME --> to fill; several times")
     add("--show", help="comma-separated blocks to print: short, readme, peers-40000, peers-10000, sizes, train, ...")
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 from benchmarks.quality.jobs import CURVE, SCENES
-from benchmarks.quality.published import PEER_NAMES, best_peer, best_peer_file, mean, seeds_of
+from benchmarks.quality.published import PEER_NAMES, best_peer, best_peer_file, equal_seconds, mean, seeds_of
 from benchmarks.quality.results import Results
 from benchmarks.quality.rows import DEFAULT, MEGABYTES, PAPER, ROWS, SUSPECTS
 
@@ -24,12 +24,17 @@ HEADINGS = {
 Cell = Sequence[Mapping[str, float]]
 
 
-def blocks(results: Results) -> dict[str, str]:
-    """Return the Markdown of each block, from results `of_one_default`."""
+def blocks(results: Results, alone: Results | None = None) -> dict[str, str]:
+    """Return the Markdown of each block.
+
+    Args:
+        results: as of `of_one_default`.
+        alone: results of trainings that were alone on their GPU, whose seconds count.
+    """
     found = {f"peers-{size}": _peers(results, size) for size in SIZES}
     found |= {"sizes": _sizes(results), "train": _train(results), "megabytes": _megabytes(results)}
     found |= {"suspects": _suspects(results), "short": _short(results), "readme": _readme(results)}
-    return found
+    return found | {"seconds": _equal_seconds(alone or {})}
 
 
 def figures(found: Cell) -> str:
@@ -144,6 +149,24 @@ def _megabytes(results: Results) -> str:
     header = ["scene", *(f"{n}: {x}" for n in BUDGETS for x in ("nexwarp", "best gsplat", "difference"))]
     caption = _measured(results, "megabytes", {job.size for job in results if job.row in shown}, shown)
     return f"{_table(header, [*lines, means])}\n\n{caption}"
+
+
+def _equal_seconds(alone: Results) -> str:
+    lines, shown = [], []
+    for scene in SCENES:
+        found = equal_seconds(alone, scene)
+        if found is None:
+            lines.append([scene, *[MISSING] * 5])
+            continue
+        own, job, peer = found
+        shown += [own, peer]
+        told = f"{figures([peer])} ({job.row.removeprefix('gsplat MCMC, ')}, {job.iterations:,})"
+        cells = [f"{own['seconds']:.0f} s", figures([own]), f"{peer['seconds']:.0f} s", told, difference([own], [peer])]
+        lines.append([scene, *cells])
+    header = ["scene", "nexwarp", "30,000 iterations", "gsplat", "row, iterations", "difference"]
+    named = "; ".join(" and ".join(sorted({str(x[key]) for x in shown})) for key in ("device", "date", "commit"))
+    caption = f"*{'Measured' if shown else 'To be measured'} by* `python -m benchmarks.quality.equal_seconds`"
+    return f"{_table(header, lines)}\n\n{caption}{': ' * bool(shown)}{named}."
 
 
 def _suspects(results: Results) -> str:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
 from benchmarks.quality.jobs import TrainingJob, config_of
 from benchmarks.quality.results import Results
@@ -11,6 +12,7 @@ from benchmarks.quality.run import config_name
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) -->\n)(.*?)(<!-- end of results -->)", re.DOTALL)
 PEER_NAMES = tuple(row.name for row in PEERS)
 ITERATIONS = 30_000
+SIZE = 40_000  # of the comparison by seconds
 
 
 def of_one_default(
@@ -111,6 +113,29 @@ def best_peer_file(results: Results, scene: str, megabytes: float) -> tuple[str,
     ]
     small = (pair for pair in named if pair[1] and mean(pair[1], "megabytes") <= megabytes)
     return max(small, key=lambda pair: mean(pair[1], "psnr"), default=None)
+
+
+def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], TrainingJob, Mapping[str, Any]] | None:
+    """Return the default's result of `benchmarks.quality.equal_seconds`, then the job and result of gsplat beside it.
+
+    gsplat's training is the longest one that has fewer than 30,000 iterations. None where one of the two is missing, or
+    the default had other settings than today's.
+
+    Args:
+        alone: results of trainings that were alone on their GPU.
+        scene: of the two.
+    """
+    at_size = {job: x for job, x in alone.items() if (job.scene, job.size, job.variant) == (scene, SIZE, "")}
+    own = [x for job, x in at_size.items() if job.row == DEFAULT.name and _of_today(job, x)]
+    peers = [job for job in at_size if job.row in PEER_NAMES and job.iterations < ITERATIONS]
+    if not own or not peers:
+        return None
+    longest = max(peers, key=lambda job: job.iterations)
+    return own[-1], longest, at_size[longest]
+
+
+def _of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
+    return result.get("config") == config_name(config_of(job, ROWS[job.row]))
 
 
 def mean(found: Collection[Mapping[str, float]], metric: str) -> float:
