@@ -17,7 +17,8 @@ HEADINGS = {
     "gsplat MCMC": "gsplat MCMC as in its example",
     "gsplat MCMC, background": "and background",
     "gsplat MCMC, exposures": "and background, exposures",
-    "gsplat MCMC, even start": "and background, exposures, initial points",
+    "gsplat MCMC, even start": "and background, exposures, points of our cloud",
+    "gsplat MCMC, skybox": "and background, exposures, all our initial points",
     "gsplat default": "gsplat default, background",
     "gsplat 2DGS": "gsplat 2DGS, background",
 }
