@@ -61,6 +61,8 @@ def test_points_are_where_photos_show_the_sphere(scene: Scene) -> None:
     torch.testing.assert_close(points.normals, (centre - points.means) / radius, rtol=0, atol=1e-5)
     nearest = torch.cdist(points.means, points.means).fill_diagonal_(9e9).min(dim=1).values
     torch.testing.assert_close(2 * points.scales, nearest, rtol=0.3, atol=0)
+    few = skybox_points(scene.train, scene.points, 3)
+    assert len(few.means) == 3, "those left out are of all directions"
     for point, color in list(zip(points.means, points.colors, strict=True))[::10]:
         pixels = [
             scene.train[view].image[row, column].double() / 255 for view, row, column in seen_pixels(scene, point)
@@ -98,6 +100,8 @@ def test_masked_pixels_show_nothing(scene: Scene) -> None:
     assert 0 < len(points.means) <= 100
     assert all(any(row < half for _, row, _ in seen_pixels(scene, point)) for point in points.means)
     assert len(skybox_points(masked(0), scene.points, 100).means) == 0
+    alone = scene.train[:1]
+    assert len(skybox_points(alone, alone[0].camera.position[None], 100).means) == 0, "a sphere without extent"
     with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
         skybox_points(scene.train, scene.points, 0)
 

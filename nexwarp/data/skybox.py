@@ -15,6 +15,7 @@ from nexwarp.data.views import View
 RADIUS = 2.0  # of the sphere, in units of the distance that nearly all points have from the cameras' mean
 NEARLY_ALL = 0.99
 SAMPLES = 4096  # directions by which the seen share of the sphere is estimated
+LEAST_SHARE = 1 / 64  # where photos show less of the sphere than this, there are fewer points
 MOST_VIEWS = 256  # that are asked, evenly chosen
 
 
@@ -28,11 +29,14 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     Args:
         views: training views; at least one.
         points: (P, 3) of the scene, world frame; P >= 1.
-        count: roughly the number of points.
+        count: roughly the number of points, 1 or more.
 
     Returns:
         At most `count` points, none if no photo shows any. Normals point to the cameras' mean; a scale is half the
         distance between neighbours.
+
+    Raises:
+        ValueError: `count` is below 1.
     """
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")
@@ -43,10 +47,11 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     reach = (points.double() - centre).norm(dim=1).sort().values[int(NEARLY_ALL * (len(points) - 1))]
     radius = RADIUS * torch.maximum(reach, (positions - centre).norm(dim=1).max())
     share = (_colors(judges, centre + radius * directions(SAMPLES))[1] > 0).double().mean().item()
-    total = math.ceil(count / max(share, 1 / SAMPLES))
+    total = math.ceil(count / max(share, LEAST_SHARE))
     towards = directions(total)
     sums, seen = _colors(judges, centre + radius * towards)
-    kept = (seen > 0).nonzero()[:count, 0]
+    kept = (seen > 0).nonzero()[:, 0]
+    kept = kept[torch.linspace(0, len(kept) - 1, min(count, len(kept))).round().long()]  # left out all over the sphere
     spacing = radius * math.sqrt(4 * math.pi / total)
     return InitialPoints(
         means=(centre + radius * towards[kept]).float(),
