@@ -39,7 +39,7 @@ MPS = "CUDA_MPS_PIPE_DIRECTORY" in os.environ
 SLOTS = {"ours": 2 if MPS else 1, "gsplat": 3 if MPS else 1}  # trainings at once on a GPU, by default
 EXPOSED, EVEN, SKY = (row.name for row in PEERS[2:5])
 # The changes about which short and small runs say least.
-UNDONE_FIRST = ("no depth jitter", "no filter of points", "no exposures")
+UNDONE_FIRST = ("no skybox", "no depth jitter", "no filter of points", "no exposures")
 # Detail limits and SH smoothing show in other views than these; the paper's table is a matter of the file's size.
 NOT_UNDONE = ("no footprints", "no SH smoothing", "paper's table")
 
