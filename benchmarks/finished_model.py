@@ -83,7 +83,8 @@ def reduced(image: RenderImage) -> Callable[[Camera, int], torch.Tensor]:
     """Return a function that renders at full size and reduces the rendering by area."""
 
     def render(camera: Camera, factor: int) -> torch.Tensor:
-        return torch.nn.functional.avg_pool2d(image(camera).permute(2, 0, 1), factor).permute(1, 2, 0)
+        pooled = torch.nn.functional.avg_pool2d(image(camera).permute(2, 0, 1), factor)
+        return pooled.permute(1, 2, 0).contiguous()  # as a rendering lies: sums over pixels round alike
 
     return render
 
