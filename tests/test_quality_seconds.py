@@ -31,7 +31,9 @@ class Stand:
         return 0
 
 
-def test_gsplat_trains_for_our_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_trains_for_our_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert tuple(BEST) == SCENES and set(BEST.values()) <= set(PEER_NAMES)
     monkeypatch.setattr(module, "Schedule", Stand)
     out = tmp_path / "out.jsonl"
@@ -42,6 +44,9 @@ def test_gsplat_trains_for_our_seconds(tmp_path: Path, monkeypatch: pytest.Monke
     assert done[:4] == [("fox", "default", 30_000), *(("fox", BEST["fox"], n) for n in (1_000, 3_000, 14_500))]
     with pytest.raises(RuntimeError, match=r"saharov.*: expected a result, got none"):
         main([str(out), "--scenes", "saharov"])
+    with pytest.raises(SystemExit):
+        main([str(out), "--scenes", "fox,garden"])
+    assert "--scenes: expected some of train, fox, saharov, kitchen25, got garden" in capsys.readouterr().err
 
 
 def test_as_many_iterations_as_fit_the_seconds() -> None:

@@ -70,9 +70,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scenes", default=",".join(SCENES), help="default: %(default)s")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
+    scenes = given.scenes.split(",")
+    if unknown := [scene for scene in scenes if scene not in BEST]:
+        parser.error(f"--scenes: expected some of {', '.join(BEST)}, got {', '.join(unknown)}")
     if given.out.exists():
         drop_unfinished(given.out)
-    for scene in given.scenes.split(","):
+    for scene in scenes:
         train_scene(scene, given.data, given.out)
 
 
