@@ -221,6 +221,12 @@ def _check_intrinsics(intrinsics: torch.Tensor) -> None:
         raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")
 
 
+def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """Return (M,) bool: which points project into an image; the arguments are those of `visible_points`."""
+    size = torch.tensor([width, height], device=pixels.device)
+    return (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+
+
 def visible_points(
     pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
@@ -236,8 +242,7 @@ def visible_points(
     Returns:
         Indices (P,) int64 of the points' pixels, row-major, and z-depths (P,); None if there are no such points.
     """
-    size = torch.tensor([width, height], device=pixels.device)
-    inside = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+    inside = in_image(pixels, depths, width, height)
     column, row = pixels[inside].long().unbind(-1)
     places, expected = row * width + column, depths[inside]
     if mask is not None:

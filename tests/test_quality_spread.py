@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.quality import spread as module
 from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.published import of_today
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import CHANGES, PEERS, ROWS, SUSPECTS
 from benchmarks.quality.run import config_name
@@ -19,7 +20,6 @@ from benchmarks.quality.spread import (
     expected_seconds,
     kind_of,
     next_job,
-    of_today,
     spread,
     undone_jobs,
     wanted_jobs,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.data import Scene
+from nexwarp.data import Scene, skybox
 from nexwarp.data.skybox import directions, skybox_points
 from nexwarp.train.initial import initial_surfels
 from tests.reference.collect import rotations
@@ -61,14 +61,22 @@ def test_points_are_where_photos_show_the_sphere(scene: Scene) -> None:
     torch.testing.assert_close(points.normals, (centre - points.means) / radius, rtol=0, atol=1e-5)
     nearest = torch.cdist(points.means, points.means).fill_diagonal_(9e9).min(dim=1).values
     torch.testing.assert_close(2 * points.scales, nearest, rtol=0.3, atol=0)
-    few = skybox_points(scene.train, scene.points, 3)
-    assert len(few.means) == 3, "those left out are of all directions"
     for point, color in list(zip(points.means, points.colors, strict=True))[::10]:
         pixels = [
             scene.train[view].image[row, column].double() / 255 for view, row, column in seen_pixels(scene, point)
         ]
         assert pixels, "no photo shows it"
         torch.testing.assert_close(color.double(), torch.stack(pixels).mean(0), rtol=0, atol=1e-6)
+
+
+def test_no_side_is_left_out(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With an estimate of the seen share that is too low, more points are seen than asked for."""
+    quarters = torch.tensor([0.25, 0.5, 0.75])
+    heights = skybox_points(scene.train, scene.points, 1000).normals[:, 2].quantile(quarters)
+    monkeypatch.setattr(skybox, "SAMPLES", 8)  # 3 of them are seen, but 477 of 1,000
+    found = skybox_points(scene.train, scene.points, 1000)
+    assert len(found.means) == 1000
+    torch.testing.assert_close(found.normals[:, 2].quantile(quarters), heights, rtol=0, atol=0.01)
 
 
 def test_cameras_are_inside(scene: Scene) -> None:

@@ -40,6 +40,7 @@ TABLES = (
     "frames",
     "demo",
 )
+SIZE, ITERATIONS = 40_000, 30_000  # of a training at full size
 CURVE = (5_000, 10_000, 20_000, 40_000, 100_000)
 
 

@@ -4,15 +4,13 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.jobs import ITERATIONS, SIZE, TrainingJob, config_of
 from benchmarks.quality.results import Results
 from benchmarks.quality.rows import DEFAULT, PEERS, ROWS
 from benchmarks.quality.run import config_name
 
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) -->\n)(.*?)(<!-- end of results -->)", re.DOTALL)
 PEER_NAMES = tuple(row.name for row in PEERS)
-ITERATIONS = 30_000
-SIZE = 40_000  # of the comparison by seconds
 
 
 def of_one_default(
@@ -126,7 +124,7 @@ def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], Traini
         scene: of the two.
     """
     at_size = {job: x for job, x in alone.items() if (job.scene, job.size, job.variant) == (scene, SIZE, "")}
-    own = [x for job, x in at_size.items() if job.row == DEFAULT.name and _of_today(job, x)]
+    own = [x for job, x in at_size.items() if job.row == DEFAULT.name and of_today(job, x)]
     peers = [job for job in at_size if job.row in PEER_NAMES and job.iterations < ITERATIONS]
     if not own or not peers:
         return None
@@ -134,8 +132,10 @@ def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], Traini
     return own[-1], longest, at_size[longest]
 
 
-def _of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
-    return result.get("config") == config_name(config_of(job, ROWS[job.row]))
+def of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
+    """Whether a result of a known row was trained with today's settings; of gsplat's rows each is."""
+    row = ROWS.get(job.row)
+    return row is not None and (row.preset is None or result.get("config") == config_name(config_of(job, row)))
 
 
 def mean(found: Collection[Mapping[str, float]], metric: str) -> float:

@@ -21,14 +21,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.jobs import TrainingJob
+from benchmarks.quality.published import of_today
 from benchmarks.quality.results import drop_unfinished, read_results, result_line
 from benchmarks.quality.rows import CHANGES, DEFAULT, MEGABYTES, PAPER, PEERS, ROWS, SUSPECTS
-from benchmarks.quality.run import config_name
 from benchmarks.timing import ROOT
 
 # Seconds of our training with 40,000 surfels on an H100, roughly; the spread corrects them by what it sees.
@@ -96,12 +95,6 @@ def undone_jobs() -> list[TrainingJob]:
     """Return trainings of the default and of each change undone, judged on validation views, by value."""
     names = dict.fromkeys([DEFAULT.name, *UNDONE_FIRST, *(row.name for row in CHANGES if row.name not in NOT_UNDONE)])
     return [TrainingJob(scene, "inner", row, 40_000, 0, 9_000) for row in names for scene in SECONDS]
-
-
-def of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
-    """Whether a result of a known row was trained with today's settings."""
-    row = ROWS.get(job.row)
-    return row is not None and (row.preset is None or result.get("config") == config_name(config_of(job, row)))
 
 
 def kind_of(job: TrainingJob) -> str:

@@ -1,7 +1,7 @@
-"""Points on a sphere around the scene, where surfels of backgrounds start that have no points. Not in the paper.
+"""Points on a sphere around the scene, where the surfels of a background start. Not in the paper.
 
-Structure from motion finds no points in sky, in blurred backgrounds and on what few photos show. Surfels come there by
-splits of those that are too near, or the background colour is left visible. Seen from a held-out view, both are wrong.
+Structure from motion finds few points in sky and in blurred backgrounds. Without surfels there, the background colour
+shows, or surfels that are too near stretch over it. Both are wrong in a held-out view.
 """
 
 import math
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 
+from nexwarp.camera import in_image
 from nexwarp.data.points import InitialPoints
 from nexwarp.data.views import View
 
@@ -76,8 +77,7 @@ def _colors(views: Sequence[View], points: torch.Tensor) -> tuple[torch.Tensor, 
     for view in views:
         camera = view.camera
         pixels, depths = camera.project(points.float())
-        size = torch.tensor([camera.width, camera.height])
-        inside = ((depths > camera.near) & ((pixels >= 0) & (pixels < size)).all(dim=1)).nonzero()[:, 0]
+        inside = in_image(pixels, depths, camera.width, camera.height).nonzero()[:, 0]
         column, row = pixels[inside].long().unbind(1)
         if view.mask is not None:
             used = view.mask[row, column]

@@ -137,8 +137,8 @@ class Config:
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
     skybox: float = 0.16
-    """Share of the initial surfels that start on a sphere around the scene, for backgrounds without points: sky, and
-    what is far or blurred. None do where photos are transparent."""
+    """Share of the initial surfels that start on a sphere around the scene, for backgrounds with few points: sky, and
+    what is far or blurred. It counts as 0 where photos are transparent."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False

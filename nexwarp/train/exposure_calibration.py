@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.camera import Camera, in_image
 from nexwarp.data import Scene
 from nexwarp.representation.exposures import (
     DECIMALS,
@@ -241,8 +241,7 @@ def observations(
     masks = [None] * len(cameras) if masks is None else masks
     for index, (camera, photo, seen, mask) in enumerate(zip(cameras, photos, points, masks, strict=True)):
         pixels, depths = camera.project(seen)
-        inside = (depths > 0) & (pixels >= 0).all(1)
-        inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        inside = in_image(pixels, depths, camera.width, camera.height)
         column, row = pixels[inside].long().unbind(1)
         color = photo[row, column]
         usable = (color >= CLIPPED[0]).all(1) & (color <= CLIPPED[1]).all(1)
