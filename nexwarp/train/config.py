@@ -136,9 +136,6 @@ class Config:
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
-    skybox: float = 0.16
-    """Share of the initial surfels that start on a sphere around the scene, for backgrounds with few points: sky, and
-    what is far or blurred. It counts as 0 where photos are transparent."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
@@ -162,7 +159,6 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
-        check_range("skybox", self.skybox, 0.0, 0.9)
         check_range("sh_every", self.sh_every, 1)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
