@@ -56,6 +56,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "order": ("", ""),
     "filter_points": ("", ""),
     "orient_points": ("", ""),
+    "skybox": ("", ""),
     "seed": ("", "code"),
     "deterministic": ("", ""),
     "cuda_graphs": ("", ""),

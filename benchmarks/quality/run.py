@@ -144,8 +144,14 @@ def file_name(job: TrainingJob) -> str:
 
 
 def config_name(config: Config) -> str:
-    """Return a digest of settings, whatever the seed; constants that once were settings count, as in older results."""
+    """Return a digest of settings, whatever the seed.
+
+    It is that of older results: constants that once were settings count, and a setting that was added does not where it
+    is off.
+    """
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"} | {"clamp_image": True}
+    if not config.skybox:
+        del settings["skybox"]
     settings["losses"] |= {"poses": POSE_PRIOR}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}

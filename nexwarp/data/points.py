@@ -1,5 +1,6 @@
 """The initial points of a training: sparse points without outliers, in an even distribution, with sizes."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,11 @@ class InitialPoints:
     colors: torch.Tensor
     scales: torch.Tensor
     normals: torch.Tensor
+
+    def joined(self, other: "InitialPoints") -> "InitialPoints":
+        """Return these points, followed by others."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return InitialPoints(**{name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names})
 
 
 def initial_points(

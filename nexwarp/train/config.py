@@ -136,6 +136,9 @@ class Config:
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
+    skybox: int = 100
+    """Number of initial surfels on a sphere around the scene, for backgrounds with few points: sky, and what is far or
+    blurred. They are a sixth of the initial surfels at most, and none where photos are transparent."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
@@ -159,6 +162,7 @@ class Config:
         check_range("sh_degree", self.sh_degree, 0, 3)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
+        check_range("skybox", self.skybox, 0)
         check_range("sh_every", self.sh_every, 1)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)

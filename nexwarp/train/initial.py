@@ -5,7 +5,8 @@ import math
 import numpy as np
 import torch
 
-from nexwarp.data import Scene, View, initial_points
+from nexwarp.data import InitialPoints, Scene, View, initial_points
+from nexwarp.data.skybox import skybox_points
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.representation.poses import PoseCorrections
@@ -18,13 +19,14 @@ INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 FIRST_BLUR = 0.5  # standard deviation of the first motions, pixels for each of their six numbers
+SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
 
 def initial_surfels(
     scene: Scene, config: Config, generator: torch.Generator, colors: torch.Tensor | None = None
 ) -> Surfels:
-    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 4.3).
+    """Surfels on the `starting_points`: half the budget at most (paper Sec. 4.3).
 
     Args:
         scene: its P points are taken.
@@ -32,14 +34,8 @@ def initial_surfels(
         generator: of random rotations, on the CPU.
         colors: (P, 3) colours of the points; None takes the scene's.
     """
-    points = initial_points(
-        scene.points,
-        scene.colors if colors is None else colors,
-        max(config.max_surfels // 2, 1),
-        track_lengths=scene.track_lengths,
-        errors=scene.reprojection_errors,
-        filter_outliers=config.filter_points,
-    )
+    most = max(config.max_surfels // 2, 1)
+    points = starting_points(scene, most, colors, skybox=config.skybox, filter_outliers=config.filter_points)
     count = len(points.means)
     quats = torch.randn(count, 4, generator=generator)
     raw = {
@@ -52,6 +48,40 @@ def initial_surfels(
         "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     return Surfels(raw)
+
+
+def starting_points(
+    scene: Scene,
+    most: int,
+    colors: torch.Tensor | None = None,
+    *,
+    skybox: int = 0,
+    filter_outliers: bool = True,
+) -> InitialPoints:
+    """Choose points of the cloud by farthest point sampling, then points of a sphere around the scene.
+
+    Args:
+        scene: its P points and its training views.
+        most: number of points, 1 or more.
+        colors: (P, 3) colours of the points; None takes the scene's.
+        skybox: number of points on the sphere: a sixth of `most` at the most, none where photos are transparent.
+        filter_outliers: as in `initial_points`.
+
+    Returns:
+        At most `most` points, those of the sphere last.
+    """
+    # Behind transparent photos is that colour.
+    count = 0 if scene.background is not None else min(skybox, most // SKYBOX_SHARE)
+    sky = skybox_points(scene.train, scene.points, count) if count else None
+    points = initial_points(
+        scene.points,
+        scene.colors if colors is None else colors,
+        most if sky is None else most - len(sky.means),
+        track_lengths=scene.track_lengths,
+        errors=scene.reprojection_errors,
+        filter_outliers=filter_outliers,
+    )
+    return points if sky is None else points.joined(sky)
 
 
 def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
