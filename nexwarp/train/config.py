@@ -136,9 +136,9 @@ class Config:
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
-    skybox: int = 100
-    """Number of initial surfels on a sphere around the scene, for backgrounds with few points: sky, and what is far or
-    blurred. They are a sixth of the initial surfels at most, and none where photos are transparent."""
+    skybox: int = 0
+    """Number of initial surfels on a sphere around the scene, for backgrounds with few points, such as the room behind
+    a table; 100 is enough. They are a sixth of the initial surfels at most, and none where photos are transparent."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
