@@ -1,7 +1,8 @@
 """Points on a sphere around the scene, where the surfels of a background start. Not in the paper.
 
 Structure from motion finds few points in sky and in blurred backgrounds. Without surfels there, the background colour
-shows, or surfels that are too near stretch over it. Both are wrong in a held-out view.
+shows, or surfels that are too near stretch over it. Both are wrong in a held-out view. Where the cloud has points, a
+sphere would be too far.
 """
 
 import math
@@ -18,22 +19,25 @@ NEARLY_ALL = 0.99
 SAMPLES = 4096  # directions by which the seen share of the sphere is estimated
 LEAST_SHARE = 1 / 64  # where photos show less of the sphere than this, there are fewer points
 MOST_VIEWS = 256  # that are asked, evenly chosen
+GAP = 0.03  # share of an image's diagonal in which a photo shows no point of the cloud around one of the sphere
+MOST_POINTS = 100_000  # of the cloud, evenly chosen: more would not fill other gaps
 
 
 def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> InitialPoints:
-    """Choose even points on a sphere around the cameras and the points, in the directions that photos show.
+    """Choose even points on a sphere around the cameras and the points, where photos show no point of the cloud.
 
     The radius is twice the distance from the cameras' mean that 99 % of the points have, or that all cameras have,
-    whichever is larger. A point's colour is the mean of the photos' pixels that it projects to, whatever is in front of
-    it. Masked pixels show nothing.
+    whichever is larger. Of the photos that show a point's direction, more than half have no point of the cloud within
+    3 % of their diagonal there. A point's colour is the mean of the photos' pixels that it projects to, whatever is in
+    front of it. Masked pixels show nothing.
 
     Args:
         views: training views; at least one.
         points: (P, 3) of the scene, world frame; P >= 1.
-        count: roughly the number of points, 1 or more.
+        count: roughly the number of points if the cloud were nowhere, 1 or more.
 
     Returns:
-        At most `count` points, none if no photo shows any. Normals point to the cameras' mean; a scale is half the
+        At most `count` points, none if photos show none. Normals point to the cameras' mean; a scale is half the
         distance between neighbours.
 
     Raises:
@@ -51,7 +55,9 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     total = math.ceil(count / max(share, LEAST_SHARE))
     towards = directions(total)
     sums, seen = _colors(judges, centre + radius * towards)
-    kept = (seen > 0).nonzero()[:, 0]
+    cloud = points[:: math.ceil(len(points) / MOST_POINTS)]
+    empty = _empty(judges, centre + radius * towards, cloud)
+    kept = (2 * empty > seen).nonzero()[:, 0]
     kept = kept[torch.linspace(0, len(kept) - 1, min(count, len(kept))).round().long()]  # left out all over the sphere
     spacing = radius * math.sqrt(4 * math.pi / total)
     return InitialPoints(
@@ -75,13 +81,32 @@ def _colors(views: Sequence[View], points: torch.Tensor) -> tuple[torch.Tensor, 
     """Return the sums (N, 3) of the colours in [0, 1] at which views show points (N, 3), and how many (N,) do."""
     sums, seen = torch.zeros(len(points), 3, dtype=torch.float64), torch.zeros(len(points), dtype=torch.int64)
     for view in views:
-        camera = view.camera
-        pixels, depths = camera.project(points.float())
-        inside = in_image(pixels, depths, camera.width, camera.height).nonzero()[:, 0]
-        column, row = pixels[inside].long().unbind(1)
-        if view.mask is not None:
-            used = view.mask[row, column]
-            inside, column, row = inside[used], column[used], row[used]
-        sums[inside] += view.image[row, column].double() / 255
-        seen[inside] += 1
+        shown, pixels = _shown(view, points)
+        column, row = pixels.long().unbind(1)
+        sums[shown] += view.image[row, column].double() / 255
+        seen[shown] += 1
     return sums, seen
+
+
+def _empty(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> torch.Tensor:
+    """Return how many (N,) views show each of the points (N, 3), and no point of the cloud (M, 3) near it."""
+    empty = torch.zeros(len(points), dtype=torch.int64)
+    for view in views:
+        camera = view.camera
+        shown, pixels = _shown(view, points)
+        found, depths = camera.project(cloud.float())
+        found = found[in_image(found, depths, camera.width, camera.height)]
+        near = torch.cdist(pixels, found) < GAP * math.hypot(camera.width, camera.height)
+        empty[shown] += ~near.any(dim=1)
+    return empty
+
+
+def _shown(view: View, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the indices (M,) of the points (N, 3) that a view shows, and their pixels (M, 2)."""
+    camera = view.camera
+    pixels, depths = camera.project(points.float())
+    shown = in_image(pixels, depths, camera.width, camera.height).nonzero()[:, 0]
+    if view.mask is not None:
+        column, row = pixels[shown].long().unbind(1)
+        shown = shown[view.mask[row, column]]
+    return shown, pixels[shown]

@@ -137,8 +137,9 @@ class Config:
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
     skybox: int = 0
-    """Number of initial surfels on a sphere around the scene, for backgrounds with few points, such as the room behind
-    a table; 100 is enough. They are a sixth of the initial surfels at most, and none where photos are transparent."""
+    """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
+    behind a table; 100 is enough. Where photos show no point of the cloud, initial surfels lie on them, at most one in
+    six, and none if photos are transparent."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
