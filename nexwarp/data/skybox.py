@@ -21,6 +21,7 @@ LEAST_SHARE = 1 / 64  # where photos show less of the sphere than this, there ar
 MOST_VIEWS = 256  # that are asked, evenly chosen
 GAP = 0.03  # share of an image's diagonal in which a photo shows no point of the cloud around one of the sphere
 MOST_POINTS = 100_000  # of the cloud, evenly chosen: more would not fill other gaps
+PART = 4096  # points of the cloud that are compared at once, to save memory
 
 
 def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> InitialPoints:
@@ -96,8 +97,11 @@ def _empty(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> 
         shown, pixels = _shown(view, points)
         found, depths = camera.project(cloud.float())
         found = found[in_image(found, depths, camera.width, camera.height)]
-        near = torch.cdist(pixels, found) < GAP * math.hypot(camera.width, camera.height)
-        empty[shown] += ~near.any(dim=1)
+        gap = GAP * math.hypot(camera.width, camera.height)
+        near = torch.zeros(len(shown), dtype=torch.bool)
+        for part in found.split(PART):
+            near |= (torch.cdist(pixels, part) < gap).any(dim=1)
+        empty[shown] += ~near
     return empty
 
 
