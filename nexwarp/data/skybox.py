@@ -19,7 +19,7 @@ NEARLY_ALL = 0.99
 SAMPLES = 4096  # directions by which the seen share of the sphere is estimated
 LEAST_SHARE = 1 / 64  # where photos show less of the sphere than this, there are fewer points
 MOST_VIEWS = 256  # that are asked, evenly chosen
-GAP = 0.03  # share of an image's diagonal in which a photo shows no point of the cloud around one of the sphere
+GAP = 0.03  # in image diagonals: a point of the cloud within this distance is near one of the sphere
 MOST_POINTS = 100_000  # of the cloud, evenly chosen: more would not fill other gaps
 PART = 4096  # points of the cloud that are compared at once, to save memory
 
@@ -35,7 +35,7 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     Args:
         views: training views; at least one.
         points: (P, 3) of the scene, world frame; P >= 1.
-        count: roughly the number of points if the cloud were nowhere, 1 or more.
+        count: roughly the number of points before those near the cloud are left out, 1 or more.
 
     Returns:
         At most `count` points, none if photos show none. Normals point to the cameras' mean; a scale is half the

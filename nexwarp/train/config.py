@@ -138,8 +138,8 @@ class Config:
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
     skybox: int = 0
     """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
-    behind a table; 100 is enough. Where photos show no point of the cloud, initial surfels lie on them, at most one in
-    six, and none if photos are transparent."""
+    behind a table; 100 is enough. Initial surfels start on those around which photos show no point of the cloud. They
+    are at most a sixth of the initial surfels. Where photos are transparent there are none."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
