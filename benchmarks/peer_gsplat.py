@@ -17,12 +17,13 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.data import Scene, initial_points
+from nexwarp.data import Scene
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.compact import decode, encode
 from nexwarp.representation.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
+from nexwarp.train.initial import starting_points
 from nexwarp.train.losses import image_loss
 from nexwarp.train.step_losses import SATURATION
 from nexwarp.train.views import TrainingViews, mean_color
@@ -54,6 +55,7 @@ class PeerSettings:
         exposures: train at the photos' mean exposure and render with predicted gains, as our default does, where our
             gate uses exposures.
         even_start: start at half the budget from points chosen by farthest point sampling, as we do.
+        skybox: with `even_start`, how many of these points lie on a sphere around the scene.
     """
 
     primitive: str = "3dgs"
@@ -61,6 +63,7 @@ class PeerSettings:
     background: bool = False
     exposures: bool = False
     even_start: bool = False
+    skybox: int = 0
 
     def __post_init__(self) -> None:
         if self.primitive not in FLOATS:
@@ -248,14 +251,8 @@ def _initial(
     extent = 1.1 * float((train - train.mean(0)).norm(dim=1).max())
     points, colors = scene.points, scene.colors.float() / 255 if calibration is None else calibration.colors
     if settings.even_start:
-        chosen_points = initial_points(
-            points,
-            colors,
-            max(count // 2, 1),
-            track_lengths=scene.track_lengths,
-            errors=scene.reprojection_errors,
-        )
-        points, colors = chosen_points.means, chosen_points.colors
+        start = starting_points(scene, max(count // 2, 1), colors, skybox=settings.skybox)
+        points, colors = start.means, start.colors
     elif len(points) > count:
         chosen = torch.randperm(len(points))[:count]
         points, colors = points[chosen], colors[chosen]

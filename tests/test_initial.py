@@ -102,7 +102,7 @@ def test_surfels_turn_to_their_normals_by_the_least_angle(case):
 @pytest.mark.parametrize("budget", [16, 101, 100_000])
 def test_initial_surfels(scene, budget, orient):
     """Half the budget at most, opacity 0.1, gamma 1 + e^-5, colours of the points, on fitted planes or at random."""
-    config = small(max_surfels=budget, orient_points=orient)
+    config = small(max_surfels=budget, orient_points=orient, skybox=0)
     surfels = initial_surfels(scene, config, torch.Generator().manual_seed(0))
     points = initial_points(
         scene.points,

@@ -106,9 +106,10 @@ def test_settings_out_of_range_are_refused(name, value):
         Config(**{name: value})
 
 
-def test_runs_from_before_relocation_do_not_relocate():
-    """Their config.json keeps what they did."""
+def test_runs_from_before_a_setting_keep_what_they_did():
     written = Config().as_dict()
     assert config_from_dict(written) == Config()
     del written["densify"]["relocate"]
     assert config_from_dict(written).densify == dataclasses.replace(DensifyConfig(), relocate=0.0)
+    del written["skybox"]
+    assert config_from_dict(written).skybox == 0

@@ -73,7 +73,7 @@ def test_each_change_is_undone_on_validation_views() -> None:
     jobs = undone_jobs()
     assert len(jobs) == len(set(jobs)) and {job.variant for job in jobs} == {"inner"}
     rows = list(dict.fromkeys(job.row for job in jobs))
-    assert rows[:2] == ["default", "no depth jitter"]
+    assert rows[:2] == ["default", "no skybox"]
     assert {row.name for row in CHANGES} - set(rows) == set(module.NOT_UNDONE)
     assert {(job.scene, job.row) for job in jobs} == {(scene, row) for scene in module.SECONDS for row in rows}
     inner, test = (command_of(each[0], Path("data"), Path("out.jsonl")) for each in (jobs, wanted_jobs()))

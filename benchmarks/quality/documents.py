@@ -18,6 +18,7 @@ HEADINGS = {
     "gsplat MCMC, background": "and background",
     "gsplat MCMC, exposures": "and background, exposures",
     "gsplat MCMC, even start": "and background, exposures, points of our cloud",
+    "gsplat MCMC, skybox": "and background, exposures, all our initial points",
     "gsplat default": "gsplat default, background",
     "gsplat 2DGS": "gsplat 2DGS, background",
 }

@@ -35,6 +35,7 @@ PEERS = (
     Row("gsplat MCMC, background", None, _BACKGROUND),
     Row("gsplat MCMC, exposures", None, _EXPOSED),
     Row("gsplat MCMC, even start", None, _EXPOSED | {"even_start": True}),
+    Row("gsplat MCMC, skybox", None, _EXPOSED | {"even_start": True, "skybox": preset("default").skybox}),
     Row("gsplat default", None, _BACKGROUND | {"strategy": "default"}),
     Row("gsplat 2DGS", None, _BACKGROUND | {"strategy": "default", "primitive": "2dgs"}),
 )
@@ -42,7 +43,7 @@ PEERS = (
 MEGABYTES = (
     (Row("5 MB", settings={"texture.table_size": 2**16}), 37_000),
     (Row("10 MB", settings={"texture.table_size": 2**17}), 74_900),
-    *((row, size) for row in PEERS[2:4] for size in (68_400, 136_900)),
+    *((row, size) for row in PEERS[2:5] for size in (68_400, 136_900)),
 )
 NO_TEXTURE = Row("no texture", settings={"max_hits": 0})  # K = 0
 # The ablations of the paper.
@@ -66,6 +67,7 @@ CHANGES = (
     Row("black background", settings={"background": [0.0, 0.0, 0.0]}),
     Row("no filter of points", settings={"filter_points": False}),
     Row("random rotations", settings={"orient_points": False}),
+    Row("no skybox", settings={"skybox": 0}),
     Row("no pruning at the cap", settings={"densify.prune_at_cap": False}),
     Row("no depth jitter", settings={"depth_jitter": 0.0}),
     Row("paper's table", settings={"texture.table_size": 2**20}),

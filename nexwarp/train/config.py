@@ -136,10 +136,10 @@ class Config:
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
-    skybox: int = 0
+    skybox: int = 100
     """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
-    behind a table; 100 is enough. Initial surfels start on those around which photos show no point of the cloud. They
-    are at most a sixth of the initial surfels. Where photos are transparent there are none."""
+    behind a table. Initial surfels start on those around which photos show no point of the cloud. They are at most a
+    sixth of the initial surfels. Where photos are transparent there are none."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from nexwarp.data import Scene, View, initial_points
+from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
@@ -26,9 +26,7 @@ TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the
 def initial_surfels(
     scene: Scene, config: Config, generator: torch.Generator, colors: torch.Tensor | None = None
 ) -> Surfels:
-    """Surfels on points of the cloud chosen by farthest point sampling: half the budget at most (paper Sec. 4.3).
-
-    Some of them lie on a sphere around the scene instead, by `Config.skybox`; they come last.
+    """Surfels on the `starting_points`: half the budget at most (paper Sec. 4.3).
 
     Args:
         scene: its P points are taken.
@@ -37,18 +35,7 @@ def initial_surfels(
         colors: (P, 3) colours of the points; None takes the scene's.
     """
     most = max(config.max_surfels // 2, 1)
-    # Behind transparent photos is their background colour.
-    on_sphere = 0 if scene.background is not None else min(config.skybox, most // SKYBOX_SHARE)
-    sky = skybox_points(scene.train, scene.points, on_sphere) if on_sphere else None
-    points = initial_points(
-        scene.points,
-        scene.colors if colors is None else colors,
-        most if sky is None else most - len(sky.means),
-        track_lengths=scene.track_lengths,
-        errors=scene.reprojection_errors,
-        filter_outliers=config.filter_points,
-    )
-    points = points if sky is None else points.joined(sky)
+    points = starting_points(scene, most, colors, skybox=config.skybox, filter_outliers=config.filter_points)
     count = len(points.means)
     quats = torch.randn(count, 4, generator=generator)
     raw = {
@@ -61,6 +48,40 @@ def initial_surfels(
         "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     return Surfels(raw)
+
+
+def starting_points(
+    scene: Scene,
+    most: int,
+    colors: torch.Tensor | None = None,
+    *,
+    skybox: int = 0,
+    filter_outliers: bool = True,
+) -> InitialPoints:
+    """Choose points of the cloud by farthest point sampling, then points of a sphere around the scene.
+
+    Args:
+        scene: its P points and its training views.
+        most: number of points, 1 or more.
+        colors: (P, 3) colours of the points; None takes the scene's.
+        skybox: number of points on the sphere: a sixth of `most` at the most, none where photos are transparent.
+        filter_outliers: as in `initial_points`.
+
+    Returns:
+        At most `most` points, those of the sphere last.
+    """
+    # Behind transparent photos is that colour.
+    count = 0 if scene.background is not None else min(skybox, most // SKYBOX_SHARE)
+    sky = skybox_points(scene.train, scene.points, count) if count else None
+    points = initial_points(
+        scene.points,
+        scene.colors if colors is None else colors,
+        most if sky is None else most - len(sky.means),
+        track_lengths=scene.track_lengths,
+        errors=scene.reprojection_errors,
+        filter_outliers=filter_outliers,
+    )
+    return points if sky is None else points.joined(sky)
 
 
 def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:

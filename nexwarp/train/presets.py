@@ -8,12 +8,13 @@ from nexwarp.train.config import LARGEST_NUMBER, Config, LearningRates, TextureC
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
 
-# The demo is small enough for two CPU cores: a short run, so its steps are larger.
+# The demo is small enough for two CPU cores: a short run, so its steps are larger. It is a closed room, without sky.
 DEMO_SETTINGS: dict[str, object] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
     "depth_jitter": 0.5,
+    "skybox": 0,
     "texture.levels": 12,
     "texture.table_size": 2**15,
     "texture.features": 2,
@@ -31,8 +32,8 @@ DEMO_SETTINGS: dict[str, object] = {
 
 PARTS = ("losses", "rates", "texture", "densify")
 
-# What runs did before a setting existed, where the default does something else.
-BEFORE: dict[str, dict[str, object]] = {"densify": {"relocate": 0.0}}
+# What runs did before a setting existed, where the default does something else; "" has the settings without a part.
+BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0}, "densify": {"relocate": 0.0}}
 
 
 Part = TypeVar("Part", LossWeights, LearningRates, TextureConfig, DensifyConfig)
@@ -90,6 +91,7 @@ PRESETS: dict[str, Config] = {
         exposures=False,
         filter_points=False,
         orient_points=False,
+        skybox=0,
         texture=TextureConfig(
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),
@@ -117,7 +119,8 @@ def config_from_dict(data: Mapping[str, Any]) -> Config:
         base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else Config()
         known = {field.name for field in dataclasses.fields(Config)}
         parts = {k: _part(getattr(base, k), {**BEFORE.get(k, {}), **v}, k) for k, v in data.items() if k in PARTS}
-        data = {k: v for k, v in data.items() if k in known} | parts
+        written = BEFORE[""] if parts.keys() >= BEFORE.keys() - {""} else {}  # the whole record of a run
+        data = {**written, **{k: v for k, v in data.items() if k in known}, **parts}
         return dataclasses.replace(base, **_checked(Config, _tuples(data), "config"))
     except (TypeError, AttributeError, KindError) as error:
         raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
