@@ -8,13 +8,12 @@ from nexwarp.train.config import LARGEST_NUMBER, Config, LearningRates, TextureC
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
 
-# The demo is small enough for two CPU cores: a short run, so its steps are larger. It is a closed room, without sky.
+# The demo is small enough for two CPU cores: a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, object] = {
     "iterations": 1200,
     "max_surfels": 3000,
     "coarse": 0.4,
     "depth_jitter": 0.5,
-    "skybox": 0,
     "texture.levels": 12,
     "texture.table_size": 2**15,
     "texture.features": 2,
