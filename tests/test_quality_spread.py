@@ -50,6 +50,7 @@ def test_the_tables_trainings_come_by_value() -> None:
     few = ("kitchen25", "saharov")
     assert pairs == {(scene, row) for scene in (*few, "fox") for row in ("default", module.EXPOSED)}
     assert {row.name for row in (*PEERS[2:], *SUSPECTS)} <= {job.row for job in jobs}
+    assert {job.scene for job in jobs if job.row == module.SKY} == {*few}
     assert {(job.scene, job.variant) for job in jobs if job.variant} == {("fox", "near"), ("fox", "arc")}
     assert {(job.scene, job.seed) for job in jobs[-8:]} == {("saharov", 1), ("kitchen25", 1)}
     even = {"ours": 1.0, "gsplat": 1.0}
