@@ -55,7 +55,7 @@ class PeerSettings:
         exposures: train at the photos' mean exposure and render with predicted gains, as our default does, where our
             gate uses exposures.
         even_start: start at half the budget from points chosen by farthest point sampling, as we do.
-        skybox: with `even_start`, how many of these points lie on a sphere around the scene.
+        skybox: with `even_start`, as `Config.skybox`: some of these points lie on a sphere around the scene.
     """
 
     primitive: str = "3dgs"

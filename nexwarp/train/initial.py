@@ -64,13 +64,14 @@ def starting_points(
         scene: its P points and its training views.
         most: number of points, 1 or more.
         colors: (P, 3) colours of the points; None takes the scene's.
-        skybox: number of points on the sphere: a sixth of `most` at the most, none where photos are transparent.
+        skybox: number of points on the sphere, before those near the cloud are left out; a sixth of `most` at the
+            most, and none where photos are transparent.
         filter_outliers: as in `initial_points`.
 
     Returns:
         At most `most` points, those of the sphere last.
     """
-    # Behind transparent photos is that colour.
+    # Behind transparent photos lies the background colour alone.
     count = 0 if scene.background is not None else min(skybox, most // SKYBOX_SHARE)
     sky = skybox_points(scene.train, scene.points, count) if count else None
     points = initial_points(
