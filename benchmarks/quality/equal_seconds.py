@@ -22,8 +22,8 @@ SHORT = (1_000, 3_000)
 BEST = {
     "train": "gsplat MCMC, even start",
     "fox": "gsplat MCMC, exposures",
-    "saharov": "gsplat MCMC, even start",
-    "kitchen25": "gsplat MCMC, exposures",
+    "saharov": "gsplat MCMC, skybox",
+    "kitchen25": "gsplat MCMC, skybox",
 }
 
 
