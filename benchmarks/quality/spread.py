@@ -70,7 +70,7 @@ def wanted_jobs() -> list[TrainingJob]:
         ("train", ours, 400_000, 0),
         *((scene, ours, size, 0) for size in (40_000, 10_000) for scene in SECONDS),
         # Four test views each, so that one seed cannot tell.
-        *((scene, row, 40_000, 1) for scene in few for row in (ours, EXPOSED)),
+        *((scene, row, 40_000, 1) for scene in few for row in (ours, EXPOSED, SKY)),
         *((scene, SKY, size, 0) for size in (40_000, 10_000) for scene in few),
         *((scene, row.name, size, 0) for row, size in MEGABYTES for scene in scenes.get(row.name, SECONDS)),
         *((scene, ours, size, 0) for size in (100_000, 20_000, 5_000) for scene in SECONDS),
