@@ -118,7 +118,7 @@ def config_from_dict(data: Mapping[str, Any]) -> Config:
         base = PRESETS[preset] if isinstance(preset, str) and preset in PRESETS else Config()
         known = {field.name for field in dataclasses.fields(Config)}
         parts = {k: _part(getattr(base, k), {**BEFORE.get(k, {}), **v}, k) for k, v in data.items() if k in PARTS}
-        written = BEFORE[""] if parts.keys() >= BEFORE.keys() - {""} else {}  # the whole record of a run
+        written = BEFORE[""] if "densify" in parts else {}  # the record of a run has it, a few settings do not
         data = {**written, **{k: v for k, v in data.items() if k in known}, **parts}
         return dataclasses.replace(base, **_checked(Config, _tuples(data), "config"))
     except (TypeError, AttributeError, KindError) as error:
