@@ -99,9 +99,9 @@ def test_gsplat_with_our_seconds_stands_beside_us(tmp_path: Path) -> None:
     lines += [line("fox", EXPOSED, 40_000, 32.0, iterations=14_500, seconds=93.7)]
     table = blocks({}, read(lines, tmp_path / "x.jsonl"))["seconds"]
     own, peer = "32.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1000 (exposures, 14,500)"
-    assert rows_of(table)["fox"] == ["94 s", own, "94 s", peer, "+0.50 dB, +0.0000, +0.0000"]
-    assert rows_of(table)["saharov"] == rows_of(blocks({})["seconds"])["fox"] == [MISSING] * 5
-    assert table.endswith("*Measured by* `python -m benchmarks.quality.equal_seconds`: H200; 2026-11-25; abc.")
+    assert rows_of(table)["fox"] == ["H200", "94 s", own, "94 s", peer, "+0.50 dB, +0.0000, +0.0000"]
+    assert rows_of(table)["saharov"] == rows_of(blocks({})["seconds"])["fox"] == [MISSING] * 6
+    assert table.endswith("*Measured by* `python -m benchmarks.quality.equal_seconds`: 2026-11-25; abc.")
 
 
 def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:

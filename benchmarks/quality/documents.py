@@ -157,15 +157,15 @@ def _equal_seconds(alone: Results) -> str:
     for scene in SCENES:
         found = equal_seconds(alone, scene)
         if found is None:
-            lines.append([scene, *[MISSING] * 5])
+            lines.append([scene, *[MISSING] * 6])
             continue
         own, job, peer = found
         shown += [own, peer]
         told = f"{figures([peer])} ({job.row.removeprefix('gsplat MCMC, ')}, {job.iterations:,})"
         cells = [f"{own['seconds']:.0f} s", figures([own]), f"{peer['seconds']:.0f} s", told, difference([own], [peer])]
-        lines.append([scene, *cells])
-    header = ["scene", "nexwarp", "30,000 iterations", "gsplat", "row, iterations", "difference"]
-    named = "; ".join(" and ".join(sorted({str(x[key]) for x in shown})) for key in ("device", "date", "commit"))
+        lines.append([scene, own["device"], *cells])
+    header = ["scene", "GPU", "nexwarp", "30,000 iterations", "gsplat", "row, iterations", "difference"]
+    named = "; ".join(" and ".join(sorted({str(x[key]) for x in shown})) for key in ("date", "commit"))
     caption = f"*{'Measured' if shown else 'To be measured'} by* `python -m benchmarks.quality.equal_seconds`"
     return f"{_table(header, lines)}\n\n{caption}{': ' * bool(shown)}{named}."
 
