@@ -59,7 +59,7 @@ def test_the_best_gsplat_row_of_each_scene_is_the_peer(tmp_path: Path) -> None:
     assert rows["saharov"] == ["22.00, 0.9000, 0.1000", MISSING, MISSING, MISSING]
     assert rows["train"] == [MISSING] * 4
     assert "nexwarp H200, 2026-11-25, abc, seeds 0, 1; gsplat H200, 2026-11-25, older, seed 0" in tables["peers-40000"]
-    assert "Not run with 40,000: and background;" in tables["peers-40000"]
+    assert "Not run with 40,000: gsplat MCMC, background;" in tables["peers-40000"]
     readme = rows_of(tables["readme"])
     assert readme["fox"] == ["32.40", "0.9100", "0.1000", "2.0", "32.00", "0.9000", "0.1200", "2.0"]
     assert readme["kitchen25"] == [MISSING, "", "", ""] * 2
@@ -102,6 +102,13 @@ def test_gsplat_with_our_seconds_stands_beside_us(tmp_path: Path) -> None:
     assert rows_of(table)["fox"] == ["H200", "94 s", own, "94 s", peer, "+0.50 dB, +0.0000, +0.0000"]
     assert rows_of(table)["saharov"] == rows_of(blocks({})["seconds"])["fox"] == [MISSING] * 6
     assert table.endswith("*Measured by* `python -m benchmarks.quality.equal_seconds`: 2026-11-25; abc.")
+    lines += [line("fox", EXPOSED, 40_000, 33.0, device="H100"), line("fox", GSPLAT, 40_000, 31.0)]
+    alone = read(lines, tmp_path / "y.jsonl")
+    assert blocks({}, alone)["seconds"] == table, "neither another GPU nor another row is compared with"
+    whole = read([*lines, line("fox", EXPOSED, 40_000, 32.25, seconds=94.0)], tmp_path / "z.jsonl")
+    assert "32.25, 0.9000, 0.1000 (exposures, 30,000)" in rows_of(blocks({}, whole)["seconds"])["fox"]
+    short = read(lines[:5], tmp_path / "short.jsonl")
+    assert rows_of(blocks({}, short)["seconds"])["fox"] == [MISSING] * 6, "the two short ones are no comparison"
 
 
 def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:

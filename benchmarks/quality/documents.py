@@ -90,7 +90,7 @@ def _peers(results: Results, size: int) -> str:
         margin = MISSING if best is None else difference(own, best[1])
         lines.append([scene, figures(own), *(figures(cells[name]) for name in shown), margin])
     header = ["scene", "nexwarp", *(HEADINGS[name] for name in shown), "nexwarp less the best gsplat"]
-    absent = [HEADINGS[name] for name in PEER_NAMES if name not in shown]
+    absent = [name for name in PEER_NAMES if name not in shown]
     told = [f"Not run with {size:,}: {'; '.join(absent)}.", ""] if absent else []
     caption = _measured(results, "peers", [size], (DEFAULT.name, *PEER_NAMES))
     return "\n".join([_table(header, lines), "", *told, caption])

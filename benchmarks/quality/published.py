@@ -4,6 +4,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from benchmarks.quality.equal_seconds import BEST, SHORT
 from benchmarks.quality.jobs import ITERATIONS, SIZE, TrainingJob, config_of
 from benchmarks.quality.results import Results
 from benchmarks.quality.rows import DEFAULT, PEERS, ROWS
@@ -116,8 +117,8 @@ def best_peer_file(results: Results, scene: str, megabytes: float) -> tuple[str,
 def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], TrainingJob, Mapping[str, Any]] | None:
     """Return the default's result of `benchmarks.quality.equal_seconds`, then the job and result of gsplat beside it.
 
-    gsplat's training is the longest one that has fewer than 30,000 iterations. None where one of the two is missing, or
-    the default had other settings than today's.
+    gsplat's training is the longest one of the scene's row on the same kind of GPU, the two short ones left out. None
+    where one of the two is missing, or the default had other settings than today's.
 
     Args:
         alone: results of trainings that were alone on their GPU.
@@ -125,8 +126,9 @@ def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], Traini
     """
     at_size = {job: x for job, x in alone.items() if (job.scene, job.size, job.variant) == (scene, SIZE, "")}
     own = [x for job, x in at_size.items() if job.row == DEFAULT.name and of_today(job, x)]
-    peers = [job for job in at_size if job.row in PEER_NAMES and job.iterations < ITERATIONS]
-    if not own or not peers:
+    long = [job for job in at_size if job.row == BEST[scene] and job.iterations not in SHORT]
+    peers = [job for job in long if own and at_size[job]["device"] == own[-1]["device"]]
+    if not peers:
         return None
     longest = max(peers, key=lambda job: job.iterations)
     return own[-1], longest, at_size[longest]
