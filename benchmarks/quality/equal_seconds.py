@@ -4,8 +4,8 @@
 
 For each scene: our default with 30,000 iterations; two short trainings of gsplat, which tell the seconds of its
 iterations; then gsplat with the number of iterations that take as long as ours. Run nothing beside it on the GPU. Its
-row is the best one of the scene with 30,000 iterations. Results are appended to OUT, those of the short trainings too;
-what OUT holds is not trained again.
+row is that of BEST: the best one of the scene with 30,000 iterations, of those known when the seconds were measured.
+Results are appended to OUT, those of the short trainings too; what OUT holds is not trained again.
 """
 
 import argparse
