@@ -105,9 +105,9 @@ def run_job(
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
         of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either;
-        `compact`, the metrics and megabytes of a compact file; of nexwarp `config`, a digest of its settings,
-        `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its shared start, if any;
-        the metrics by view; device, date and commit.
+        `compact`, the metrics and megabytes of a compact file, and its PSNR by view; of nexwarp `config`, a digest of
+        its settings, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its shared
+        start, if any; the metrics by view; device, date and commit.
     """
     device = _device()
     scene = scene_of(job, data)
@@ -128,7 +128,7 @@ def run_job(
         **{key: _mean(v[key] for v in views.values()) for key in METRICS},
         **trained.facts,
         "compact": {key: _mean(v[key] for v in coded.values()) for key in METRICS}
-        | {"megabytes": trained.compact_bytes / 1e6},
+        | {"megabytes": trained.compact_bytes / 1e6, "views": {name: x["psnr"] for name, x in coded.items()}},
         **peak,
         "views": views,
         "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
