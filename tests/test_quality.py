@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -204,6 +205,9 @@ def test_a_training_from_a_shared_start_is_the_training(
     textures = []
     for job, result in found.items():
         assert result["together"] == {"rows": [*rows], "iterations": 9}
+        compact = result["compact"]
+        assert compact["views"].keys() == result["views"].keys()
+        assert statistics.fmean(compact["views"].values()) == pytest.approx(compact["psnr"])
         row = Row(job.row, settings=rows[job.row])
         alone = run_job(job, folder, row, models=tmp_path / "alone")
         assert alone["views"] == result["views"] and "together" not in alone
