@@ -1,5 +1,6 @@
 """Compact model files: small, close to the model, and refused with one line where they are damaged."""
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from safetensors import safe_open
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model.compact import CODE, DTYPES, REACH, decode, encode
+from nexwarp.model.compact import CODE, DTYPES, LARGEST, REACH, decode, encode
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import COMPACT_VERSION, MODEL_FILE, save_model
 from nexwarp.representation.detail_limits import NEVER, DetailLimits
@@ -117,6 +118,18 @@ def test_extreme_values_harm_no_others(tmp_path: Path) -> None:
         assert float((after[name][1:] - tensors[name][1:]).abs().max()) < most, name
     assert float(after["surfels.means"][0].abs().min()) == pytest.approx(1e6, rel=1e-3)
     assert float(after["surfels.logit_opacities"][0]) < -REACH / 2
+
+
+@pytest.mark.parametrize("name", ["surfels.logit_opacities", "surfels.raw_gammas"])
+@pytest.mark.parametrize("end", [-REACH - 5, REACH + 5])
+def test_a_majority_at_one_end_harms_no_others(tmp_path: Path, name: str, end: float) -> None:
+    """Where most surfels are opaque, or hard quads, the coding of the others is as fine as it was."""
+    tensors = full_tensors(make_model(200), tmp_path)
+    tensors[name][50:] = end
+    after = decode(encode(tensors))[name]
+    step = 2 * REACH / (2 * LARGEST[DTYPES[name]])
+    assert float((after[:50] - tensors[name][:50]).abs().max()) <= 0.51 * step
+    assert float((after[50:] - math.copysign(REACH, end)).abs().max()) <= 0.51 * step
 
 
 def drop(name: str) -> Callable[[dict[str, torch.Tensor], dict[str, Any]], object]:

@@ -22,7 +22,7 @@ DTYPES = {
     **dict.fromkeys(ROUNDED, torch.bfloat16),
 }
 STORED = {torch.int16: "I16", torch.int8: "I8", torch.bfloat16: "BF16"}
-REACH = 20.0  # logarithms farther than this from their median are as good as there: exp(-20) of a scale is invisible
+REACH = 20.0  # what logarithms are clamped to: exp(-20), an opacity or a share of the median scale, is invisible
 
 
 def code_names() -> set[str]:
@@ -71,9 +71,11 @@ def _encoded(name: str, values: torch.Tensor, largest: int) -> tuple[torch.Tenso
         bent = torch.asinh((values - middle) / spread)
         step = (bent.abs().amax(0) / largest).clamp_min(1e-12).float().double()
         return (bent / step).round().clamp(-largest, largest), torch.stack([middle, spread, step]).float()
-    if name != "surfels.sh0":
+    if name == "surfels.log_scales":  # their unit is that of the scene
         middle = values.median(0).values
         values = values.clamp(middle - REACH, middle + REACH)
+    elif name != "surfels.sh0":  # most opacities may be 1, with logits of 20 and more
+        values = values.clamp(-REACH, REACH)
     low, high = values.amin(0), values.amax(0)
     middle = ((low + high) / 2).float().double()
     step = torch.maximum(high - middle, middle - low).div(largest).clamp_min(1e-12).float().double()
