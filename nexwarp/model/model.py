@@ -251,7 +251,7 @@ class Model(nn.Module):
         Args:
             path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
                 `model.safetensors` is written.
-            compact: write 8 and 16 bits a number: about a third of the size, for a loss of thousandths of a dB.
+            compact: write 8 and 16 bits a number: about a third of the size, mostly for a loss of thousandths of a dB.
 
         Returns:
             The file that was written.
