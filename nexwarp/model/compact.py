@@ -22,8 +22,8 @@ DTYPES = {
     **dict.fromkeys(ROUNDED, torch.bfloat16),
 }
 STORED = {torch.int16: "I16", torch.int8: "I8", torch.bfloat16: "BF16"}
-# What logarithms are clamped to. exp(-20) is invisible as an opacity, as a share of the median scale and as what lacks
-# to an opacity of 1; a gamma of exp(20) is a hard edge, and one of 1 + exp(-20) a Gaussian.
+# What logarithms are clamped to. exp(-20) is invisible as an opacity, as its difference from 1 and as a share of the
+# median scale; a gamma of 1 + exp(20) is a hard edge, one of 1 + exp(-20) a Gaussian.
 REACH = 20.0
 
 
@@ -76,7 +76,7 @@ def _encoded(name: str, values: torch.Tensor, largest: int) -> tuple[torch.Tenso
     if name == "surfels.log_scales":  # their unit is that of the scene
         middle = values.median(0).values
         values = values.clamp(middle - REACH, middle + REACH)
-    elif name != "surfels.sh0":  # not around the median: most opacities may be 1, with logits above 20
+    elif name in ("surfels.logit_opacities", "surfels.raw_gammas"):  # the median may be at an end: most opacities 1
         values = values.clamp(-REACH, REACH)
     low, high = values.amin(0), values.amax(0)
     middle = ((low + high) / 2).float().double()
