@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -90,6 +90,7 @@ def run_job(
     pictures: Path | None = None,
     models: Path | None = None,
     start: SharedStart | None = None,
+    trainer: Callable[[Scene, Config, torch.device], Trainer] = Trainer,
 ) -> dict[str, Any]:
     """Train, render the test views and compare them with their photos.
 
@@ -100,6 +101,7 @@ def run_job(
         pictures: folder for photo, rendering and error of each test view.
         models: folder to keep the model in.
         start: where to continue from.
+        trainer: makes the training of nexwarp.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
@@ -118,7 +120,7 @@ def run_job(
     if row.preset is None:
         trained = _train_gsplat(job, row, scene, device)
     else:
-        trained = _train_nexwarp(job, row, scene, device, models, start)
+        trained = _train_nexwarp(job, scene, lambda: trainer(scene, config_of(job, row), device), models, start)
     peak = _peak("peak_mib", device)
     views = _compare(job, trained.renderings, pictures)
     coded = _compare(job, trained.compact, None)
@@ -185,10 +187,11 @@ def _peak(name: str, device: torch.device) -> dict[str, int]:
 
 
 def _train_nexwarp(
-    job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None, start: SharedStart | None
+    job: TrainingJob, scene: Scene, make: Callable[[], Trainer], models: Path | None, start: SharedStart | None
 ) -> Trained:
     begin = time.perf_counter()
-    trainer = Trainer(scene, config_of(job, row), device)
+    trainer = make()
+    device = trainer.device
     shared = {}
     if start is not None:
         _restore(trainer, start.folder)
