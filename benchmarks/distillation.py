@@ -1,14 +1,16 @@
-"""Distillation: a training that also learns from the renderings of other models, from cameras between the photos'.
+"""Distillation: a training that also learns from the renderings of other models, from cameras near the photos'.
 
 Usage: `python -m benchmarks.distillation OUT.jsonl --scenes fox,saharov [--variant inner] [--teachers 3]
 [--teacher-iterations 9000] [--share 0.5] [--iterations 30000] [--size 40000] [--seed 0] [--downscale 1] [--data DIR]`.
-For each scene, teachers are trained with as many primitives and the seeds after 10 times the student's, then the
-student. A line of OUT is one of `benchmarks.quality` and names teachers and share; its seconds are the student's.
+For each scene, teachers of the same size are trained, then the student. With S the student's seed, the teachers' are
+100 S + 1, 100 S + 2 and so on. A line of OUT is one of `benchmarks.quality` and names teachers and share; its seconds
+and, but for memory, all other figures are the student's.
 """
 
 import argparse
 import dataclasses
 import json
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -29,8 +31,9 @@ from nexwarp.train.target import Target
 class Student(Trainer):
     """A training in which a share of the steps compare with renderings of teachers instead of photos.
 
-    Each of these steps renders one teacher, drawn at random, at the photos' mean exposure, from a camera between two
-    training cameras (`between`). So the student regresses to the mean of the teachers, whose errors differ.
+    Each of these steps renders one teacher, drawn at random, at the photos' mean exposure, from a camera on the line
+    through two training cameras (`between`). So the student regresses to the mean of the teachers, whose errors differ.
+    Its random numbers are not part of checkpoints.
     """
 
     def __init__(
@@ -46,13 +49,12 @@ class Student(Trainer):
             share: of the steps that learn from teachers, 0 to 1.
 
         Raises:
-            ValueError: no teachers, or the share is out of range.
+            ValueError: no teachers, the share is out of range, or poses are learned.
         """
-        if not teachers:
-            raise ValueError("teachers: expected at least one model, got none")
-        if not 0 <= share <= 1:
-            raise ValueError(f"share: expected a number from 0 to 1, got {share}")
+        check_distillation(len(teachers), share)
         super().__init__(scene, config, device)
+        if self.poses is not None:
+            raise ValueError("config: expected fixed poses and sharp photos, got refine_poses or blur_poses")
         self.teachers, self.share = teachers, share
         self.chance = torch.Generator().manual_seed(config.seed)
         self.upcoming: list[tuple[int, Camera]] = []
@@ -68,7 +70,7 @@ class Student(Trainer):
         teacher = self.teachers[int(torch.randint(len(self.teachers), (), generator=self.chance))]
         with torch.no_grad():
             image = teacher.render(camera, background=target.background, exposure="mean").image.clone()
-        # Gains of 1 and depths of 0, which stand for no point, leave the step's CUDA graph as it is with photos.
+        # Gains of 1 and depths of 0, which stand for no point: without masks, photos' steps have the same CUDA graph.
         exposure = None if target.exposure is None else torch.ones_like(target.exposure)
         depths = None if target.expected is None else torch.zeros_like(target.expected)
         made = dataclasses.replace(target, camera=camera, photo=image, exposure=exposure, expected=depths)
@@ -83,17 +85,36 @@ class Student(Trainer):
         return self.upcoming.pop()
 
 
+def check_distillation(teachers: int, share: float) -> None:
+    """Raise ValueError for no teachers, or a share that is not one."""
+    if teachers < 1:
+        raise ValueError(f"teachers: expected at least one, got {teachers}")
+    if not 0 <= share <= 1:
+        raise ValueError(f"share: expected a number from 0 to 1, got {share}")
+
+
 def train_teachers(job: TrainingJob, data: Path, count: int, iterations: int) -> tuple[list[Model], float]:
-    """Train models with other seeds than a job's; return them, and the seconds that their steps took."""
+    """Train models with seeds of their own.
+
+    Args:
+        job: the student's; with its seed S, the teachers' are 100 S + 1 to 100 S + count.
+        data: folder of the scenes.
+        count: how many.
+        iterations: of each.
+
+    Returns:
+        The models, and the seconds from the loaded scene to the last finished model.
+    """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    teachers, seconds = [], 0.0
+    scene, teachers, begin = scene_of(job, data), [], time.perf_counter()
     for number in range(1, count + 1):
-        one = dataclasses.replace(job, seed=10 * job.seed + number, iterations=iterations)
-        trainer = Trainer(scene_of(one, data), config_of(one, DEFAULT), device)
+        one = dataclasses.replace(job, seed=100 * job.seed + number, iterations=iterations)
+        trainer = Trainer(scene, config_of(one, DEFAULT), device)
         trainer.run()
         teachers.append(trainer.finish())
-        seconds += trainer.seconds
-    return teachers, seconds
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return teachers, time.perf_counter() - begin
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -112,6 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--downscale", type=int, default=1, help="reduce photos by (default: %(default)s)")
     add("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     given = parser.parse_args(arguments)
+    check_distillation(given.teachers, given.share)
     for scene in given.scenes.split(","):
         row = f"{given.teachers} teachers of {given.teacher_iterations}, {given.share:g}"
         job = TrainingJob(scene, given.variant, row, given.size, given.seed, given.iterations, given.downscale)

@@ -101,7 +101,7 @@ def run_job(
         pictures: folder for photo, rendering and error of each test view.
         models: folder to keep the model in.
         start: where to continue from.
-        trainer: makes the training of nexwarp.
+        trainer: makes a training of nexwarp from scene, settings and device; gsplat's rows do not use it.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
