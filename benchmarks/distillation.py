@@ -73,8 +73,9 @@ class Student(Trainer):
         # Gains of 1 and depths of 0, which stand for no point: without masks, photos' steps have the same CUDA graph.
         exposure = None if target.exposure is None else torch.ones_like(target.exposure)
         depths = None if target.expected is None else torch.zeros_like(target.expected)
-        made = dataclasses.replace(target, camera=camera, photo=image, exposure=exposure, expected=depths)
-        return dataclasses.replace(made, counts=None, empty=None)
+        return dataclasses.replace(
+            target, camera=camera, photo=image, exposure=exposure, expected=depths, counts=None, empty=None
+        )
 
     def _next_camera(self) -> tuple[int, Camera]:
         """Return a training view's index and a camera near its own; each view's turn comes once in a round."""
