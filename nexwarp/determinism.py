@@ -1,5 +1,6 @@
 """Random seeds, torch's threads, and operations whose results do not depend on the order of threads."""
 
+import hashlib
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,3 +64,15 @@ def seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
     torch.manual_seed(seed)
+
+
+def derived_seed(seed: int, number: int, stream: int) -> int:
+    """Return a seed of its own for each of many series of random numbers, for `torch.Generator.manual_seed`.
+
+    Args:
+        seed: of the training.
+        number: of what they are for, such as a view among all that the training sees.
+        stream: number of the series.
+    """
+    digest = hashlib.blake2b(f"{seed} {number} {stream}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 1  # manual_seed takes 63 bits

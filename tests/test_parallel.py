@@ -16,6 +16,7 @@ from benchmarks import scaling
 from nexwarp.cli import device
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
+from nexwarp.determinism import derived_seed
 from nexwarp.distributed import join, liveness
 from nexwarp.distributed.join import Place, first_difference, join_store
 from nexwarp.distributed.launch import check_count
@@ -27,7 +28,7 @@ from nexwarp.train import presets
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside, view_seed
+from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import (
     CPU,
@@ -146,7 +147,7 @@ def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
     assert all(len(set(each)) == 1 for each in order)  # all sizes agree
     for epoch in range(3):
         assert sorted(each[0] for each in order[epoch * views : (epoch + 1) * views]) == list(range(views))
-    assert len({view_seed(0, n, k) for n in range(1000) for k in range(2)}) == 2000
+    assert len({derived_seed(0, n, k) for n in range(1000) for k in range(2)}) == 2000
 
 
 def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:

@@ -24,6 +24,7 @@ from nexwarp.distributed.launch import check_count
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
+from nexwarp.model.model_file import load
 from nexwarp.run.folder import (
     DEMO,
     SceneSource,
@@ -83,6 +84,11 @@ class Train:
     """K: number of ray-surfel hits textured in each pixel, 0 to 8; 0 trains without a texture."""
     refine_poses: bool = False
     """Learn a small correction of each training pose, for poses that are not exact (docs/poses.md)."""
+    teachers: Annotated[
+        tyro.conf.UseAppendAction[tuple[Path, ...]],
+        tyro.conf.arg(name="teacher", metavar="RUN", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """Also learn from the renderings of a finished run of the scene, for few photos (docs/sparse.md)."""
     preset: Preset_ = "default"
     """Settings to start from: nexwarp's defaults, those of the paper (docs/paper.md), or `web`, defaults with a smaller
     texture network for web pages on weak GPUs (docs/web.md)."""
@@ -200,6 +206,7 @@ class Train:
     def _trainer(self, source: SceneSource, config: Config, ranks: Ranks, resume: bool, console: Console) -> Trainer:
         """Load the scene and return the trainer."""
         device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
+        teachers = [load(run) for run in self.teachers]  # before the photos: a wrong path is told at once
         console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = shared_scene(lambda: source.load(progress), ranks)
@@ -209,7 +216,9 @@ class Train:
             f"{len(scene.points):,} points"
         )
         config = self._with_background(config, scene, resume)
-        return Trainer(scene, config, device) if ranks.size == 1 else ParallelTrainer(scene, config, device, ranks)
+        if ranks.size == 1:
+            return Trainer(scene, config, device, teachers=teachers)
+        return ParallelTrainer(scene, config, device, ranks, teachers=teachers)
 
     def _sinks(self) -> list[str]:
         """Return where to log beside the run's file."""

@@ -201,6 +201,8 @@ class TrainingSession:
             "iterations_per_second": rate,
             "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         }
+        if trainer.teachers is not None:
+            facts["teachers"] = len(trainer.teachers.models)
         rows = {}
         if scene.test:
             mask_mode = trainer.config.mask_mode

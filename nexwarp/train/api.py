@@ -1,7 +1,7 @@
 """Training from Python."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 
@@ -24,6 +24,7 @@ def train(
     callbacks: Iterable[Callback] = (),
     losses: Mapping[str, OwnLoss] | None = None,
     optimizer: OptimizerMaker | None = None,
+    teachers: Sequence[Model] = (),
 ) -> Model:
     """Train a scene and return the finished model, as `nexwarp train` does, without writing files.
 
@@ -48,6 +49,8 @@ def train(
             the first one. When surfels are split or removed, state tensors of their parameter's shape get the same
             rows, and zeros for new surfels; all other state is kept. An own optimizer runs in CUDA graphs if its groups
             have `capturable=True` and learning rates that are tensors on the GPU; else without.
+        teachers: trained models of the scene, for few photos; they are moved to the device. Every other step compares
+            with a rendering of one, at the mean exposure, from a camera on the line through those of two photos.
 
     Returns:
         The finished model on the device.
@@ -62,13 +65,10 @@ def train(
         raise TypeError(f"scene: expected a nexwarp.Scene, got {type(scene).__name__}")
     if config is not None and not isinstance(config, Config):
         raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
-    observers = list(callbacks)
-    for index, callback in enumerate(observers):
-        if not callable(callback):
-            raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
+    observers = _checked(callbacks)
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    trainer = Trainer(scene, config or Config(), device, losses=losses, optimizer=optimizer)
+    trainer = Trainer(scene, config or Config(), device, losses=losses, optimizer=optimizer, teachers=teachers)
 
     def observe(report: StepReport) -> None:
         for callback in observers:
@@ -76,3 +76,12 @@ def train(
 
     trainer.run(observe, lambda message: warnings.warn(message, stacklevel=2))
     return trainer.finish()
+
+
+def _checked(callbacks: Iterable[Callback]) -> list[Callback]:
+    """Return callbacks as a list; TypeError for one that is no function."""
+    observers = list(callbacks)
+    for index, callback in enumerate(observers):
+        if not callable(callback):
+            raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
+    return observers

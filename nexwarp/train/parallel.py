@@ -7,18 +7,20 @@ change, so that all ranks change them alike. `Config.iterations` and all schedul
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from nexwarp.data import Scene
+from nexwarp.determinism import derived_seed
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.memory import needed_memory
 from nexwarp.model.frames import capturing
+from nexwarp.model.model import Model
 from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
@@ -53,6 +55,7 @@ class ParallelTrainer(Trainer):
         *,
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
+        teachers: Sequence[Model] = (),
         beside: bool | None = None,
     ) -> None:
         """Make the same initial surfels and texture on all ranks.
@@ -64,6 +67,7 @@ class ParallelTrainer(Trainer):
             ranks: all ranks.
             losses: see `Trainer`.
             optimizer: see `Trainer`.
+            teachers: see `Trainer`; the same on all ranks.
             beside: sum gradients after a CUDA graph instead of inside; None decides by `sums_beside`.
 
         Raises:
@@ -74,7 +78,7 @@ class ParallelTrainer(Trainer):
             raise SceneError(
                 f"{scene.path}: expected at most as many ranks as training views, {len(scene.train)}, got {ranks.size}"
             )
-        super().__init__(scene, config, device, losses=losses, optimizer=optimizer)
+        super().__init__(scene, config, device, losses=losses, optimizer=optimizer, teachers=teachers)
         self.ranks = ranks
         ranks.check_same(
             {
@@ -82,6 +86,7 @@ class ParallelTrainer(Trainer):
                 "training cameras": self.views.fingerprint()[:12],
                 "scene": self._scene_digest[:12],
                 "background": str(self.background),
+                "teachers": self._teachers_digest[:12],
             }
         )
         # The same already, unless the ranks' processors round differently.
@@ -101,15 +106,15 @@ class ParallelTrainer(Trainer):
     def _next_target(self) -> Target:
         ranks, first = self.ranks, self.iteration
         self.views_a_step = max(1, min(ranks.size, self.config.iterations - first))
-        chosen = [self._next_view() for _ in range(self.views_a_step)]
+        chosen = [self._next_view(number) for number in range(first + 1, first + 1 + self.views_a_step)]
         # Where views of the last step are fewer than ranks, the others repeat one with weight 0.
         self.share = 1.0 / self.views_a_step if ranks.rank < self.views_a_step else 0.0
         mine = ranks.rank % self.views_a_step
         self.iteration += self.views_a_step
         for offset, generator in enumerate((self.targets.generator, self.targets.noise)):
-            generator.manual_seed(view_seed(self.config.seed, first + mine + 1, offset))
+            generator.manual_seed(derived_seed(self.config.seed, first + mine + 1, offset))
         upcoming = self.order[-1 - ranks.rank :: -ranks.size][:2]
-        return self.targets.make(chosen[mine], self.iteration, upcoming)
+        return self._target(chosen[mine], first + mine + 1, upcoming)
 
     def _run_step(self, target: Target) -> StepResult:
         result = super()._run_step(target)
@@ -232,15 +237,3 @@ def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
         group["ends"] = first * math.sqrt(views), last * math.sqrt(views)
         if isinstance(optimizer, torch.optim.Adam):
             group["betas"] = tuple(beta**views for beta in group["betas"])
-
-
-def view_seed(seed: int, number: int, stream: int) -> int:
-    """Return the seed of a view's random numbers.
-
-    Args:
-        seed: of the training.
-        number: of the view among all that the training sees, from 1.
-        stream: number of the generator.
-    """
-    digest = hashlib.blake2b(f"{seed} {number} {stream}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") >> 1  # manual_seed takes 63 bits

@@ -182,14 +182,17 @@ def restore_random(
     random.setstate((version, tuple(internal), gauss))
 
 
-def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str, *, extend: bool = False) -> None:
-    """Raise ValueError unless a snapshot comes from a run of this scene with these settings.
+def check_origin(
+    snapshot: Snapshot, config: Config, views: str, scene: str, teachers: str = "", *, extend: bool = False
+) -> None:
+    """Raise ValueError unless a snapshot comes from a run of this scene with these settings and teachers.
 
     Args:
         snapshot: as it was read.
         config: settings.
         views: fingerprint of the training views.
         scene: digest of the scene.
+        teachers: digest of the teachers; empty without any.
         extend: whether the run may have had fewer iterations.
     """
     state = snapshot.state
@@ -202,6 +205,8 @@ def check_origin(snapshot: Snapshot, config: Config, views: str, scene: str, *, 
         raise ValueError("it has seen other training views than the scene has")
     if state["scene"] != scene:
         raise ValueError("the scene's photos, masks or points have changed since")
+    if state.get("teachers", "") != teachers:
+        raise ValueError("it has learned from other teachers")
 
 
 def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, reduce
 from pathlib import Path
 
@@ -51,6 +51,7 @@ from nexwarp.train.state import (
 )
 from nexwarp.train.step_losses import OwnLoss, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker, refined
+from nexwarp.train.teachers import Teachers
 from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
@@ -72,6 +73,7 @@ class Trainer:
         views: the training views on the device.
         exposures: of the training photos; None where they have one exposure.
         poses: corrections and motions of the training poses; None where neither is learned.
+        teachers: other models of the scene that every other step learns from; None where there are none.
         background: colour behind everything, three numbers.
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
@@ -88,6 +90,7 @@ class Trainer:
         *,
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
+        teachers: Sequence[Model] = (),
     ) -> None:
         """Make the initial surfels and texture.
 
@@ -97,15 +100,17 @@ class Trainer:
             device: where to train.
             losses: own losses by name, added to ours; see `nexwarp.train`.
             optimizer: makes an optimizer of the parameter groups; None is Adam; see `nexwarp.train`.
+            teachers: trained models of the scene, to learn from their renderings too; see `nexwarp.train`.
 
         Raises:
             SceneError: the scene has no training views.
-            TypeError, ValueError: own losses or the optimizer do not fit.
+            TypeError, ValueError: own losses, the optimizer or teachers do not fit.
         """
         if not scene.train:
             raise SceneError(f"{scene.path}: expected at least one training view, got none")
         self.scene, self.config, self.device = scene, config, torch.device(device)
         self.own_losses, self.own_optimizer = check_own_losses(losses), optimizer
+        self.teachers = Teachers(teachers, scene, config, self.device) if teachers else None
         seed_everything(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
@@ -191,7 +196,14 @@ class Trainer:
 
     def _next_target(self) -> Target:
         self.iteration += 1
-        return self.targets.make(self._next_view(), self.iteration, self.order[:-3:-1])
+        return self._target(self._next_view(self.iteration), self.iteration, self.order[:-3:-1])
+
+    def _target(self, index: int, number: int, upcoming: list[int]) -> Target:
+        """Make the target of the view with that number in the training; see `TargetMaker.make`."""
+        target = self.targets.make(index, self.iteration, upcoming)
+        if self.teachers is None or not self.teachers.has_turn(number):
+            return target
+        return self.teachers.show(target, number)
 
     def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
         surfels = initial_surfels(self.scene, self.config, self.generator, colors)
@@ -201,7 +213,10 @@ class Trainer:
         made = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
         return make_optimizer(self.surfels, self.texture, *made)
 
-    def _next_view(self) -> int:
+    def _next_view(self, number: int) -> int:
+        """Return the index of the training view with that number in the training, from 1."""
+        if self.teachers is not None and self.teachers.has_turn(number):
+            return self.teachers.turn(number)[0]
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
@@ -325,11 +340,12 @@ class Trainer:
 
         Raises:
             FileNotFoundError: there is none.
-            ValueError: they are damaged, or scene, settings or optimizer differ.
+            ValueError: they are damaged, or scene, settings, optimizer or teachers differ.
         """
         snapshot = self._read(run, warn)
         try:
-            check_origin(snapshot, self.config, self.views.fingerprint(), self._scene_digest, extend=extend)
+            origin = self.views.fingerprint(), self._scene_digest, self._teachers_digest
+            check_origin(snapshot, self.config, *origin, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
@@ -349,6 +365,7 @@ class Trainer:
         state = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order), **generators}
         state |= {"views": self.views.fingerprint(), "scene": self._scene_digest, "config": self.config.as_dict()}
         state |= {"rate_factor": self.rate_factor} | ({} if optimizer is None else {"optimizer": optimizer})
+        state |= {"teachers": self._teachers_digest} if self.teachers is not None else {}
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
 
     def load_snapshot(self, snapshot: Snapshot) -> None:
@@ -373,6 +390,10 @@ class Trainer:
     @cached_property
     def _scene_digest(self) -> str:
         return scene_digest(self.scene, self.texture)
+
+    @cached_property
+    def _teachers_digest(self) -> str:
+        return "" if self.teachers is None else self.teachers.digest()
 
     def _named_parameters(self) -> Iterator[tuple[str, torch.nn.Parameter]]:
         return named_parameters(self.surfels, self.texture, self.poses)

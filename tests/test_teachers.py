@@ -1,0 +1,194 @@
+"""Training that also learns from teachers: what its steps compare with, resuming, ranks, errors."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks.distillation import main, train_teachers
+from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.rows import DEFAULT
+from benchmarks.quality.scenes import scene_of
+from nexwarp import Config, Model, Scene, Trainer
+from nexwarp.cli import main as cli
+from nexwarp.errors import CheckpointError
+from nexwarp.run.evaluate import METRICS
+from nexwarp.train.config import TextureConfig
+from nexwarp.train.teachers import Teachers
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+CPU = torch.device("cpu")
+CONFIG = Config(
+    iterations=12,
+    max_surfels=60,
+    exposures=False,
+    background=(0.5, 0.4, 0.3),
+    skybox=0,  # its colours are of the photos
+    texture=TextureConfig(levels=4, table_size=1024),
+)
+
+
+@pytest.fixture(scope="module")
+def teachers(tiny_scene: Scene) -> list[Model]:
+    return [nw.train(tiny_scene, dataclasses.replace(CONFIG, seed=seed), device=CPU) for seed in (1, 2)]
+
+
+def learned(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Return all learned tensors."""
+    return trainer.surfels.state_dict() | {f"texture.{k}": x for k, x in trainer.texture.state_dict().items()}
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(x, other[name]) for name, x in one.items())
+
+
+def test_every_other_step_has_a_teachers_picture_at_the_mean_exposure(tiny_scene: Scene, teachers: list[Model]) -> None:
+    student = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    views, shown = {view.camera.viewmat: view.image / 255 for view in tiny_scene.train}, set()
+    for number in range(1, 4 * len(views) + 1):
+        target = student._next_target()
+        assert student.iteration == number
+        photos = [photo for viewmat, photo in views.items() if torch.equal(viewmat, target.camera.viewmat)]
+        if number % 2 == 0:
+            assert len(photos) == 1 and torch.allclose(target.photo, photos[0])
+            continue
+        pictures = [m.render(target.camera, background=target.background, exposure="mean").image for m in teachers]
+        alike = [torch.equal(picture, target.photo) for picture in pictures]
+        assert not photos and sum(alike) == 1
+        shown.add(alike.index(True))
+    assert shown == {0, 1}
+
+
+def test_photos_and_cameras_near_each_have_their_turn_once_in_a_round(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Two numbers of a round, one for a photo and one for a teacher, for each view."""
+    student, views = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers), len(tiny_scene.train)
+    for round_ in range(3):
+        numbers = range(2 * views * round_ + 1, 2 * views * (round_ + 1) + 1)
+        chosen = [student._next_view(number) for number in numbers]
+        assert sorted(chosen[0::2]) == sorted(chosen[1::2]) == [*range(views)]
+
+
+def test_turns_follow_from_seed_and_number_alone(tiny_scene: Scene, teachers: list[Model]) -> None:
+    one, other = (Teachers(teachers, tiny_scene, CONFIG, CPU) for _ in range(2))
+    numbers = [99, 3, 1, 41, 99]
+    forward = {number: one.turn(number) for number in sorted(numbers)}
+    for number in numbers:
+        index, camera, model = other.turn(number)
+        assert index == forward[number][0] and model is forward[number][2]
+        assert torch.equal(camera.viewmat, forward[number][1].viewmat)
+    seeded = Teachers(teachers, tiny_scene, dataclasses.replace(CONFIG, seed=5), CPU)
+    assert any(not torch.equal(seeded.turn(n)[1].viewmat, one.turn(n)[1].viewmat) for n in numbers)
+
+
+def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Its gains, its points and its mask; the teacher's picture has none of them."""
+    masks = [torch.ones(view.image.shape[:2], dtype=torch.bool) for view in tiny_scene.train]
+    for mask in masks:
+        mask[0] = False
+    views = [dataclasses.replace(view, mask=mask) for view, mask in zip(tiny_scene.train, masks, strict=True)]
+    student = Trainer(dataclasses.replace(tiny_scene, train=views), CONFIG, CPU, teachers=teachers)
+    student.views.gains = torch.full((len(views), 3), 1.5)
+    for _ in range(len(views)):
+        taught, of_photo = student._next_target(), student._next_target()
+        assert of_photo.counts is not None and of_photo.exposure is not None and bool((of_photo.exposure == 1.5).all())
+        assert of_photo.expected is not None and bool(of_photo.expected.any())
+        assert taught.counts is None and taught.empty is None
+        assert taught.exposure is not None and bool((taught.exposure == 1).all())
+        assert taught.expected is not None and not taught.expected.any()
+
+
+def test_teachers_stay_as_they_are(tiny_scene: Scene, teachers: list[Model]) -> None:
+    before = [{name: x.clone() for name, x in model.state_dict().items()} for model in teachers]
+    nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
+    assert all(same(old, model.state_dict()) for old, model in zip(before, teachers, strict=True))
+
+
+def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
+    tiny_scene: Scene, teachers: list[Model], tmp_path: Path
+) -> None:
+    whole = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    whole.run()
+    begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    begun.run(until=7)
+    begun.save_checkpoint(tmp_path)
+    resumed = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    resumed.restore(tmp_path)
+    resumed.run()
+    assert same(learned(whole), learned(resumed))
+    alone = Trainer(tiny_scene, CONFIG, CPU)
+    alone.run()
+    assert not torch.equal(learned(whole)["sh0"], learned(alone)["sh0"])
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["without teachers", "fewer teachers"])
+def test_a_checkpoint_of_other_teachers_is_refused(
+    tiny_scene: Scene, teachers: list[Model], tmp_path: Path, number: int
+) -> None:
+    begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    begun.run(until=3)
+    begun.save_checkpoint(tmp_path)
+    with pytest.raises(CheckpointError, match="learned from other teachers"):
+        Trainer(tiny_scene, CONFIG, CPU, teachers=teachers[:number]).restore(tmp_path)
+
+
+def test_learned_poses_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
+    for changes in ({"refine_poses": True}, {"blur_poses": 3}):
+        with pytest.raises(ValueError, match="teachers: expected refine_poses=False and blur_poses=1"):
+            Trainer(tiny_scene, dataclasses.replace(CONFIG, **changes), CPU, teachers=teachers)
+
+
+def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
+    larger = dataclasses.replace(tiny_scene, scale=2 * tiny_scene.scale)
+    with pytest.raises(ValueError, match=r"teachers\[0\]: expected a model of .* whose scale is"):
+        nw.train(larger, CONFIG, device=CPU, teachers=teachers)
+    with pytest.raises(TypeError, match=r"teachers\[1\]: expected a nexwarp.Model, got str"):
+        nw.train(tiny_scene, CONFIG, device=CPU, teachers=[teachers[0], "runs/b"])  # type: ignore[list-item]
+
+
+def test_the_command_learns_from_runs(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--iterations", "10", "--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024"]
+    for name, seed in (("a", "1"), ("b", "2")):
+        assert cli.main(["train", str(tiny_folder), "--run", name, "--seed", seed, *options]) == 0
+    train = ["train", str(tiny_folder), "--run", "c", "--teacher", "a", "--teacher", "b"]
+    assert cli.main([*train, *options]) == 0
+    assert json.loads(Path("c/metrics.json").read_text())["teachers"] == 2
+    assert "teachers" not in json.loads(Path("a/metrics.json").read_text())
+    capsys.readouterr()
+    assert cli.main([*train, "--teacher", "none", "--run", "d", *options]) == 2
+    assert "none: expected a model file, or a run folder" in " ".join(capsys.readouterr().err.split())
+    assert not Path("d/config.json").exists()
+
+
+def test_the_benchmarks_teachers_have_seeds_of_their_own(tiny_folder: Path) -> None:
+    """And are trained as any model of that seed."""
+    job = TrainingJob(tiny_folder.name, "", "mine", 60, 3, 12)
+    found, seconds = train_teachers(job, tiny_folder.parent, 2, 8)
+    for number, teacher in enumerate(found, 1):
+        one = dataclasses.replace(job, seed=300 + number, iterations=8)
+        trainer = Trainer(scene_of(one, tiny_folder.parent), config_of(one, DEFAULT), CPU)
+        trainer.run()
+        assert torch.equal(trainer.finish().surfels.means, teacher.surfels.means)
+    assert seconds > 0
+
+
+def test_the_benchmarks_line_names_the_teachers(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
+    out = tmp_path / "out.jsonl"
+    command = [str(out), "--scenes", tiny_folder.name, "--data", str(tiny_folder.parent), "--variant", ""]
+    command += ["--teacher-iterations", "8", "--iterations", "10", "--size", "60", "--seed", "3", "--teachers"]
+    assert main([*command, "2"]) == 0
+    line = json.loads(out.read_text())
+    assert (line["row"], line["iterations"], line["seed"]) == ("2 teachers of 8", 10, 3)
+    assert line["teachers"]["count"] == 2 and line["teachers"]["seconds"] > 0
+    with pytest.raises(SystemExit):
+        main([*command, "0"])
+    assert "--teachers: expected at least one, got 0" in capsys.readouterr().err
