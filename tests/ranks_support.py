@@ -20,6 +20,7 @@ from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.kernels.launch import set_num_threads
+from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.trainer import Trainer
@@ -142,10 +143,10 @@ def kept_gradients(trainer: Trainer) -> Iterator[list[dict[str, torch.Tensor]]]:
     trainer.optimizer.step = step  # type: ignore[method-assign]
 
 
-def alone_as(rank: int, size: int, scene: Scene, config: Config) -> ParallelTrainer:
+def alone_as(rank: int, size: int, scene: Scene, config: Config, teachers: Sequence[Model] = ()) -> ParallelTrainer:
     """A trainer in one process that takes the views of one of several ranks and sends nothing."""
     ranks = Ranks.alone(CPU)
-    trainer = ParallelTrainer(scene, config, CPU, ranks)
+    trainer = ParallelTrainer(scene, config, CPU, ranks, teachers=teachers)
     ranks.rank, ranks.size = rank, size
     trainer.reducer.overlapped, trainer.reducer = False, Unsent(None)
     return trainer

@@ -110,6 +110,18 @@ def test_masks_too(tiny_scene: Scene, mode: str) -> None:
     assert_same_state(trained(scene, mask_mode=mode), launched)
 
 
+def test_teachers_too(tiny_scene: Scene) -> None:
+    """Steps with a teacher's picture have the graph of steps with photos."""
+    teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
+    for graphs in (False, True):
+        config = Config(**(SETTINGS | {"cuda_graphs": graphs}))
+        runs.append(Trainer(tiny_scene, config, "cuda", teachers=teachers))
+        runs[-1].run()
+    launched, replayed = runs
+    assert graphs_of(replayed) == 1
+    assert_same_state(replayed, launched)
+
+
 def test_each_step_has_its_own_losses(tiny_scene: Scene) -> None:
     """They are read later, when the graph has long written others."""
     seen: dict[bool, list[dict[str, torch.Tensor]]] = {}

@@ -18,6 +18,7 @@ from nexwarp.errors import CheckpointError
 from nexwarp.run.evaluate import METRICS
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.teachers import Teachers
+from tests.ranks_support import alone_as
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -82,6 +83,17 @@ def test_turns_follow_from_seed_and_number_alone(tiny_scene: Scene, teachers: li
         assert torch.equal(camera.viewmat, forward[number][1].viewmat)
     seeded = Teachers(teachers, tiny_scene, dataclasses.replace(CONFIG, seed=5), CPU)
     assert any(not torch.equal(seeded.turn(n)[1].viewmat, one.turn(n)[1].viewmat) for n in numbers)
+
+
+def test_ranks_share_the_turns_of_one_process(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Whatever their number: the target of each number is that of a training on one GPU, but for random numbers."""
+    alone = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    expected = [alone._next_target() for _ in range(12)]
+    for size in (2, 3):
+        trainers = [alone_as(rank, size, tiny_scene, CONFIG, teachers) for rank in range(size)]
+        found = [trainer._next_target() for _ in range(12 // size) for trainer in trainers]
+        for mine, theirs in zip(found, expected, strict=True):
+            assert torch.equal(mine.camera.viewmat, theirs.camera.viewmat) and torch.equal(mine.photo, theirs.photo)
 
 
 def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: list[Model]) -> None:
