@@ -34,6 +34,7 @@ from nexwarp.run.folder import (
     keep_camera_path,
     prepare_run,
     read_run,
+    read_teachers,
     rewrite_config,
 )
 from nexwarp.run.log_sinks import PACKAGES, check_package
@@ -156,7 +157,7 @@ class Train:
                     console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
             with self._viewer(trainer, run, source.name, console) as viewer:
                 if not resume and ranks.first:
-                    names = create_run(run, source, trainer.config, ranks.device.type, ranks.launch)
+                    names = create_run(run, source, trainer.config, ranks.device.type, ranks.launch, self.teachers)
                     _tell_foreign(console, run, names)
                 session.train(viewer)
                 model = session.finish()
@@ -192,21 +193,24 @@ class Train:
             resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
             if resume:
                 source = self._resumed_source(source, run)
+                self.teachers = self.teachers or read_teachers(run)
             config = self._config(run, resume)
             self._check()
         if ranks.size > 1:
-            mine = None if config is None else [dataclasses.asdict(source), config.as_dict(), resume]
+            mine = None
+            if config is not None:
+                mine = [dataclasses.asdict(source), config.as_dict(), resume, [str(path) for path in self.teachers]]
             told = ranks.share(mine)
             assert isinstance(told, list)
             source, config = SceneSource(**(told[0] | {"path": source.path})), config_from_dict(told[1])
-            resume = told[2]
+            resume, self.teachers = told[2], tuple(map(Path, told[3]))
         assert config is not None
         return source, config, resume
 
     def _trainer(self, source: SceneSource, config: Config, ranks: Ranks, resume: bool, console: Console) -> Trainer:
         """Load the scene and return the trainer."""
         device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
-        teachers = [load(run) for run in self.teachers]  # before the photos: a wrong path is told at once
+        teachers = [load(path) for path in self.teachers]
         console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = shared_scene(lambda: source.load(progress), ranks)
@@ -225,7 +229,9 @@ class Train:
         return [name for name in PACKAGES if getattr(self, name)]
 
     def _check(self) -> None:
-        """Raise SettingError for invalid options, before the photos are read."""
+        """Raise SettingError for invalid options, and an error for a damaged teacher, before the photos are read."""
+        for path in self.teachers:
+            load(path)
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.downscale < 1:
@@ -327,7 +333,17 @@ class Train:
         base = preset(self.preset)
         if self.scene == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
-        return with_flag_settings(with_settings(base, given), settings)
+        config = with_flag_settings(with_settings(base, given), settings)
+        self._check_teachers(run, config)
+        return config
+
+    def _check_teachers(self, run: Path, config: Config) -> None:
+        """Raise SettingError for a teacher that the run would replace, and for poses that teachers do not follow."""
+        for path in self.teachers:
+            if path.resolve().is_relative_to(run.resolve()):
+                raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
+        if self.teachers and (config.refine_poses or config.blur_poses > 1):
+            raise SettingError("--teacher: expected poses that stay as given, got --refine-poses or blur_poses")
 
     def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
         """Return the settings of the run to resume; a SettingError names an option that differs."""

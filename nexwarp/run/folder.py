@@ -7,7 +7,7 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,7 +129,9 @@ def _check_replaceable(run: Path) -> None:
         ) from None
 
 
-def create_run(run: Path, source: SceneSource, config: Config, device: str, launch: str = "") -> list[str]:
+def create_run(
+    run: Path, source: SceneSource, config: Config, device: str, launch: str = "", teachers: Sequence[Path] = ()
+) -> list[str]:
     """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
 
     The new config is on the disk before anything is deleted, and replaces the old config last, when the disk has stored
@@ -141,6 +143,7 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str, laun
         config: settings.
         device: type of the device.
         launch: of several ranks, as `began` recognises it.
+        teachers: folders or files of the models that it also learns from.
 
     Returns:
         Names of the files and folders that nexwarp did not write; they stay.
@@ -151,6 +154,8 @@ def create_run(run: Path, source: SceneSource, config: Config, device: str, laun
     if source.points is not None:
         scene["points"] = str(Path(source.points).resolve())
     data = {"scene": scene, "device": device, "config": config.as_dict()} | ({"launch": launch} if launch else {})
+    if teachers:
+        data["teachers"] = [str(path.resolve()) for path in teachers]
     with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(data, indent=2) + "\n").encode())
         sync(temporary)
@@ -216,11 +221,21 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         for name in ("follow_links", "skip_missing"):
             if not isinstance(scene.get(name, False), bool):
                 raise ValueError(f"scene: {name}: expected true or false, got {scene[name]!r}")
+        teachers = data.get("teachers", [])
+        if not isinstance(teachers, list) or not all(isinstance(path, str) for path in teachers):
+            raise ValueError(f"teachers: expected a list of paths, got {teachers!r}")
         known = {field.name for field in dataclasses.fields(SceneSource)}
         source = SceneSource(**{name: value for name, value in scene.items() if name in known})
         return source, config_from_dict(data["config"]), data
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
+
+
+def read_teachers(run: Path) -> tuple[Path, ...]:
+    """Return the folders or files of the models that a run also learns from; errors are those of `read_run`."""
+    paths = read_run(run)[2].get("teachers", [])
+    assert isinstance(paths, list)
+    return tuple(Path(str(path)) for path in paths)
 
 
 def read_metrics(run: Path) -> dict[str, Json]:

@@ -1,7 +1,7 @@
 """Training from Python."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import torch
 
@@ -24,7 +24,7 @@ def train(
     callbacks: Iterable[Callback] = (),
     losses: Mapping[str, OwnLoss] | None = None,
     optimizer: OptimizerMaker | None = None,
-    teachers: Sequence[Model] = (),
+    teachers: Iterable[Model] = (),
 ) -> Model:
     """Train a scene and return the finished model, as `nexwarp train` does, without writing files.
 

@@ -7,7 +7,7 @@ change, so that all ranks change them alike. `Config.iterations` and all schedul
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import torch
@@ -55,7 +55,7 @@ class ParallelTrainer(Trainer):
         *,
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
-        teachers: Sequence[Model] = (),
+        teachers: Iterable[Model] = (),
         beside: bool | None = None,
     ) -> None:
         """Make the same initial surfels and texture on all ranks.

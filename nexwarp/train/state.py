@@ -206,7 +206,7 @@ def check_origin(
     if state["scene"] != scene:
         raise ValueError("the scene's photos, masks or points have changed since")
     if state.get("teachers", "") != teachers:
-        raise ValueError("it has learned from other teachers")
+        raise ValueError("it has learned from other teachers, from others besides, or in another order")
 
 
 def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property, reduce
 from pathlib import Path
 
@@ -51,7 +51,7 @@ from nexwarp.train.state import (
 )
 from nexwarp.train.step_losses import OwnLoss, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker, refined
-from nexwarp.train.teachers import Teachers
+from nexwarp.train.teachers import make_teachers
 from nexwarp.train.views import TrainingViews, mean_color, with_cameras
 
 # Iterations between checks that all numbers are finite, and snapshots that a run takes, one replacing the other.
@@ -90,7 +90,7 @@ class Trainer:
         *,
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
-        teachers: Sequence[Model] = (),
+        teachers: Iterable[Model] = (),
     ) -> None:
         """Make the initial surfels and texture.
 
@@ -110,7 +110,7 @@ class Trainer:
             raise SceneError(f"{scene.path}: expected at least one training view, got none")
         self.scene, self.config, self.device = scene, config, torch.device(device)
         self.own_losses, self.own_optimizer = check_own_losses(losses), optimizer
-        self.teachers = Teachers(teachers, scene, config, self.device) if teachers else None
+        self.teachers = make_teachers(teachers, scene, config, self.device)
         seed_everything(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
@@ -201,9 +201,9 @@ class Trainer:
     def _target(self, index: int, number: int, upcoming: list[int]) -> Target:
         """Make the target of the view with that number in the training; see `TargetMaker.make`."""
         target = self.targets.make(index, self.iteration, upcoming)
-        if self.teachers is None or not self.teachers.has_turn(number):
+        if self.teachers is None or not self.teachers.teaches(number):
             return target
-        return self.teachers.show(target, number)
+        return self.teachers.target(target, number)
 
     def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
         surfels = initial_surfels(self.scene, self.config, self.generator, colors)
@@ -215,8 +215,8 @@ class Trainer:
 
     def _next_view(self, number: int) -> int:
         """Return the index of the training view with that number in the training, from 1."""
-        if self.teachers is not None and self.teachers.has_turn(number):
-            return self.teachers.turn(number)[0]
+        if self.teachers is not None and self.teachers.teaches(number):
+            return self.teachers.choice(number)[0]
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
