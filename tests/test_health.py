@@ -65,9 +65,9 @@ def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Tra
     trainers: list[Trainer] = []
     init = Trainer.__init__
 
-    def remember(self: Trainer, *args: Any) -> None:
+    def remember(self: Trainer, *args: Any, **options: Any) -> None:
         trainers.append(self)
-        init(self, *args)
+        init(self, *args, **options)
 
     def strike(*_: Any) -> None:
         if trainers[-1].iteration in iterations:
