@@ -19,6 +19,7 @@ from nexwarp.cli import main as cli
 from nexwarp.errors import CheckpointError
 from nexwarp.representation.exposures import Exposures
 from nexwarp.run.evaluate import METRICS
+from nexwarp.train.checkpoint import CHECKPOINTS
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.teachers import Teachers
 from tests.ranks_support import alone_as
@@ -241,7 +242,7 @@ def test_the_command_learns_from_runs(
     assert not any("teachers" in json.loads(Path(f"a/{name}.json").read_text()) for name in ("metrics", "config"))
     # A run resumes with its teachers, before its first checkpoint too.
     model = Path("c/model.safetensors").read_bytes()
-    for name in ("checkpoint", "checkpoint.old"):
+    for name in CHECKPOINTS:
         shutil.rmtree(Path("c", name), ignore_errors=True)
     Path("c/model.safetensors").unlink()
     assert train("c", "--resume") == 0

@@ -210,7 +210,7 @@ class Train:
     def _trainer(self, source: SceneSource, config: Config, ranks: Ranks, resume: bool, console: Console) -> Trainer:
         """Load the scene and return the trainer."""
         device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
-        teachers = [load(path) for path in self.teachers]
+        teachers = [load(path) for path in self.teachers]  # a wrong path is told before the photos are read
         console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = shared_scene(lambda: source.load(progress), ranks)
@@ -229,9 +229,7 @@ class Train:
         return [name for name in PACKAGES if getattr(self, name)]
 
     def _check(self) -> None:
-        """Raise SettingError for invalid options, and an error for a damaged teacher, before the photos are read."""
-        for path in self.teachers:
-            load(path)
+        """Raise SettingError for invalid options, before the photos are read."""
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.downscale < 1:
@@ -278,6 +276,8 @@ class Train:
         """Return the scene of a video; what would stop the training later stops it before the scene is made."""
         video = Path(self.scene)
         self._check()
+        for path in self.teachers:
+            load(path)
         run, scene = self.run or Path("runs") / video.stem, SceneSource(str(SCENES / video.stem))
         self._config(run, prepare_run(run, scene, **self._folder_flags(run, ranks)))
         return scene_of_video(video, console)

@@ -1,7 +1,7 @@
 """Learning from other models of the scene: every other step compares with a teacher's rendering. Not in the paper.
 
-Models that were trained with other seeds differ where photos say little. A student of several regresses to their mean,
-from cameras where there is no photo.
+Models that were trained with other seeds differ where photos say little. A student of several settles between them,
+also in views that no photo has.
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.target import Target
 
-EVERY = 2  # steps of which the last learns from a teacher; the log's lines are of odd steps, which have photos
+EVERY = 2  # the second of so many steps learns from a teacher: the log's lines are of odd steps, which have photos
 SAME_SCALE = 1e-3  # share by which the scale of a teacher's scene may differ from that of the training's
-STREAM = 2  # number of the random numbers; those of a view's target are 0 and 1
+STREAM = 2  # series of random numbers, as `derived_seed` counts them; those of a view's target are 0 and 1
 
 
 class Teachers:
@@ -82,23 +82,23 @@ class Teachers:
             self.round = round_
         return self.choices[place]
 
-    def target(self, target: Target, number: int) -> Target:
-        """Return the target of a step with a teacher: its rendering at the photos' mean exposure.
+    def target(self, of_photo: Target, number: int) -> Target:
+        """Return the target of a step with a teacher: the teacher's rendering at the photos' mean exposure.
 
         Args:
-            target: of the photo of the step's training view; it has the picture's size.
+            of_photo: target with the photo of the step's training view, whose size the rendering has.
             number: of the step.
         """
         _, near, teacher = self.choice(number)
-        c = target.camera
+        c = of_photo.camera
         camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near)
         with torch.no_grad(), self.launches():
-            picture = teacher.render(camera, background=target.background, exposure="mean").image.clone()
+            picture = teacher.render(camera, background=of_photo.background, exposure="mean").image.clone()
         # Gains of 1, and depths of 0, which stand for no point: without masks, steps with photos have the same graph.
-        exposure = None if target.exposure is None else torch.ones_like(target.exposure)
-        depths = None if target.expected is None else torch.zeros_like(target.expected)
+        exposure = None if of_photo.exposure is None else torch.ones_like(of_photo.exposure)
+        depths = None if of_photo.expected is None else torch.zeros_like(of_photo.expected)
         return dataclasses.replace(
-            target, camera=camera, photo=picture, exposure=exposure, expected=depths, counts=None, empty=None
+            of_photo, camera=camera, photo=picture, exposure=exposure, expected=depths, counts=None, empty=None
         )
 
     def digest(self) -> str:
