@@ -24,6 +24,7 @@ from benchmarks.quality.run import run_job
 from benchmarks.quality.scenes import VARIANTS, scene_of
 from benchmarks.timing import ROOT
 from nexwarp import Model, Trainer
+from nexwarp.train.stages import student_trainer
 
 
 def train_teachers(job: TrainingJob, data: Path, count: int, iterations: int, size: int) -> tuple[list[Model], float]:
@@ -43,7 +44,7 @@ def train_teachers(job: TrainingJob, data: Path, count: int, iterations: int, si
     scene, teachers, begin = scene_of(job, data), [], time.perf_counter()
     for number in range(1, count + 1):
         one = dataclasses.replace(job, seed=100 * job.seed + number, iterations=iterations, size=size)
-        trainer = Trainer(scene, config_of(one, DEFAULT), device)
+        trainer = Trainer(scene, dataclasses.replace(config_of(one, DEFAULT), teachers=0), device)
         trainer.run()
         teachers.append(trainer.finish())
     if device.type == "cuda":
@@ -75,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
         teachers, seconds = train_teachers(
             job, given.data, given.teachers, given.teacher_iterations, given.teacher_size or given.size
         )
-        result = run_job(job, given.data, DEFAULT, trainer=partial(Trainer, teachers=teachers))
+        result = run_job(job, given.data, DEFAULT, trainer=partial(student_trainer, teachers=teachers))
         result |= {"teachers": {"count": given.teachers, "iterations": given.teacher_iterations, "seconds": seconds}}
         if given.teacher_size:
             result["teachers"]["size"] = given.teacher_size

@@ -15,12 +15,11 @@ import torch
 import nexwarp as nw
 from benchmarks.peer_gsplat import PeerSettings
 from benchmarks.quality.__main__ import main
-from benchmarks.quality.jobs import TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
+from benchmarks.quality.jobs import ARC_VIEWS, TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import GSPLAT, MEGABYTES, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
 from benchmarks.quality.scenes import (
-    ARC_VIEWS,
     VARIANTS,
     held_out_arc,
     inner_validation,

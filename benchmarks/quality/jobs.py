@@ -20,11 +20,16 @@ from benchmarks.quality.rows import (
     SUSPECTS,
     Row,
 )
+from nexwarp.data.scene import TEST_EVERY
 from nexwarp.train.config import Config
 from nexwarp.train.presets import preset
 from nexwarp.train.settings import with_settings
+from nexwarp.train.stages import teacher_count
 
 SCENES = ("train", "fox", "saharov", "kitchen25")
+# Number of photos, to know without them whether a run has teachers.
+PHOTOS = {"train": 301, "fox": 50, "saharov": 32, "kitchen25": 25}
+ARC_VIEWS = 8  # held out by the variant "arc"
 DEMO = "demo"  # the built-in scene
 TABLES = (
     "peers",
@@ -133,10 +138,27 @@ def table_jobs(
 
 
 def config_of(job: TrainingJob, row: Row) -> Config:
-    """Return the settings of a training of nexwarp; `row.preset` must not be None."""
+    """Return the settings of a training of nexwarp; `row.preset` must not be None.
+
+    The number of teachers is that of the scene; of a scene that is not one of `PHOTOS` the run decides.
+    """
     assert row.preset is not None
     config = with_settings(preset(row.preset), row.settings)
-    return dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
+    config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
+    photos = training_photos(job)
+    return config if photos is None else dataclasses.replace(config, teachers=teacher_count(config, photos))
+
+
+def training_photos(job: TrainingJob) -> int | None:
+    """Return how many photos a training has; None where the scene is not one of `PHOTOS`."""
+    if (photos := PHOTOS.get(job.scene)) is None:
+        return None
+    if job.variant == "arc":
+        return photos - ARC_VIEWS
+    train = photos - len(range(0, photos, TEST_EVERY))
+    if not job.variant.startswith("inner"):
+        return train
+    return train - len(range(int(job.variant.removeprefix("inner") or 0), train, TEST_EVERY))
 
 
 def group_jobs(jobs: Iterable[TrainingJob], rows: Mapping[str, Row]) -> list[JobGroup]:
@@ -162,7 +184,7 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         return job, 0
     config = config_of(job, row)
     shared = min(config.settled - 1, job.iterations)
-    if shared <= 0:
+    if shared <= 0 or config.teachers:
         return job, 0
     alike = dataclasses.replace(
         config,

@@ -30,6 +30,7 @@ from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.schedules import MOTION_RATES, POSE_RATES
+from nexwarp.train.stages import student_trainer
 from nexwarp.train.step_losses import POSE_PRIOR
 from nexwarp.train.trainer import Trainer
 
@@ -90,7 +91,7 @@ def run_job(
     pictures: Path | None = None,
     models: Path | None = None,
     start: SharedStart | None = None,
-    trainer: Callable[[Scene, Config, torch.device], Trainer] = Trainer,
+    trainer: Callable[[Scene, Config, torch.device], Trainer] = student_trainer,
 ) -> dict[str, Any]:
     """Train, render the test views and compare them with their photos.
 
@@ -101,7 +102,8 @@ def run_job(
         pictures: folder for photo, rendering and error of each test view.
         models: folder to keep the model in.
         start: where to continue from.
-        trainer: makes a training of nexwarp from scene, settings and device; gsplat's rows do not use it.
+        trainer: makes a training of nexwarp from scene, settings and device, by default after its teachers; gsplat's
+            rows do not use it.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
@@ -120,7 +122,9 @@ def run_job(
     if row.preset is None:
         trained = _train_gsplat(job, row, scene, device)
     else:
-        trained = _train_nexwarp(job, scene, lambda: trainer(scene, config_of(job, row), device), models, start)
+        config = config_of(job, row)
+        trained = _train_nexwarp(job, scene, lambda: trainer(scene, config, device), models, start)
+        trained.facts["config"] = config_name(config)
     peak = _peak("peak_mib", device)
     views = _compare(job, trained.renderings, pictures)
     coded = _compare(job, trained.compact, None)
@@ -152,8 +156,9 @@ def config_name(config: Config) -> str:
     is off.
     """
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"} | {"clamp_image": True}
-    if not config.skybox:
-        del settings["skybox"]
+    for name in ("skybox", "teachers"):
+        if not settings[name]:
+            del settings[name]
     settings["losses"] |= {"poses": POSE_PRIOR}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
@@ -215,10 +220,10 @@ def _train_nexwarp(
         "primitives": len(trainer.surfels),
         "megabytes": megabytes,
         "seconds": seconds,
-        "config": config_name(trainer.config),
         "train_psnr": train_psnr(scene, image),
         "zoom_psnr": zoom_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
+        **({} if trainer.teachers is None else {"teachers": {"count": len(trainer.teachers.models)}}),
         **memory,
         **shared,
     }

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.quality.jobs import DEMO, TrainingJob
+from benchmarks.quality.jobs import ARC_VIEWS, DEMO, TrainingJob
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.scene import TEST_EVERY
-
-ARC_VIEWS = 8
 
 
 def inner_validation(scene: Scene, first: int = 0) -> Scene:

@@ -101,7 +101,7 @@ def duration(seconds: float) -> str:
 class TrainingDisplay:
     """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
 
-    def __init__(self, console: Console, total: int, done: int, device: torch.device) -> None:
+    def __init__(self, console: Console, total: int, done: int, device: torch.device, name: str = "training") -> None:
         """Prepare the display.
 
         Args:
@@ -109,12 +109,13 @@ class TrainingDisplay:
             total: iterations of the run.
             done: iterations done before.
             device: device of the training, whose memory is shown.
+            name: of the training.
         """
         self.console, self.total, self.done, self.device = console, total, done, device
         self.start = self.shown = time.perf_counter()
         self.estimate = CpuEstimate(total) if device.type == "cpu" else None
         self.progress = Progress(
-            TextColumn("training"),
+            TextColumn(name),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[text]}"),
@@ -123,7 +124,7 @@ class TrainingDisplay:
             console=console,
             disable=not console.is_terminal,
         )
-        self.task = self.progress.add_task("training", total=total, completed=done, text="")
+        self.task = self.progress.add_task(name, total=total, completed=done, text="")
 
     def __enter__(self) -> "TrainingDisplay":
         self.progress.start()

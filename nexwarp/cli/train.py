@@ -15,7 +15,7 @@ from nexwarp.cli.device import joined_ranks
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Scene_, check_max_hits, option, with_flag_settings
 from nexwarp.cli.process import SCENES, is_video, scene_of_video
-from nexwarp.cli.training_session import TrainingSession
+from nexwarp.cli.staged_session import StagedSession, extend_run
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
 from nexwarp.data.shared import shared_scene
@@ -33,16 +33,15 @@ from nexwarp.run.folder import (
     create_run,
     keep_camera_path,
     prepare_run,
+    read_own_teachers,
     read_run,
     read_teachers,
-    rewrite_config,
 )
 from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
-from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
-from nexwarp.train.trainer import Trainer
+from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divided, plan_teachers
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -145,72 +144,84 @@ class Train:
             self.scene = str(ranks.share(made)) if ranks.size > 1 else str(made)
         run = self.run or Path("runs") / self._source().name
         with ExitStack() as claim:
-            source, config, resume = self._plan(run, ranks, claim, console)
-            trainer = self._trainer(source, config, ranks, resume, console)
-            session = TrainingSession(trainer, run, console, sinks=self._sinks(), every=self.checkpoint_every)
-            if resume:
-                session.resume()
-                self._extend(run, trainer, console)
-            else:
-                session.check_room()
-                if self.resume:
-                    console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
-            with self._viewer(trainer, run, source.name, console) as viewer:
+            source, config, resume, own = self._plan(run, ranks, claim, console)
+            given = [load(path) for path in self.teachers]  # a wrong path is told before photos are read
+            scene = self._load_scene(source, config, ranks, console)
+            config = self._with_background(config, scene, resume)
+            if own is None:
+                own = NO_TEACHERS if given else plan_teachers(config, len(scene.train))
+            session = StagedSession(
+                scene,
+                divided(config, own),
+                run,
+                source,
+                console,
+                ranks,
+                teachers=given,
+                resume=resume,
+                sinks=self._sinks(),
+                every=self.checkpoint_every,
+            )
+            session.begin()
+            if resume and ranks.first:
+                extend_run(run, config, console)
+            if self.resume and not resume:
+                console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+            with self._viewer(session, config, run, source.name, console) as viewer:
                 if not resume and ranks.first:
-                    names = create_run(run, source, trainer.config, ranks.device.type, ranks.launch, self.teachers)
+                    names = create_run(run, source, config, ranks.device.type, ranks.launch, self.teachers, own)
                     _tell_foreign(console, run, names)
                 session.train(viewer)
                 model = session.finish()
                 claim.close()  # while the viewer shows the result, other commands may write to the run
                 ranks.close()
                 if viewer is not None:
-                    viewer.finish(f"{trainer.iteration:,} iterations done", lambda: model)
+                    viewer.finish(f"{config.iterations:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
-
-    def _extend(self, run: Path, trainer: Trainer, console: Console) -> None:
-        """Write a larger --iterations into the run to resume, and say what it does."""
-        if not trainer.ranks.first:
-            return
-        before = read_run(run)[1].iterations
-        if trainer.config.iterations > before:
-            rewrite_config(run, trainer.config)
-            console.print(
-                f"extended from {before:,} to {trainer.config.iterations:,} iterations: from here on, learning rates, "
-                "density control and all other schedules are those of a run of that length",
-                soft_wrap=True,
-            )
 
     def _folder_flags(self, run: Path, ranks: Ranks) -> dict[str, bool]:
         """Whether to resume or to overwrite; ranks that torchrun has restarted go on with the run that they began."""
         again = ranks.restarted and began(run, ranks.launch)
         return {"resume": self.resume or again, "overwrite": self.overwrite and not again}
 
-    def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[SceneSource, Config, bool]:
-        """Claim the run folder, on rank 0; return scene, settings and whether to resume, the same on all ranks."""
-        source, config, resume = self._source(), None, False
+    def _plan(
+        self, run: Path, ranks: Ranks, claim: ExitStack, console: Console
+    ) -> tuple[SceneSource, Config, bool, OwnTeachers | None]:
+        """Claim the run folder, on rank 0.
+
+        Returns:
+            The scene, the settings, whether to resume, and the own teachers of a run to resume, the same on all ranks.
+        """
+        source, config, resume, own = self._source(), None, False, None
         if ranks.first:
             flags = self._folder_flags(run, ranks)
             resume = claim.enter_context(claimed_run(run, source, **flags, warn=partial(display.warn, console)))
             if resume:
                 source = self._resumed_source(source, run)
+                own = read_own_teachers(run)
+                if self.teachers and own.count:
+                    raise SettingError(
+                        "--teacher: expected none as in the run to resume, which has teachers of its own"
+                    )
                 self.teachers = self.teachers or read_teachers(run)
             config = self._config(run, resume)
             self._check()
         if ranks.size > 1:
             mine = None
             if config is not None:
-                mine = [dataclasses.asdict(source), config.as_dict(), resume, [str(path) for path in self.teachers]]
+                paths = [str(path) for path in self.teachers]
+                mine = [dataclasses.asdict(source), config.as_dict(), resume, paths, own and dataclasses.astuple(own)]
             told = ranks.share(mine)
             assert isinstance(told, list)
             source, config = SceneSource(**(told[0] | {"path": source.path})), config_from_dict(told[1])
             resume, self.teachers = told[2], tuple(map(Path, told[3]))
+            own = None if told[4] is None else OwnTeachers(*told[4])
         assert config is not None
-        return source, config, resume
+        return source, config, resume, own
 
-    def _trainer(self, source: SceneSource, config: Config, ranks: Ranks, resume: bool, console: Console) -> Trainer:
-        """Load the scene and return the trainer."""
+    def _load_scene(self, source: SceneSource, config: Config, ranks: Ranks, console: Console) -> Scene:
+        """Load the scene, and say what it holds."""
         device, count = ranks.device, f", {ranks.size} ranks" if ranks.size > 1 else ""
-        teachers = [load(path) for path in self.teachers]  # a wrong path is told before the photos are read
         console.print(f"{source.name} on {device_name(device)}{count}, preset {config.preset}")
         with display.loading(console) as progress:
             scene = shared_scene(lambda: source.load(progress), ranks)
@@ -219,10 +230,7 @@ class Train:
             f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
             f"{len(scene.points):,} points"
         )
-        config = self._with_background(config, scene, resume)
-        if ranks.size == 1:
-            return Trainer(scene, config, device, teachers=teachers)
-        return ParallelTrainer(scene, config, device, ranks, teachers=teachers)
+        return scene
 
     def _sinks(self) -> list[str]:
         """Return where to log beside the run's file."""
@@ -250,23 +258,24 @@ class Train:
         return dataclasses.replace(config, background=scene.background)
 
     def _viewer(
-        self, trainer: Trainer, run: Path, title: str, console: Console
+        self, session: StagedSession, config: Config, run: Path, title: str, console: Console
     ) -> AbstractContextManager["Viewer | None"]:
         """Return a context with the viewer of the training; with None, without --view."""
-        if not self.view or not trainer.ranks.first:
+        scene = session.trainer.scene
+        if not self.view or not session.ranks.first:
             return nullcontext()
         from nexwarp.viewer import Viewer
 
-        sets = {"train": trainer.scene.train, "test": trainer.scene.test}
+        sets = {"train": scene.train, "test": scene.test}
         viewer = Viewer(
-            trainer.model,
+            lambda: session.trainer.model(),
             {group: {view.name: view.camera for view in views} for group, views in sets.items()},
-            near=trainer.scene.train[0].camera.near,
+            near=scene.train[0].camera.near,
             title=title,
             host=self.host,
             port=self.port,
             photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
-            total=trainer.config.iterations,
+            total=config.iterations,
             save_path=partial(keep_camera_path, run),
         )
         print_url(viewer, console)

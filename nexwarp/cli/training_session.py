@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,12 +15,21 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.memory import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.contents import COMPARE, DIVERGED_FILE, RENDERS_FOLDER, TRAIN, picture_name, remove_leftovers
+from nexwarp.run.contents import (
+    COMPARE,
+    DIVERGED_FILE,
+    METRICS_FILE,
+    RENDERS_FOLDER,
+    TRAIN,
+    picture_name,
+    remove_leftovers,
+)
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
@@ -35,11 +45,38 @@ CHECKPOINTS_A_RUN = 10
 FILES_AT_A_TIME = 4
 
 
+@dataclass(frozen=True)
+class Stage:
+    """Place of a training among those of a run.
+
+    Attributes:
+        name: of its progress.
+        teacher: whether it is a teacher of the run, whose model is not evaluated.
+        iterations: of the stages before it.
+        seconds: of the stages before it.
+    """
+
+    name: str = "training"
+    teacher: bool = False
+    iterations: int = 0
+    seconds: float = 0.0
+
+
+ALONE = Stage()
+
+
 class TrainingSession:
     """One training in a run folder, from its first or resumed iteration to the evaluated model."""
 
     def __init__(
-        self, trainer: Trainer, run: Path, console: Console, *, sinks: Collection[str] = (), every: int | None = None
+        self,
+        trainer: Trainer,
+        run: Path,
+        console: Console,
+        *,
+        sinks: Collection[str] = (),
+        every: int | None = None,
+        stage: Stage = ALONE,
     ) -> None:
         """Prepare the session; nothing runs yet.
 
@@ -49,8 +86,9 @@ class TrainingSession:
             console: where to print.
             sinks: where to log beside the run's file: names of `nexwarp.run.log_sinks.PACKAGES`.
             every: iterations between checkpoints; None is a tenth of the run.
+            stage: place of the training among those of the run.
         """
-        self.trainer, self.run, self.console, self.sinks = trainer, run, console, sinks
+        self.trainer, self.run, self.console, self.sinks, self.stage = trainer, run, console, sinks, stage
         self.ranks = trainer.ranks
         self.total = trainer.config.iterations
         self.every = every or max(self.total // CHECKPOINTS_A_RUN, 1)
@@ -69,7 +107,8 @@ class TrainingSession:
         found = False
         if self.ranks.first:
             self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
-            remove_leftovers(self.run)
+            if self.run.is_dir():  # a teacher that has not begun has no folder yet
+                remove_leftovers(self.run)
             found = has_checkpoint(self.run)
         if self.ranks.share(found):
             # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
@@ -92,7 +131,9 @@ class TrainingSession:
             Stopped: a signal ended the training; a checkpoint of its last step is in the run.
         """
         trainer, ranks = self.trainer, self.ranks
-        progress_display = display.TrainingDisplay(self.console, self.total, trainer.iteration, trainer.device)
+        progress_display = display.TrainingDisplay(
+            self.console, self.total, trainer.iteration, trainer.device, self.stage.name
+        )
         log = TrainingLog(self.run, trainer, tensorboard="tensorboard" in self.sinks, wandb="wandb" in self.sinks)
         with ExitStack() as stack:
             if ranks.first:
@@ -106,7 +147,8 @@ class TrainingSession:
                     with self._model_kept():
                         log(step)
                 if viewer is not None:
-                    viewer.between_steps(step.iteration, partial(_describe, step), lambda: stop_signal() is not None)
+                    done = self.stage.iterations + step.iteration
+                    viewer.between_steps(done, partial(_describe, step), lambda: stop_signal() is not None)
                 number = ranks.agree(stop_signal(), now=step.iteration == self.total)
                 if step.passed(self.every) or step.iteration == self.total or number is not None:
                     with self._model_kept():
@@ -177,32 +219,22 @@ class TrainingSession:
             ) from error
 
     def _finish(self) -> Model:
-        trainer, scene, run, device = self.trainer, self.trainer.scene, self.run, self.trainer.device
+        trainer, scene, run = self.trainer, self.trainer.scene, self.run
         if not self.ranks.first:
             return self._finish_with_others()
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(run, finished)
-        if self.ranks.size > 1:
-            self.ranks.share_bytes(file.read_bytes())
+        model = shared_model(file, self.ranks)
         given = scene.cameras
         cameras = trainer.views.refined_cameras(trainer.poses)
         refined = {TRAIN: dict(zip(given[TRAIN], cameras, strict=True))}
         ends = trainer.views.exposure_ends(trainer.poses)
         save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given, ends)
-        model = load(run).to(device)
-        rate, megabytes = trainer.iteration / max(trainer.seconds, 1e-9), file.stat().st_size / 1e6
-        facts: dict[str, Json] = {
-            "preset": trainer.config.preset,
-            "iterations": trainer.iteration,
-            "surfels": len(model.surfels),
-            "megabytes": megabytes,
-            "seconds": trainer.seconds,
-            "iterations_per_second": rate,
-            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-        }
-        if trainer.teachers is not None:
-            facts["teachers"] = len(trainer.teachers.models)
+        facts = self._facts(model, file)
+        if self.stage.teacher:
+            write_json(run / METRICS_FILE, facts)
+            return model
         rows = {}
         if scene.test:
             mask_mode = trainer.config.mask_mode
@@ -210,8 +242,8 @@ class TrainingSession:
             rows = figures(results)
         rows |= {
             "surfels": f"{len(model.surfels):,}",
-            "model file": f"{megabytes:.1f} MB",
-            "training": f"{trainer.seconds:.0f} s, {rate:.1f} it/s",
+            "model file": f"{facts['megabytes']:.1f} MB",
+            "training": f"{facts['seconds']:.0f} s, {facts['iterations_per_second']:.1f} it/s",
             "run": str(run),
         }
         self.console.print(display.results_table(rows, f"{len(scene.test)} test views"))
@@ -220,17 +252,50 @@ class TrainingSession:
             self.console.print(f"photo, render, error: {strip}")
         return model
 
+    def _facts(self, model: Model, file: Path) -> dict[str, Json]:
+        """Return the entries of metrics.json beside the metrics; a student's time is that of its teachers, too."""
+        trainer, device = self.trainer, self.trainer.device
+        iterations, seconds = trainer.iteration, trainer.seconds
+        if not self.stage.teacher:
+            iterations, seconds = iterations + self.stage.iterations, seconds + self.stage.seconds
+        facts: dict[str, Json] = {
+            "preset": trainer.config.preset,
+            "iterations": iterations,
+            "surfels": len(model.surfels),
+            "megabytes": file.stat().st_size / 1e6,
+            "seconds": seconds,
+            "iterations_per_second": iterations / max(seconds, 1e-9),
+            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        }
+        if trainer.teachers is not None:
+            facts["teachers"] = len(trainer.teachers.models)
+        return facts
+
     def _finish_with_others(self) -> Model:
         """Return the model that rank 0 has finished; render a share of the test views for it."""
         trainer = self.trainer
         if trainer.graphs is not None:
             trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
-        with TemporaryDirectory() as folder:
-            (Path(folder) / MODEL_FILE).write_bytes(self.ranks.share_bytes(None))
-            model = load(folder).to(trainer.device)
-        if trainer.scene.test:
+        model = shared_model(None, self.ranks)
+        if trainer.scene.test and not self.stage.teacher:
             evaluate(model, trainer.scene.test, mask_mode=trainer.config.mask_mode, ranks=self.ranks)
         return model
+
+
+def shared_model(file: Path | None, ranks: Ranks) -> Model:
+    """Return rank 0's model on the device of each rank.
+
+    Args:
+        file: of the model, on rank 0.
+        ranks: the processes that train together.
+    """
+    if file is not None:
+        if ranks.size > 1:
+            ranks.share_bytes(file.read_bytes())
+        return load(file).to(ranks.device)
+    with TemporaryDirectory() as folder:
+        (Path(folder) / MODEL_FILE).write_bytes(ranks.share_bytes(None))
+        return load(folder).to(ranks.device)
 
 
 def _describe(step: StepReport) -> str:

@@ -22,6 +22,7 @@ CAMERA_PATH = "camera_path_{}.json"
 
 TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
+TEACHERS_FOLDER = "teachers"  # each of its subfolders, 1 and so on, is a run
 EXPORT_FOLDER = "export"
 SURFELS_FILE, SPLATS_FILE, MESH_FILE = "surfels.ply", "splats.ply", "mesh.ply"
 COMPACT_FILE = "compact.safetensors"
@@ -70,6 +71,15 @@ def frame_name(index: int) -> str:
     return f"{index:04d}.png"
 
 
+def teacher_folders(run: Path) -> list[Path]:
+    """Return the folders of the teachers that a run has trained for itself, each a run, in their order."""
+    folder = run / TEACHERS_FOLDER
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    found = [each for each in folder.iterdir() if re.fullmatch(r"[1-9]\d*", each.name)]
+    return sorted((f for f in found if f.is_dir() and not f.is_symlink()), key=lambda f: int(f.name))
+
+
 def list_files(run: Path) -> tuple[list[str], list[str]]:
     """Return the files below a run folder that have names of ours, and what else there is; links are not followed.
 
@@ -78,9 +88,14 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
     views = _view_pictures(run)
     own: list[str] = []
     foreign: list[str] = []
+    teachers = teacher_folders(run)
+    for folder in teachers:
+        prefix = f"{folder.relative_to(run).as_posix()}/"
+        for names, found in zip((own, foreign), list_files(folder), strict=True):
+            names += [prefix + name for name in found]
     for name, entry in _entries(run):
         if entry.is_dir(follow_symlinks=False):
-            if not _may_hold_ours(name):
+            if not _may_hold_ours(name) and run / name not in teachers:
                 foreign.append(f"{name}/")
         else:
             (own if _is_ours(name, views) else foreign).append(name)
@@ -95,9 +110,11 @@ def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
         keep: names of files of ours to keep.
     """
     own, foreign = list_files(run)
-    # The files of the run folder itself go last: until then they tell which pictures are ours.
-    own.sort(key=lambda name: "/" not in name)
-    folders = {run / name for name in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, RENDERS_FOLDER)}
+    # The files of a run folder itself go last: until then they tell which pictures are ours.
+    runs = [run, *teacher_folders(run)]
+    own.sort(key=lambda name: (run / name).parent in runs)
+    parts = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, RENDERS_FOLDER, TEACHERS_FOLDER)
+    folders = {each / name for each in runs for name in parts}
     for name in own:
         if name not in keep:
             (run / name).unlink()
@@ -142,7 +159,7 @@ def _may_hold_ours(folder: str) -> bool:
     top, _, rest = folder.partition("/")
     if top == RENDERS_FOLDER:
         return True
-    return not rest and (top in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER) or _is_aside(top))
+    return not rest and (top in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER) or _is_aside(top))
 
 
 def _is_ours(name: str, views: set[str]) -> bool:

@@ -7,7 +7,7 @@ A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.js
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,9 @@ from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, wri
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.run.contents import CAMERA_PATH, CONFIG_FILE, LOCK_FILE, METRICS_FILE, delete_files
 from nexwarp.run.lock import locked_run
-from nexwarp.train.config import Config
+from nexwarp.train.config import MOST_TEACHERS, Config
 from nexwarp.train.presets import config_from_dict
+from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 
 DEMO = "demo"
 RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
@@ -99,7 +100,7 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
         raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
-    if resume and (run / CONFIG_FILE).is_file():
+    if resume and is_run(run):
         return True
     # A process that is killed before it has written the config leaves a lock and temporary files.
     empty = run.is_dir() and all(file.name == LOCK_FILE or is_temporary(file.name) for file in run.iterdir())
@@ -130,7 +131,13 @@ def _check_replaceable(run: Path) -> None:
 
 
 def create_run(
-    run: Path, source: SceneSource, config: Config, device: str, launch: str = "", teachers: Sequence[Path] = ()
+    run: Path,
+    source: SceneSource,
+    config: Config,
+    device: str,
+    launch: str = "",
+    teachers: Sequence[Path] = (),
+    own: OwnTeachers = NO_TEACHERS,
 ) -> list[str]:
     """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
 
@@ -144,6 +151,7 @@ def create_run(
         device: type of the device.
         launch: of several ranks, as `began` recognises it.
         teachers: folders or files of the models that it also learns from.
+        own: teachers that it trains first.
 
     Returns:
         Names of the files and folders that nexwarp did not write; they stay.
@@ -156,6 +164,8 @@ def create_run(
     data = {"scene": scene, "device": device, "config": config.as_dict()} | ({"launch": launch} if launch else {})
     if teachers:
         data["teachers"] = [str(path.resolve()) for path in teachers]
+    if own.count:
+        data["own_teachers"] = dataclasses.asdict(own)
     with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(data, indent=2) + "\n").encode())
         sync(temporary)
@@ -224,6 +234,7 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         teachers = data.get("teachers", [])
         if not isinstance(teachers, list) or not all(isinstance(path, str) for path in teachers):
             raise ValueError(f"teachers: expected a list of paths, got {teachers!r}")
+        _own_teachers(data)
         known = {field.name for field in dataclasses.fields(SceneSource)}
         source = SceneSource(**{name: value for name, value in scene.items() if name in known})
         return source, config_from_dict(data["config"]), data
@@ -236,6 +247,26 @@ def read_teachers(run: Path) -> tuple[Path, ...]:
     paths = read_run(run)[2].get("teachers", [])
     assert isinstance(paths, list)
     return tuple(Path(str(path)) for path in paths)
+
+
+def read_own_teachers(run: Path) -> OwnTeachers:
+    """Return the teachers that a run trains first; errors are those of `read_run`."""
+    return _own_teachers(read_run(run)[2])
+
+
+def _own_teachers(data: Mapping[str, Json]) -> OwnTeachers:
+    own = data.get("own_teachers", dataclasses.asdict(NO_TEACHERS))
+    if not (isinstance(own, dict) and own.keys() == {"count", "iterations"}):
+        raise ValueError(f"own_teachers: expected count and iterations, got {own!r:.60}")
+    count, iterations = own["count"], own["iterations"]
+    if type(count) is not int or type(iterations) is not int or not 0 <= count <= MOST_TEACHERS or iterations < 0:
+        raise ValueError(f"own_teachers: expected a count of 0 to {MOST_TEACHERS} and iterations, got {own}")
+    return OwnTeachers(count, iterations)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder has the config of a run, which may be damaged."""
+    return (folder / CONFIG_FILE).is_file()
 
 
 def read_metrics(run: Path) -> dict[str, Json]:

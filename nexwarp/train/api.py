@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import torch
 
@@ -10,8 +11,8 @@ from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
+from nexwarp.train.stages import counted_from, student_trainer
 from nexwarp.train.step_losses import OwnLoss
-from nexwarp.train.trainer import Trainer
 
 Callback = Callable[[StepReport], object]
 
@@ -34,8 +35,9 @@ def train(
         scene: what to learn from: its training views and points.
         config: settings; None is `nexwarp.preset("default")`.
         device: where to train; None is CUDA where there is a device, else the CPU.
-        callbacks: functions that are called with a `StepReport` after each step. One that raises stops the training;
-            its exception is passed on. After divergence, steps are repeated and reported again.
+        callbacks: functions that are called with a `StepReport` after each step, those of `config.teachers` included,
+            which come first. One that raises stops the training; its exception is passed on. After divergence, steps
+            are repeated and reported again.
         losses: own losses by name: functions of the step's `Rendering`, at the photo's exposure, and its `Target`
             (`target.photo` (H, W, 3), `target.camera`, `target.background`, `target.counts`) that return a scalar
             tensor. They are added to ours as they are, so that factors are their own business, and appear in
@@ -49,8 +51,9 @@ def train(
             the first one. When surfels are split or removed, state tensors of their parameter's shape get the same
             rows, and zeros for new surfels; all other state is kept. An own optimizer runs in CUDA graphs if its groups
             have `capturable=True` and learning rates that are tensors on the GPU; else without.
-        teachers: trained models of the scene, for few photos; they are moved to the device. Every other step compares
-            with a rendering of one, at the mean exposure, from a camera on the line through those of two photos.
+        teachers: trained models of the scene, in place of the run's own (`config.teachers`); they are moved to the
+            device. Every other step compares with a rendering of one, at the mean exposure, from a camera on the line
+            through those of two photos.
 
     Returns:
         The finished model on the device.
@@ -68,13 +71,18 @@ def train(
     observers = _checked(callbacks)
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    trainer = Trainer(scene, config or Config(), device, losses=losses, optimizer=optimizer, teachers=teachers)
+    config = config or Config()
 
     def observe(report: StepReport) -> None:
         for callback in observers:
             callback(report)
 
-    trainer.run(observe, lambda message: warnings.warn(message, stacklevel=2))
+    def warn(message: str) -> None:
+        warnings.warn(message, stacklevel=2)
+
+    own = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
+    trainer = own(scene, config, device, observe=observe, warn=warn)
+    trainer.run(counted_from(config.iterations - trainer.config.iterations, observe), warn)
     return trainer.finish()
 
 

@@ -19,6 +19,7 @@ MIN_SURFELS = 16
 LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
 MOST_BLUR_POSES = 31
+MOST_TEACHERS = 8
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,11 @@ class Config:
     """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
     behind a table. Initial surfels start on those around which photos show no point of the cloud. They are at most a
     sixth of the initial surfels. Where photos are transparent there are none."""
+    teachers: int | None = 0
+    """Number of teachers: models of other seeds that are trained first, in two fifths of the iterations, and from whose
+    renderings the run then learns, too, for captures of few photos (docs/sparse.md). None is 2 where there are at most
+    64 training photos, at least 600 surfels of `max_surfels` for each of them and at least 30,000 iterations, and where
+    poses stay as given; otherwise 0."""
     seed: int = 0
     """Random seed."""
     deterministic: bool = False
@@ -174,6 +180,10 @@ class Config:
         check_range("blur_poses", self.blur_poses, 1, MOST_BLUR_POSES)
         if self.blur_poses % 2 == 0:
             raise ValueError(f"blur_poses: expected an odd number, got {self.blur_poses}")
+        if self.teachers is not None:
+            check_range("teachers", self.teachers, 0, MOST_TEACHERS)
+        if self.teachers and (self.refine_poses or self.blur_poses > 1):
+            raise ValueError(f"teachers: expected 0 where poses are learned, got {self.teachers}")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 

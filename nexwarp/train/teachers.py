@@ -112,7 +112,16 @@ class Teachers:
 
 
 def make_teachers(models: Iterable[Model], scene: Scene, config: Config, device: torch.device) -> Teachers | None:
-    """Return the teachers of a training, None without models; arguments and errors are those of `Teachers`."""
+    """Return the teachers of a training, None without models; arguments and errors are those of `Teachers`.
+
+    Raises:
+        ValueError: the settings name a number of teachers, which this training does not train.
+    """
+    if config.teachers:
+        raise ValueError(
+            f"config.teachers: expected 0 or None, as a Trainer trains one model, got {config.teachers}; "
+            "nexwarp.train trains teachers first"
+        )
     if isinstance(models, Model):
         raise TypeError("teachers: expected a list of models, got one nexwarp.Model")
     found = list(models)

@@ -1,0 +1,144 @@
+"""The trainings that make up a run: for captures of few photos, teachers of its own come before the student.
+
+Not in the paper. What a student learns from teachers is in `nexwarp.train.teachers`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+
+from nexwarp.data import Scene
+from nexwarp.determinism import derived_seed
+from nexwarp.errors import SettingError
+from nexwarp.model.model import Model
+from nexwarp.train.config import REFERENCE_ITERATIONS, Config
+from nexwarp.train.report import StepReport
+from nexwarp.train.schedules import OptimizerMaker
+from nexwarp.train.step_losses import OwnLoss
+from nexwarp.train.trainer import Trainer
+
+# A run has teachers where photos are few and surfels many for them; otherwise it loses more by shorter trainings than
+# it gains. Shorter runs were not tried.
+TEACHERS = 2
+MOST_PHOTOS = 64
+SURFELS_A_PHOTO = 600
+SHARE = 0.4  # of the iterations that the teachers have together
+STREAM = 3  # series of seeds, as `derived_seed` counts them
+
+
+@dataclass(frozen=True)
+class OwnTeachers:
+    """The teachers that a run trains before its student.
+
+    Attributes:
+        count: how many.
+        iterations: of each.
+    """
+
+    count: int
+    iterations: int
+
+
+NO_TEACHERS = OwnTeachers(0, 0)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Settings of the trainings of a run, in their order; none of them has teachers of its own.
+
+    Attributes:
+        teachers: of each teacher.
+        student: of the training whose model is the run's.
+    """
+
+    teachers: tuple[Config, ...]
+    student: Config
+
+
+def teacher_count(config: Config, photos: int) -> int:
+    """Return how many teachers a run trains first: `config.teachers`, or what its None stands for.
+
+    Args:
+        config: of the run.
+        photos: number of training photos.
+    """
+    if config.teachers is not None:
+        return config.teachers
+    learned_poses = config.refine_poses or config.blur_poses > 1
+    few = photos <= MOST_PHOTOS and config.max_surfels >= SURFELS_A_PHOTO * photos
+    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not learned_poses else 0
+
+
+def plan_teachers(config: Config, photos: int) -> OwnTeachers:
+    """Return the teachers that a run trains first, which have two fifths of its iterations together.
+
+    Args:
+        config: of the run.
+        photos: number of training photos.
+    """
+    count = teacher_count(config, photos)
+    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1)) if count else NO_TEACHERS
+
+
+def divided(config: Config, own: OwnTeachers) -> Stages:
+    """Return the stages of a run: teachers, and the student, which has the rest of the iterations.
+
+    Raises:
+        SettingError: nothing is left for the student.
+    """
+    taken = own.count * own.iterations
+    if config.iterations <= taken:
+        raise SettingError(f"iterations: expected more than the {taken} of teachers, got {config.iterations}")
+    # Seeds of settings have 32 bits.
+    seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
+    teachers = (dataclasses.replace(config, seed=seed, iterations=own.iterations, teachers=0) for seed in seeds)
+    return Stages(tuple(teachers), dataclasses.replace(config, iterations=config.iterations - taken, teachers=0))
+
+
+def student_trainer(
+    scene: Scene,
+    config: Config,
+    device: torch.device | str,
+    *,
+    losses: Mapping[str, OwnLoss] | None = None,
+    optimizer: OptimizerMaker | None = None,
+    teachers: Iterable[Model] = (),
+    observe: Callable[[StepReport], None] | None = None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> Trainer:
+    """Train the teachers of a run, and return the trainer of its student, before its first step.
+
+    Args:
+        scene: what to learn from.
+        config: of the run.
+        device: where to train.
+        losses: see `nexwarp.train`.
+        optimizer: see `nexwarp.train`.
+        teachers: models that take the place of teachers of its own.
+        observe: called after each step of a teacher; iterations are counted over all of them.
+        warn: see `Trainer.run`.
+
+    Raises:
+        SceneError, TypeError, ValueError, DivergedError, OutOfMemoryError: as of `nexwarp.train`.
+    """
+    found = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` tells what is wrong with a model
+    stages = divided(config, NO_TEACHERS if found else plan_teachers(config, len(scene.train)))
+    own: list[Model] = []
+    for number, settings in enumerate(stages.teachers):
+        trainer = Trainer(scene, settings, device, losses=losses, optimizer=optimizer)
+        trainer.run(counted_from(number * settings.iterations, observe), warn)
+        own.append(trainer.finish())
+    return Trainer(scene, stages.student, device, losses=losses, optimizer=optimizer, teachers=own or found)
+
+
+def counted_from(done: int, observe: Callable[[StepReport], None] | None) -> Callable[[StepReport], None] | None:
+    """Return an observer that adds the iterations of earlier stages to those of each step."""
+    if observe is None or done == 0:
+        return observe
+
+    def observe_later(report: StepReport) -> None:
+        observe(dataclasses.replace(report, iteration=report.iteration + done))
+
+    return observe_later
