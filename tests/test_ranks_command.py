@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -115,3 +116,20 @@ def test_a_run_goes_on_with_any_number_of_ranks(tiny_folder: Path, tmp_path: Pat
     told, expected = (json.loads((x / "metrics.json").read_text()) for x in (run, alone))
     assert told["iterations"] == expected["iterations"] == 600
     assert told["psnr"] > expected["psnr"] - 0.5, (told["psnr"], expected["psnr"])
+
+
+def test_ranks_train_teachers_first(tiny_folder: Path, tmp_path: Path) -> None:
+    """And find them again, on all ranks, when the run is resumed."""
+    run = tmp_path / "run"
+    command = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--gpus", "2", "--iterations", "40"]
+    process = start([*command, "--set", "teachers=2"])
+    assert lines(process) == [] and process.returncode == 0
+    model, metrics = (run / MODEL_FILE).read_bytes(), json.loads((run / "metrics.json").read_text())
+    assert (metrics["iterations"], metrics["teachers"]) == (40, 2)
+    assert [(run / "teachers" / name / MODEL_FILE).is_file() for name in ("1", "2")] == [True, True]
+    for name in ("checkpoint", "checkpoint.old", "teachers/2"):
+        shutil.rmtree(run / name)
+    (run / MODEL_FILE).unlink()
+    process = start([*command, "--resume"])
+    assert lines(process) == [] and process.returncode == 0
+    assert (run / MODEL_FILE).read_bytes() == model

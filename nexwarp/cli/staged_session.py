@@ -11,8 +11,9 @@ from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.run.contents import TEACHERS_FOLDER
+from nexwarp.run.contents import teacher_folder
 from nexwarp.run.folder import SceneSource, create_run, is_run, read_metrics, read_run, rewrite_config
+from nexwarp.train.checkpoint import delete_checkpoints
 from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.stages import Stages
@@ -86,6 +87,8 @@ class StagedSession:
                 return
             self.models.append(self.session.finish())
             self.seconds += self.trainer.seconds
+            if self.ranks.first:
+                delete_checkpoints(self.session.run)  # nothing continues from them
             self.session = self._next_session()
             if self.resume:
                 self.session.resume()
@@ -100,7 +103,9 @@ class StagedSession:
         if number < count:
             trainer = self._make_trainer(self.stages.teachers[number], ())
             stage = Stage(f"teacher {number + 1} of {count}", teacher=True, iterations=before, seconds=self.seconds)
-            return TrainingSession(trainer, self._folder(number), self.console, every=self.every, stage=stage)
+            return TrainingSession(
+                trainer, teacher_folder(self.run, number + 1), self.console, every=self.every, stage=stage
+            )
         trainer = self._make_trainer(self.stages.student, self.models or self.given)
         stage = Stage(iterations=before, seconds=self.seconds)
         return TrainingSession(trainer, self.run, self.console, sinks=self.sinks, every=self.every, stage=stage)
@@ -109,9 +114,6 @@ class StagedSession:
         if self.ranks.size == 1:
             return Trainer(self.scene, config, self.ranks.device, teachers=teachers)
         return ParallelTrainer(self.scene, config, self.ranks.device, self.ranks, teachers=teachers)
-
-    def _folder(self, number: int) -> Path:
-        return self.run / TEACHERS_FOLDER / str(number + 1)
 
     def _tell_teacher(self) -> None:
         """Say which teacher is trained, and make its folder a run."""
@@ -125,7 +127,7 @@ class StagedSession:
         number = len(self.models)
         if number == len(self.stages.teachers):
             return False
-        folder = self._folder(number)
+        folder = teacher_folder(self.run, number + 1)
         metrics = read_metrics(folder) if self.ranks.first else {}
         seconds = self.ranks.share(metrics.get("seconds"))
         if not isinstance(seconds, (int, float)):

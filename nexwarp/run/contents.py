@@ -11,6 +11,7 @@ from nexwarp.io.files import is_abandoned, is_temporary, remove_empty
 from nexwarp.io.json_files import READ_ERRORS, read_json
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
+from nexwarp.train.config import MOST_TEACHERS
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
@@ -22,7 +23,7 @@ CAMERA_PATH = "camera_path_{}.json"
 
 TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
-TEACHERS_FOLDER = "teachers"  # each of its subfolders, 1 and so on, is a run
+TEACHERS_FOLDER = "teachers"
 EXPORT_FOLDER = "export"
 SURFELS_FILE, SPLATS_FILE, MESH_FILE = "surfels.ply", "splats.ply", "mesh.ply"
 COMPACT_FILE = "compact.safetensors"
@@ -71,13 +72,19 @@ def frame_name(index: int) -> str:
     return f"{index:04d}.png"
 
 
+def teacher_folder(run: Path, number: int) -> Path:
+    """Return the folder of a teacher that a run trains for itself, a run too; teachers are counted from 1."""
+    return run / TEACHERS_FOLDER / str(number)
+
+
 def teacher_folders(run: Path) -> list[Path]:
-    """Return the folders of the teachers that a run has trained for itself, each a run, in their order."""
-    folder = run / TEACHERS_FOLDER
-    if folder.is_symlink() or not folder.is_dir():
+    """Return the folders that there are of a run's own teachers, as far as its config tells them."""
+    try:
+        count = int(read_json(run / CONFIG_FILE)["own_teachers"]["count"])
+    except (*READ_ERRORS, KeyError, TypeError):  # it has none, or the config is damaged
         return []
-    found = [each for each in folder.iterdir() if re.fullmatch(r"[1-9]\d*", each.name)]
-    return sorted((f for f in found if f.is_dir() and not f.is_symlink()), key=lambda f: int(f.name))
+    found = [teacher_folder(run, number) for number in range(1, min(count, MOST_TEACHERS) + 1)]
+    return [folder for folder in found if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
 
 
 def list_files(run: Path) -> tuple[list[str], list[str]]:

@@ -53,6 +53,12 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
     _delete(older)
 
 
+def delete_checkpoints(run: Path) -> None:
+    """Delete what `save_checkpoint` wrote."""
+    for name in CHECKPOINTS:
+        _delete(run / name)
+
+
 def _delete(folder: Path) -> None:
     """Delete a checkpoint. Files in its folder that are not ours stay, and so does the folder then."""
     with suppress(OSError):

@@ -129,8 +129,16 @@ def student_trainer(
     for number, settings in enumerate(stages.teachers):
         trainer = Trainer(scene, settings, device, losses=losses, optimizer=optimizer)
         trainer.run(counted_from(number * settings.iterations, observe), warn)
-        own.append(trainer.finish())
+        own.append(_as_saved(trainer.finish()))
     return Trainer(scene, stages.student, device, losses=losses, optimizer=optimizer, teachers=own or found)
+
+
+@torch.no_grad()
+def _as_saved(model: Model) -> Model:
+    """Round what a file keeps in half precision: `nexwarp train` reads a resumed run's teachers from files."""
+    for parameter in () if model.texture is None else model.texture.parameters():
+        parameter.copy_(parameter.half())
+    return model
 
 
 def counted_from(done: int, observe: Callable[[StepReport], None] | None) -> Callable[[StepReport], None] | None:
