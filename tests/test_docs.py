@@ -57,6 +57,7 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "filter_points": ("", ""),
     "orient_points": ("", ""),
     "skybox": ("", ""),
+    "teachers": ("", ""),
     "seed": ("", "code"),
     "deterministic": ("", ""),
     "cuda_graphs": ("", ""),

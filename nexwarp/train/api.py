@@ -35,9 +35,8 @@ def train(
         scene: what to learn from: its training views and points.
         config: settings; None is `nexwarp.preset("default")`.
         device: where to train; None is CUDA where there is a device, else the CPU.
-        callbacks: functions that are called with a `StepReport` after each step, those of `config.teachers` included,
-            which come first. One that raises stops the training; its exception is passed on. After divergence, steps
-            are repeated and reported again.
+        callbacks: functions that are called with a `StepReport` after each step, first those of teachers that the run
+            trains. One that raises stops it; its exception is passed on. After divergence, steps are reported again.
         losses: own losses by name: functions of the step's `Rendering`, at the photo's exposure, and its `Target`
             (`target.photo` (H, W, 3), `target.camera`, `target.background`, `target.counts`) that return a scalar
             tensor. They are added to ours as they are, so that factors are their own business, and appear in
@@ -68,28 +67,27 @@ def train(
         raise TypeError(f"scene: expected a nexwarp.Scene, got {type(scene).__name__}")
     if config is not None and not isinstance(config, Config):
         raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
-    observers = _checked(callbacks)
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    config = config or Config()
+    config, observe = config or Config(), _observer(callbacks)
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+
+    def warn(message: str) -> None:
+        warnings.warn(message, stacklevel=2)
+
+    stages = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
+    trainer = stages(scene, config, device, observe=observe, warn=warn)
+    trainer.run(counted_from(config.iterations - trainer.config.iterations, observe), warn)
+    return trainer.finish()
+
+
+def _observer(callbacks: Iterable[Callback]) -> Callable[[StepReport], None]:
+    """Return a function that calls all callbacks; TypeError for one that is no function."""
+    observers = list(callbacks)
+    for index, callback in enumerate(observers):
+        if not callable(callback):
+            raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
 
     def observe(report: StepReport) -> None:
         for callback in observers:
             callback(report)
 
-    def warn(message: str) -> None:
-        warnings.warn(message, stacklevel=2)
-
-    own = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
-    trainer = own(scene, config, device, observe=observe, warn=warn)
-    trainer.run(counted_from(config.iterations - trainer.config.iterations, observe), warn)
-    return trainer.finish()
-
-
-def _checked(callbacks: Iterable[Callback]) -> list[Callback]:
-    """Return callbacks as a list; TypeError for one that is no function."""
-    observers = list(callbacks)
-    for index, callback in enumerate(observers):
-        if not callable(callback):
-            raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
-    return observers
+    return observe
