@@ -1,4 +1,4 @@
-"""Runs that train teachers of their own first: how they are divided, and that they are what three commands give."""
+"""Runs that train teachers of their own first: how they are divide, and that they are what three commands give."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ from rich.console import Console
 import nexwarp as nw
 from benchmarks.quality.jobs import PHOTOS, TrainingJob, config_of, group_jobs, training_photos
 from benchmarks.quality.rows import DEFAULT, Row
-from benchmarks.quality.run import config_name, run_job
+from benchmarks.quality.run import config_name, run_job, trained_with
 from benchmarks.quality.scenes import scene_of
 from benchmarks.timing import ROOT
 from nexwarp import Config, Model, Scene, Trainer
@@ -24,11 +24,11 @@ from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.run.contents import list_files
 from nexwarp.run.evaluate import METRICS
-from nexwarp.run.folder import SceneSource, create_run, read_run
+from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divided, plan_teachers, teacher_count
+from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divide, plan_teachers, teacher_count
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -73,10 +73,10 @@ def test_the_default_has_none() -> None:
 def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int) -> None:
     config = Config(iterations=iterations, teachers=count, seed=5)
     if iterations <= count:
-        with pytest.raises(SettingError, match="iterations: expected more than the 8 of teachers, got 7"):
-            divided(config, plan_teachers(config, 20))
+        with pytest.raises(SettingError, match="iterations: expected more than the teachers' 8, got 7"):
+            divide(config, plan_teachers(config, 20))
         return
-    stages = divided(config, plan_teachers(config, 20))
+    stages = divide(config, plan_teachers(config, 20))
     lengths = [each.iterations for each in stages.teachers]
     assert len(set(lengths)) == 1 and min(lengths) >= 1
     assert sum(lengths) + stages.student.iterations == iterations
@@ -88,14 +88,14 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
 
 def test_seeds_of_teachers_follow_from_the_runs() -> None:
     def seeds(seed: int) -> list[int]:
-        return [each.seed for each in divided(Config(seed=seed), OwnTeachers(2, 10)).teachers]
+        return [each.seed for each in divide(Config(seed=seed), OwnTeachers(2, 10)).teachers]
 
     assert seeds(3) == seeds(3) and not set(seeds(3)) & set(seeds(4))
 
 
 def test_settings_that_do_not_go_together_are_refused() -> None:
     for changes in ({"refine_poses": True}, {"blur_poses": 3}):
-        with pytest.raises(ValueError, match="teachers: expected 0 where poses are learned, got 2"):
+        with pytest.raises(ValueError, match="teachers: expected 0 or null where poses are learned, got 2"):
             Config(teachers=2, **changes)
     for wrong in (-1, 9):
         with pytest.raises(ValueError, match=f"teachers: expected at least 0 and at most 8, got {wrong}"):
@@ -116,7 +116,7 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
 
     found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
     assert seen == [*range(1, 21)]
-    stages = divided(CONFIG, OwnTeachers(2, 4))
+    stages = divide(CONFIG, OwnTeachers(2, 4))
     files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
     teachers = [nw.load(file) for file in files]
     assert same(found, nw.train(tiny_scene, stages.student, device=CPU, teachers=teachers))
@@ -256,7 +256,7 @@ def test_other_teachers_are_refused_where_a_run_has_its_own(
     capsys.readouterr()
     assert command(run, "--resume", "--teacher", str(finished)) == 2
     told = " ".join(capsys.readouterr().err.split())
-    assert "--teacher: expected none as in the run to resume, which has teachers of its own" in told
+    assert "--teacher: expected none, as the run to resume trains its own, got" in told
 
 
 def test_given_runs_take_the_place_of_own_teachers(
@@ -287,17 +287,143 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
     assert "own_teachers" not in read_run(run)[2]
 
 
+@pytest.mark.parametrize("kind", ["foreign", "link", "file"])
+def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Nor overwritten: nothing changes."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    place = run / "teachers"
+    if kind == "foreign":  # of a run that has no teachers of its own
+        create_run(run, SceneSource("demo"), CONFIG, "cpu")
+        shutil.copytree(finished / "teachers" / "1", place / "1", dirs_exist_ok=True)
+        place = place / "1"
+    else:
+        place.rename(tmp_path / "elsewhere")
+        place.symlink_to(tmp_path / "elsewhere") if kind == "link" else place.write_text("mine")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    capsys.readouterr()
+    assert command(run, "--overwrite") == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write".replace(" ", "") in (
+        told.replace(" ", "")
+    )
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.rmtree(run / "teachers" / "2")
+    capsys.readouterr()
+    assert command(run, "--resume", iterations=30) == 2
+    told = "".join(capsys.readouterr().err.split())
+    assert f"{run}/teachers/2:expectedthecompleteteacherthatthestudentin{run}haslearnedfrom" in told
+    assert read_run(run)[1].iterations == 20 and not (run / "teachers" / "2").exists()
+    shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
+    assert command(run, "--resume") == 2
+    assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in "".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_teacher_is_not_trained_on_its_own(
+    finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    teacher = finished / "teachers" / "1"
+    for flag in ("--resume", "--overwrite"):
+        capsys.readouterr()
+        assert command(teacher, flag) == 2
+        assert "--run: expected a run of its own, got" in " ".join(capsys.readouterr().err.split())
+    assert (teacher / "model.safetensors").is_file()
+
+
+def test_checkpoints_of_a_complete_teacher_go_even_after_a_kill(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """That came between its last file and the deletion."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.copytree(run / "checkpoint", run / "teachers" / "1" / "checkpoint")
+    assert command(run, "--resume") == 0
+    assert not has_checkpoint(run / "teachers" / "1") and has_checkpoint(run)
+
+
+def test_a_longer_run_finishes_its_teachers_as_they_were(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """Although --iterations has grown before they were complete."""
+    run = tmp_path / "run"
+    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4))
+    assert command(run, "--resume", iterations=30) == 0
+    for number in "12":
+        assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
+
+
+def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Of the training alone; a resumed run finds them by these."""
+    scene = dataclasses.replace(tiny_scene, test=[])
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
+    create_run(run, source, CONFIG, "cpu", own=own)
+    models = []
+    for resume in (False, True):
+        console, ranks = Console(quiet=True), Ranks.alone(CPU)
+        session = StagedSession(scene, CONFIG, own, run, source, console, ranks, resume=resume)
+        assert session.session.stage.teacher != resume
+        session.begin()
+        session.train()
+        models.append(session.finish())
+    assert same(*models) and not (run / "metrics.json").exists()
+
+
+def test_weights_and_biases_gets_the_runs_settings(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+
+    class Sink:
+        def __init__(self, run: Path, settings: dict[str, Any]) -> None:
+            given.append(settings)
+
+        def write(self, values: object, step: int) -> None: ...
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
+    create_run(run, source, CONFIG, "cpu", own=own)
+    session = StagedSession(
+        tiny_scene, CONFIG, own, run, source, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"]
+    )
+    session.train()
+    assert given == [CONFIG.as_dict()]
+
+
 def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> None:
     run = tmp_path / "run"
     create_run(run, SceneSource("demo"), CONFIG, "cpu")
     (run / "teachers" / "1").mkdir(parents=True)
     (run / "teachers" / "1" / "model.safetensors").write_text("mine")
     assert list_files(run) == (["config.json"], ["teachers/1/"])
-    for wrong in ({"count": 2}, {"count": "2", "iterations": 4}, {"count": 9, "iterations": 4}, [2, 4]):
+    for wrong in (
+        {"count": 2},
+        {"count": "2", "iterations": 4},
+        {"count": 9, "iterations": 4},
+        {"count": 2, "iterations": 0},
+        {"count": 2, "iterations": 10},  # all that the run has
+        [2, 4],
+    ):
         data = json.loads((run / "config.json").read_text()) | {"own_teachers": wrong}
         (run / "config.json").write_text(json.dumps(data))
         with pytest.raises(ValueError, match="own_teachers: expected"):
             read_run(run)
+    data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
+    (run / "config.json").write_text(json.dumps(data))
+    assert read_own_teachers(run) == OwnTeachers(2, 4)
 
 
 def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -312,7 +438,7 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     drawn: list[object] = []
     console = Console(quiet=True)
     source, run = SceneSource(str(tiny_scene.path)), tmp_path / "run"
-    session = StagedSession(tiny_scene, divided(CONFIG, OwnTeachers(2, 4)), run, source, console, Ranks.alone(CPU))
+    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4), run, source, console, Ranks.alone(CPU))
     create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4))
     session.train(Shown())  # type: ignore[arg-type]
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
@@ -327,10 +453,8 @@ def test_the_benchmark_trains_teachers_first(
     result = run_job(job, tiny_folder.parent, row, models=tmp_path)
     assert result["teachers"] == {"count": 2} and result["iterations"] == 20
     config = config_of(job, row)
-    assert result["config"] == config_name(config) != config_name(dataclasses.replace(config, teachers=0))
-    assert config_name(dataclasses.replace(config, teachers=0)) == config_name(
-        dataclasses.replace(config, seed=9, teachers=0)
-    )
+    assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
+    assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))
     (file,) = tmp_path.iterdir()
     expected = nw.train(scene_of(job, tiny_folder.parent), config, device=CPU)
     assert same(nw.load(file), nw.load(expected.save(tmp_path / "expected")))

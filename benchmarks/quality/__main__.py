@@ -14,7 +14,7 @@ from benchmarks.quality.jobs import SCENES, TABLES, TrainingJob, config_of, tabl
 from benchmarks.quality.published import fill, of_one_default
 from benchmarks.quality.results import DIGITS, METRICS, Results, drop_unfinished, read_results
 from benchmarks.quality.rows import DEFAULT, ROWS, Row
-from benchmarks.quality.run import config_name
+from benchmarks.quality.run import trained_with
 from benchmarks.quality.scenes import VARIANTS
 from benchmarks.quality.schedule import Schedule
 from benchmarks.quality.tables import differences, markdown, summary
@@ -73,8 +73,8 @@ def _wanted_jobs(given: argparse.Namespace, rows: Mapping[str, Row]) -> list[Tra
 def _check_settings(out: Path, wanted: Iterable[TrainingJob], have: Results, rows: Mapping[str, Row]) -> None:
     """Raise ValueError where a result of a wanted job was made with other settings than today's."""
     for job in wanted:
-        before, row = have.get(job, {}).get("config"), rows[job.row]
-        if before and row.preset is not None and before != config_name(config_of(job, row)):
+        before, row = have.get(job, {}), rows[job.row]
+        if before.get("config") and row.preset is not None and not trained_with(before, config_of(job, row)):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} with the settings of today"
             raise ValueError(f"{out}: expected {told}, got others ({have[job]['commit']}): give another --out")
 

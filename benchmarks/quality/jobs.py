@@ -184,7 +184,7 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         return job, 0
     config = config_of(job, row)
     shared = min(config.settled - 1, job.iterations)
-    if shared <= 0 or config.teachers:
+    if shared <= 0 or config.teachers != 0:
         return job, 0
     alike = dataclasses.replace(
         config,

@@ -8,7 +8,7 @@ from benchmarks.quality.equal_seconds import BEST, SHORT
 from benchmarks.quality.jobs import ITERATIONS, SIZE, TrainingJob, config_of
 from benchmarks.quality.results import Results
 from benchmarks.quality.rows import DEFAULT, PEERS, ROWS
-from benchmarks.quality.run import config_name
+from benchmarks.quality.run import trained_with
 
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) -->\n)(.*?)(<!-- end of results -->)", re.DOTALL)
 PEER_NAMES = tuple(row.name for row in PEERS)
@@ -30,7 +30,7 @@ def of_one_default(
 
     Raises:
         ValueError: the default's results are of several commits and none is named, there is none of the named commit,
-            or one was trained with other settings than today's (`older`: than another one of its scene, row and size).
+            or one was trained with other settings than today's (`older`: than another one of its row and size).
     """
     full = [(job, x) for file in files for job, x in file.items() if job.row in ROWS and _at_full_size(job)]
     own = [(job, x) for job, x in full if _is_default(job)]
@@ -41,11 +41,11 @@ def of_one_default(
     chosen = {job: x for job, x in own if x["commit"] in allowed}
     if commit is not None and not any(x["commit"] == commit for x in chosen.values()):
         raise ValueError(f"--commit: expected one of {', '.join(commits) or 'none'}, got {commit}")
-    digests: dict[tuple[str, str, int], str | None] = {}
+    digests: dict[tuple[str, int], str | None] = {}
     for job, result in chosen.items():
         digest = result.get("config")
-        expected = config_name(config_of(job, ROWS[job.row]))
-        if digest != (digests.setdefault((job.scene, job.row, job.size), digest) if older else expected):
+        alike = digest == digests.setdefault((job.row, job.size), digest)
+        if not (alike if older else trained_with(result, config_of(job, ROWS[job.row]))):
             told = f"{job.scene} {job.row} {job.size} seed {job.seed} ({result['commit']})"
             raise ValueError(
                 f"{told}: expected the settings of {'other trainings of the row' if older else 'today'}, got others"
@@ -137,7 +137,7 @@ def equal_seconds(alone: Results, scene: str) -> tuple[Mapping[str, Any], Traini
 def of_today(job: TrainingJob, result: Mapping[str, Any]) -> bool:
     """Whether a result of a known row was trained with today's settings; of gsplat's rows each is."""
     row = ROWS.get(job.row)
-    return row is not None and (row.preset is None or result.get("config") == config_name(config_of(job, row)))
+    return row is not None and (row.preset is None or trained_with(result, config_of(job, row)))
 
 
 def mean(found: Collection[Mapping[str, float]], metric: str) -> float:

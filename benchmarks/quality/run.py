@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -110,8 +110,8 @@ def run_job(
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
         of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either;
         `compact`, the metrics and megabytes of a compact file, and its PSNR by view; of nexwarp `config`, a digest of
-        its settings, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows and iterations of its shared
-        start, if any; the metrics by view; device, date and commit.
+        its settings, `teachers` where it had any, `train_psnr`, `zoom_psnr` and `quarter_psnr`; `together`, the rows
+        and iterations of its shared start, if any; the metrics by view; device, date and commit.
     """
     device = _device()
     scene = scene_of(job, data)
@@ -156,13 +156,19 @@ def config_name(config: Config) -> str:
     is off.
     """
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"} | {"clamp_image": True}
-    for name in ("skybox", "teachers"):
-        if not settings[name]:
-            del settings[name]
+    if not config.skybox:
+        del settings["skybox"]
+    del settings["teachers"]  # `trained_with` compares their number
     settings["losses"] |= {"poses": POSE_PRIOR}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def trained_with(result: Mapping[str, Any], config: Config) -> bool:
+    """Whether a result of nexwarp was trained with settings, whatever the seed, and as many teachers."""
+    teachers = (result.get("teachers") or {}).get("count", 0)
+    return result.get("config") == config_name(config) and teachers == (config.teachers or 0)
 
 
 def _device() -> torch.device:

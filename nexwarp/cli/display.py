@@ -109,7 +109,7 @@ class TrainingDisplay:
             total: iterations of the run.
             done: iterations done before.
             device: device of the training, whose memory is shown.
-            name: of the training.
+            name: what the display calls the training.
         """
         self.console, self.total, self.done, self.device = console, total, done, device
         self.start = self.shown = time.perf_counter()

@@ -1,5 +1,6 @@
 """All trainings of a run folder: its own teachers, one after the other, then the student (`nexwarp.train.stages`)."""
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,14 +10,15 @@ from rich.console import Console
 from nexwarp.cli.training_session import Stage, TrainingSession, shared_model
 from nexwarp.data import Scene
 from nexwarp.distributed.ranks import Ranks
+from nexwarp.errors import RunError
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.run.contents import teacher_folder
 from nexwarp.run.folder import SceneSource, create_run, is_run, read_metrics, read_run, rewrite_config
-from nexwarp.train.checkpoint import delete_checkpoints
+from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.stages import Stages
+from nexwarp.train.stages import OwnTeachers, divide
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -26,13 +28,15 @@ if TYPE_CHECKING:
 class StagedSession:
     """The trainings of a run, each a `TrainingSession` in a folder of its own.
 
-    A teacher's folder is a run, too: RUN/teachers/1 and so on. It has a metrics.json once it is complete.
+    A teacher's folder is a run, too: RUN/teachers/1 and so on. The teacher is complete once its metrics.json, which is
+    written last, says how long the training took.
     """
 
     def __init__(
         self,
         scene: Scene,
-        stages: Stages,
+        config: Config,
+        own: OwnTeachers,
         run: Path,
         source: SceneSource,
         console: Console,
@@ -47,17 +51,21 @@ class StagedSession:
 
         Args:
             scene: what to learn from.
-            stages: of the run.
+            config: settings of the run.
+            own: teachers that the run trains first.
             run: run folder.
             source: the scene.
             console: where to print.
             ranks: the processes that train together.
-            teachers: of a student without teachers of the run's own.
-            resume: pass over the teachers that are complete.
-            sinks: see `TrainingSession`; those of the student.
-            every: see `TrainingSession`; of all stages.
+            teachers: models that the student learns from where the run trains no teachers.
+            resume: go on with the stage that was interrupted.
+            sinks: of the student's log; see `TrainingSession`.
+            every: of all stages; see `TrainingSession`.
+
+        Raises:
+            RunError: the student has begun, and a teacher is missing or has other settings.
         """
-        self.scene, self.stages, self.run, self.source = scene, stages, run, source
+        self.scene, self.config, self.stages, self.run, self.source = scene, config, divide(config, own), run, source
         self.console, self.ranks, self.resume, self.sinks, self.every = console, ranks, resume, sinks, every
         self.given, self.models = teachers, list[Model]()
         self.seconds = 0.0
@@ -72,26 +80,28 @@ class StagedSession:
 
     def begin(self) -> None:
         """Restore the checkpoint of the stage to resume, or check that the disk has room."""
+        self._announce()
         if self.resume:
             self.session.resume()
         else:
             self.session.check_room()
 
     def train(self, viewer: "Viewer | None" = None) -> None:
-        """Train all stages but for the end of the student; see `TrainingSession.train`."""
-        while True:
-            if self.session.stage.teacher:
-                self._tell_teacher()
+        """Train and finish the teachers, and train the student; see `TrainingSession.train`."""
+        while self.session.stage.teacher:
+            if self.ranks.first and not (self.resume and is_run(self.session.run)):
+                create_run(self.session.run, self.source, self.trainer.config, self.ranks.device.type)
             self.session.train(viewer)
-            if not self.session.stage.teacher:
-                return
             self.models.append(self.session.finish())
             self.seconds += self.trainer.seconds
             if self.ranks.first:
                 delete_checkpoints(self.session.run)  # nothing continues from them
+            del self.session  # before the next trainer takes memory
             self.session = self._next_session()
+            self._announce()
             if self.resume:
-                self.session.resume()
+                self.session.resume(begun=False)
+        self.session.train(viewer)
 
     def finish(self) -> Model:
         """Finish, write, evaluate and return the run's model; see `TrainingSession.finish`."""
@@ -103,11 +113,11 @@ class StagedSession:
         if number < count:
             trainer = self._make_trainer(self.stages.teachers[number], ())
             stage = Stage(f"teacher {number + 1} of {count}", teacher=True, iterations=before, seconds=self.seconds)
-            return TrainingSession(
-                trainer, teacher_folder(self.run, number + 1), self.console, every=self.every, stage=stage
-            )
+            folder = teacher_folder(self.run, number + 1)
+            return TrainingSession(trainer, folder, self.console, every=self.every, stage=stage)
         trainer = self._make_trainer(self.stages.student, self.models or self.given)
-        stage = Stage(iterations=before, seconds=self.seconds)
+        name = "student" if count else "training"
+        stage = Stage(name, iterations=before, seconds=self.seconds, settings=self.config)
         return TrainingSession(trainer, self.run, self.console, sinks=self.sinks, every=self.every, stage=stage)
 
     def _make_trainer(self, config: Config, teachers: Sequence[Model]) -> Trainer:
@@ -115,26 +125,40 @@ class StagedSession:
             return Trainer(self.scene, config, self.ranks.device, teachers=teachers)
         return ParallelTrainer(self.scene, config, self.ranks.device, self.ranks, teachers=teachers)
 
-    def _tell_teacher(self) -> None:
-        """Say which teacher is trained, and make its folder a run."""
-        session, config = self.session, self.trainer.config
-        self.console.print(f"{session.stage.name}: {config.iterations:,} iterations, seed {config.seed}")
-        if self.ranks.first and not is_run(session.run):
-            create_run(session.run, self.source, config, self.ranks.device.type)
+    def _announce(self) -> None:
+        """Say which of several trainings comes."""
+        if self.stages.teachers:
+            config = self.trainer.config
+            self.console.print(f"{self.session.stage.name}: {config.iterations:,} iterations, seed {config.seed}")
 
     def _take_complete(self) -> bool:
         """Take the next teacher if it is complete; return whether it is."""
         number = len(self.models)
         if number == len(self.stages.teachers):
             return False
-        folder = teacher_folder(self.run, number + 1)
-        metrics = read_metrics(folder) if self.ranks.first else {}
-        seconds = self.ranks.share(metrics.get("seconds"))
+        seconds = self.ranks.share(self._seconds_of(number) if self.ranks.first else None)
         if not isinstance(seconds, (int, float)):
             return False
-        self.models.append(shared_model(folder / MODEL_FILE if self.ranks.first else None, self.ranks))
+        file = teacher_folder(self.run, number + 1) / MODEL_FILE
+        self.models.append(shared_model(file if self.ranks.first else None, self.ranks))
         self.seconds += seconds
         return True
+
+    def _seconds_of(self, number: int) -> float | None:
+        """Return how long the training of a complete teacher took; None where the teacher is not complete."""
+        folder, expected = teacher_folder(self.run, number + 1), self.stages.teachers[number]
+        begun = is_run(folder)
+        if begun and dataclasses.replace(read_run(folder)[1], cuda_graphs=expected.cuda_graphs) != expected:
+            raise RunError(f"{folder}: expected a teacher with the settings of {self.run}, got others")
+        seconds = read_metrics(folder).get("seconds") if begun else None
+        if not isinstance(seconds, (int, float)):
+            if has_checkpoint(self.run):
+                raise RunError(
+                    f"{folder}: expected the complete teacher that the student in {self.run} has learned from"
+                )
+            return None
+        delete_checkpoints(folder)  # a kill can have come before
+        return float(seconds)
 
 
 def extend_run(run: Path, config: Config, console: Console) -> None:

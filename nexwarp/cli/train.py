@@ -29,6 +29,7 @@ from nexwarp.run.folder import (
     DEMO,
     SceneSource,
     began,
+    check_teachers_place,
     claimed_run,
     create_run,
     keep_camera_path,
@@ -41,7 +42,7 @@ from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
-from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divided, plan_teachers
+from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, plan_teachers
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -152,7 +153,8 @@ class Train:
                 own = NO_TEACHERS if given else plan_teachers(config, len(scene.train))
             session = StagedSession(
                 scene,
-                divided(config, own),
+                config,
+                own,
                 run,
                 source,
                 console,
@@ -163,8 +165,11 @@ class Train:
                 every=self.checkpoint_every,
             )
             session.begin()
-            if resume and ranks.first:
-                extend_run(run, config, console)
+            if ranks.first:
+                if resume:
+                    extend_run(run, config, console)
+                else:
+                    check_teachers_place(run, own.count)
             if self.resume and not resume:
                 console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
             with self._viewer(session, config, run, source.name, console) as viewer:
@@ -200,9 +205,8 @@ class Train:
                 source = self._resumed_source(source, run)
                 own = read_own_teachers(run)
                 if self.teachers and own.count:
-                    raise SettingError(
-                        "--teacher: expected none as in the run to resume, which has teachers of its own"
-                    )
+                    given = self.teachers[0]
+                    raise SettingError(f"--teacher: expected none, as the run to resume trains its own, got {given}")
                 self.teachers = self.teachers or read_teachers(run)
             config = self._config(run, resume)
             self._check()
@@ -351,7 +355,7 @@ class Train:
         for path in self.teachers:
             if path.resolve().is_relative_to(run.resolve()):
                 raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
-        if self.teachers and (config.refine_poses or config.blur_poses > 1):
+        if self.teachers and config.learns_poses:
             raise SettingError("--teacher: expected poses that stay as given, got --refine-poses or blur_poses")
 
     def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:

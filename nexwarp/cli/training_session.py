@@ -33,7 +33,9 @@ from nexwarp.run.contents import (
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
+from nexwarp.run.log_sinks import PACKAGES
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
+from nexwarp.train.config import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -50,16 +52,18 @@ class Stage:
     """Place of a training among those of a run.
 
     Attributes:
-        name: of its progress.
-        teacher: whether it is a teacher of the run, whose model is not evaluated.
-        iterations: of the stages before it.
-        seconds: of the stages before it.
+        name: what the progress display and messages call the training.
+        teacher: whether it trains a teacher of the run, whose model is not evaluated.
+        iterations: number of iterations that earlier stages had.
+        seconds: time that earlier stages took.
+        settings: of the run; None where they are the training's.
     """
 
     name: str = "training"
     teacher: bool = False
     iterations: int = 0
     seconds: float = 0.0
+    settings: Config | None = None
 
 
 ALONE = Stage()
@@ -102,8 +106,12 @@ class TrainingSession:
         if self.ranks.first:
             check_room(self.run, max(FILES_AT_A_TIME - kept, 1) * self.trainer.checkpoint_size())
 
-    def resume(self) -> None:
-        """Restore the run's newest complete checkpoint, if it has one."""
+    def resume(self, *, begun: bool = True) -> None:
+        """Restore the run's newest complete checkpoint, if it has one.
+
+        Args:
+            begun: whether one is expected, so that the console says where there is none.
+        """
         found = False
         if self.ranks.first:
             self.check_room(sum((self.run / name).is_dir() for name in CHECKPOINTS))
@@ -114,7 +122,7 @@ class TrainingSession:
             # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
             self.trainer.restore(self.run, partial(display.warn, self.console), extend=True)
             self.console.print(f"resumed at iteration {self.trainer.iteration:,}")
-        else:
+        elif begun:
             self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
 
     def train(self, viewer: "Viewer | None" = None) -> None:
@@ -134,7 +142,8 @@ class TrainingSession:
         progress_display = display.TrainingDisplay(
             self.console, self.total, trainer.iteration, trainer.device, self.stage.name
         )
-        log = TrainingLog(self.run, trainer, tensorboard="tensorboard" in self.sinks, wandb="wandb" in self.sinks)
+        sinks = {name: name in self.sinks for name in PACKAGES}
+        log = TrainingLog(self.run, trainer, **sinks, settings=self.stage.settings)
         with ExitStack() as stack:
             if ranks.first:
                 stack.enter_context(progress_display)
@@ -207,16 +216,15 @@ class TrainingSession:
         Raises:
             StorageError, OutOfMemoryError: the last checkpoint holds the trained state; --resume finishes the run.
         """
+        complete = f"{self.stage.name} is complete and saved: --resume finishes the run"
         try:
             return self._finish()
         except OSError as error:
-            raise StorageError(f"{error}; training is complete and saved: --resume finishes the run") from error
+            raise StorageError(f"{error}; {complete}") from error
         except (MemoryError, RuntimeError) as error:
             if (needed := needed_memory(error)) is None:
                 raise
-            raise OutOfMemoryError(
-                f"out of memory: needed {needed}; training is complete and saved: --resume finishes the run"
-            ) from error
+            raise OutOfMemoryError(f"out of memory: needed {needed}; {complete}") from error
 
     def _finish(self) -> Model:
         trainer, scene, run = self.trainer, self.trainer.scene, self.run
@@ -290,9 +298,10 @@ def shared_model(file: Path | None, ranks: Ranks) -> Model:
         ranks: the processes that train together.
     """
     if file is not None:
+        model = load(file)
         if ranks.size > 1:
             ranks.share_bytes(file.read_bytes())
-        return load(file).to(ranks.device)
+        return model.to(ranks.device)
     with TemporaryDirectory() as folder:
         (Path(folder) / MODEL_FILE).write_bytes(ranks.share_bytes(None))
         return load(folder).to(ranks.device)

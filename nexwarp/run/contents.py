@@ -78,7 +78,7 @@ def teacher_folder(run: Path, number: int) -> Path:
 
 
 def teacher_folders(run: Path) -> list[Path]:
-    """Return the folders that there are of a run's own teachers, as far as its config tells them."""
+    """Return the existing folders of a run's own teachers; its config tells how many it has."""
     try:
         count = int(read_json(run / CONFIG_FILE)["own_teachers"]["count"])
     except (*READ_ERRORS, KeyError, TypeError):  # it has none, or the config is damaged

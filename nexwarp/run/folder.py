@@ -17,7 +17,16 @@ from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
 from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
-from nexwarp.run.contents import CAMERA_PATH, CONFIG_FILE, LOCK_FILE, METRICS_FILE, delete_files
+from nexwarp.run.contents import (
+    CAMERA_PATH,
+    CONFIG_FILE,
+    LOCK_FILE,
+    METRICS_FILE,
+    TEACHERS_FOLDER,
+    delete_files,
+    teacher_folder,
+    teacher_folders,
+)
 from nexwarp.run.lock import locked_run
 from nexwarp.train.config import MOST_TEACHERS, Config
 from nexwarp.train.presets import config_from_dict
@@ -100,6 +109,8 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
         raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
+    if run.resolve() in teacher_folders(run.resolve().parent.parent):
+        raise RunError(f"--run: expected a run of its own, got {run}, a teacher of {run.resolve().parent.parent}")
     if resume and is_run(run):
         return True
     # A process that is killed before it has written the config leaves a lock and temporary files.
@@ -174,6 +185,18 @@ def create_run(
     return foreign
 
 
+def check_teachers_place(run: Path, count: int) -> None:
+    """Raise RunError where something that is not the run's is where it would put its own teachers; change nothing."""
+    own = teacher_folders(run)
+    for place in (run / TEACHERS_FOLDER, *(teacher_folder(run, number) for number in range(1, count + 1))):
+        taken = place.is_symlink() or (place.exists() and not place.is_dir())
+        if count and (taken or (place.exists() and place.parent != run and place not in own)):
+            raise RunError(
+                f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or give "
+                "another --run"
+            )
+
+
 def rewrite_config(run: Path, config: Config) -> None:
     """Replace the settings in a run's config; the file's other entries stay."""
     write_json(run / CONFIG_FILE, {**read_run(run)[2], "config": config.as_dict()})
@@ -234,10 +257,12 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
         teachers = data.get("teachers", [])
         if not isinstance(teachers, list) or not all(isinstance(path, str) for path in teachers):
             raise ValueError(f"teachers: expected a list of paths, got {teachers!r}")
-        _own_teachers(data)
+        own, config = _own_teachers(data), config_from_dict(data["config"])
+        if own.count * own.iterations >= config.iterations:
+            raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
         known = {field.name for field in dataclasses.fields(SceneSource)}
         source = SceneSource(**{name: value for name, value in scene.items() if name in known})
-        return source, config_from_dict(data["config"]), data
+        return source, config, data
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None
 
@@ -256,11 +281,16 @@ def read_own_teachers(run: Path) -> OwnTeachers:
 
 def _own_teachers(data: Mapping[str, Json]) -> OwnTeachers:
     own = data.get("own_teachers", dataclasses.asdict(NO_TEACHERS))
-    if not (isinstance(own, dict) and own.keys() == {"count", "iterations"}):
-        raise ValueError(f"own_teachers: expected count and iterations, got {own!r:.60}")
-    count, iterations = own["count"], own["iterations"]
-    if type(count) is not int or type(iterations) is not int or not 0 <= count <= MOST_TEACHERS or iterations < 0:
-        raise ValueError(f"own_teachers: expected a count of 0 to {MOST_TEACHERS} and iterations, got {own}")
+    if not isinstance(own, dict):
+        raise ValueError(f"own_teachers: expected an object, got {own!r:.60}")
+    count, iterations = own.get("count"), own.get("iterations")
+    if (
+        type(count) is not int
+        or type(iterations) is not int
+        or not 0 <= count <= MOST_TEACHERS
+        or iterations < min(count, 1)
+    ):
+        raise ValueError(f"own_teachers: expected a count of 0 to {MOST_TEACHERS} and iterations, got {own!r:.60}")
     return OwnTeachers(count, iterations)
 
 

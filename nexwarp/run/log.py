@@ -12,6 +12,7 @@ import torch
 from nexwarp.io.files import written_aside
 from nexwarp.run.contents import LOG_FILE
 from nexwarp.run.log_sinks import Sink, TensorboardSink, WandbSink
+from nexwarp.train.config import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -77,7 +78,15 @@ class TrainingLog:
     Values that are not finite are written as null.
     """
 
-    def __init__(self, run: Path, trainer: Trainer, *, tensorboard: bool = False, wandb: bool = False) -> None:
+    def __init__(
+        self,
+        run: Path,
+        trainer: Trainer,
+        *,
+        tensorboard: bool = False,
+        wandb: bool = False,
+        settings: Config | None = None,
+    ) -> None:
         """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
 
         Args:
@@ -85,7 +94,9 @@ class TrainingLog:
             trainer: the trainer to observe.
             tensorboard: also write the values as scalars to `run/tensorboard`.
             wandb: also log the values, by the same names, to Weights & Biases.
+            settings: of the run, for Weights & Biases; None takes the trainer's.
         """
+        self.settings = trainer.config if settings is None else settings
         self.run, self.trainer, self.tensorboard, self.wandb = run, trainer, tensorboard, wandb
         total = trainer.config.iterations
         self.every = max(min(EVERY, total // MIN_LINES), 1)
@@ -98,7 +109,7 @@ class TrainingLog:
         if self.tensorboard:
             self.sinks.append(TensorboardSink(self.run, self.trainer.iteration))
         if self.wandb:
-            self.sinks.append(WandbSink(self.run, self.trainer.config.as_dict()))
+            self.sinks.append(WandbSink(self.run, self.settings.as_dict()))
         self.file = _open_log(self.run / LOG_FILE)
         self.written = time.perf_counter()
         return self

@@ -63,7 +63,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH,) * cpu,
-        layered=not simd or config.refine_poses or config.blur_poses > 1,  # directions with gradients
+        layered=not simd or config.learns_poses,  # directions with gradients
         simd=simd,
         cpu=cpu,
         fixed_point=config.deterministic,

@@ -73,8 +73,8 @@ def train(
     def warn(message: str) -> None:
         warnings.warn(message, stacklevel=2)
 
-    stages = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
-    trainer = stages(scene, config, device, observe=observe, warn=warn)
+    make_student = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
+    trainer = make_student(scene, config, device, observe=observe, warn=warn)
     trainer.run(counted_from(config.iterations - trainer.config.iterations, observe), warn)
     return trainer.finish()
 

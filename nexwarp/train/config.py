@@ -182,14 +182,19 @@ class Config:
             raise ValueError(f"blur_poses: expected an odd number, got {self.blur_poses}")
         if self.teachers is not None:
             check_range("teachers", self.teachers, 0, MOST_TEACHERS)
-        if self.teachers and (self.refine_poses or self.blur_poses > 1):
-            raise ValueError(f"teachers: expected 0 where poses are learned, got {self.teachers}")
+        if self.teachers and self.learns_poses:
+            raise ValueError(f"teachers: expected 0 or null where poses are learned, got {self.teachers}")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
 
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""
         return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
+
+    @property
+    def learns_poses(self) -> bool:
+        """Whether poses or motions of the training cameras are learned."""
+        return self.refine_poses or self.blur_poses > 1
 
     @property
     def settled(self) -> int:

@@ -72,7 +72,7 @@ class SeamTrainer(Trainer):
         """
         if not isinstance(model.texture, MergedTexture):
             raise TypeError("model: expected a merged model with a texture for each block")
-        if config.refine_poses or config.blur_poses > 1:
+        if config.learns_poses:
             raise ValueError("config: expected refine_poses=False and blur_poses=1 for the seams of blocks")
         model.texture.drop_half_copy()  # of the blocks' trainings: this one does not refresh them
         self.whole = scene

@@ -6,6 +6,7 @@ Not in the paper. What a student learns from teachers is in `nexwarp.train.teach
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
@@ -19,8 +20,9 @@ from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
-# A run has teachers where photos are few and surfels many for them; otherwise it loses more by shorter trainings than
-# it gains. Shorter runs were not tried.
+# Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: trainings
+# with 18 to 37 photos and at least 1,080 surfels a photo gained, those with fewer than 560 mostly lost, and 230 photos
+# with 174 surfels each lost. Nothing between was tried, nor a run of fewer than 30,000 iterations.
 TEACHERS = 2
 MOST_PHOTOS = 64
 SURFELS_A_PHOTO = 600
@@ -49,8 +51,8 @@ class Stages:
     """Settings of the trainings of a run, in their order; none of them has teachers of its own.
 
     Attributes:
-        teachers: of each teacher.
-        student: of the training whose model is the run's.
+        teachers: settings of the teachers.
+        student: settings of the training whose model is the run's.
     """
 
     teachers: tuple[Config, ...]
@@ -66,9 +68,8 @@ def teacher_count(config: Config, photos: int) -> int:
     """
     if config.teachers is not None:
         return config.teachers
-    learned_poses = config.refine_poses or config.blur_poses > 1
     few = photos <= MOST_PHOTOS and config.max_surfels >= SURFELS_A_PHOTO * photos
-    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not learned_poses else 0
+    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.learns_poses else 0
 
 
 def plan_teachers(config: Config, photos: int) -> OwnTeachers:
@@ -82,7 +83,7 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
     return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1)) if count else NO_TEACHERS
 
 
-def divided(config: Config, own: OwnTeachers) -> Stages:
+def divide(config: Config, own: OwnTeachers) -> Stages:
     """Return the stages of a run: teachers, and the student, which has the rest of the iterations.
 
     Raises:
@@ -90,7 +91,7 @@ def divided(config: Config, own: OwnTeachers) -> Stages:
     """
     taken = own.count * own.iterations
     if config.iterations <= taken:
-        raise SettingError(f"iterations: expected more than the {taken} of teachers, got {config.iterations}")
+        raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
     # Seeds of settings have 32 bits.
     seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
     teachers = (dataclasses.replace(config, seed=seed, iterations=own.iterations, teachers=0) for seed in seeds)
@@ -124,13 +125,15 @@ def student_trainer(
         SceneError, TypeError, ValueError, DivergedError, OutOfMemoryError: as of `nexwarp.train`.
     """
     found = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` tells what is wrong with a model
-    stages = divided(config, NO_TEACHERS if found else plan_teachers(config, len(scene.train)))
+    stages = divide(config, NO_TEACHERS if found else plan_teachers(config, len(scene.train)))
+    make = partial(Trainer, scene, device=device, losses=losses, optimizer=optimizer)
     own: list[Model] = []
     for number, settings in enumerate(stages.teachers):
-        trainer = Trainer(scene, settings, device, losses=losses, optimizer=optimizer)
+        trainer = make(config=settings)
         trainer.run(counted_from(number * settings.iterations, observe), warn)
         own.append(_as_saved(trainer.finish()))
-    return Trainer(scene, stages.student, device, losses=losses, optimizer=optimizer, teachers=own or found)
+        del trainer  # before the next one takes memory
+    return make(config=stages.student, teachers=own or found)
 
 
 @torch.no_grad()

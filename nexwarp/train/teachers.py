@@ -48,7 +48,7 @@ class Teachers:
             ValueError: one is of a scene of another scale, or the training learns poses or motions, which teachers do
                 not follow.
         """
-        if config.refine_poses or config.blur_poses > 1:
+        if config.learns_poses:
             raise ValueError("teachers: expected refine_poses=False and blur_poses=1, for poses that stay as given")
         for number, model in enumerate(models):
             if not isinstance(model, Model):
