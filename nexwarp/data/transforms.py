@@ -99,6 +99,7 @@ def _read_data(file: Path, images: str, skip_missing: bool) -> tuple[JsonObject,
     data = read_object(file, finite=True)
     frames: list[Json] = []
     missing: list[str] = []
+    found: set[str] = set()
     for index, frame in enumerate(_frame_list(file, data)):
         where = f"{file}: frame {index}"
         if not isinstance(frame, dict):
@@ -106,8 +107,11 @@ def _read_data(file: Path, images: str, skip_missing: bool) -> tuple[JsonObject,
         named = _file_name(where, "file_path", frame.get("file_path"))
         if _find(f"{where} ({named})", file.parent, named, images) is None:
             missing.append(named)
+        elif named in found:  # before the other frames are looked at, which are many in a file that repeats one
+            raise ValueError(f"{file}: expected each photo once, got {_view_name(named)} twice")
         else:
             frames.append(frame)
+            found.add(named)
     report_missing(file, missing, len(missing) + len(frames), skip_missing)
     return {**data, "frames": frames}, tuple(missing)
 
