@@ -25,7 +25,13 @@ from tests.faults import Disk, failing
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
-SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
+# Exposures are estimated without writing anything, and would take most of such a short command.
+SMALL = Config(
+    exposures=False,
+    texture=TextureConfig(levels=2, table_size=2**6, width=8),
+    densify=DensifyConfig(every=2),
+    sh_degree=1,
+)
 FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
 FULL, BROKEN = errno.ENOSPC, errno.EIO
 

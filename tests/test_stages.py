@@ -33,8 +33,11 @@ from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divide, plan_teachers
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 CPU = torch.device("cpu")
-CONFIG = Config(iterations=20, max_surfels=60, teachers=2, texture=TextureConfig(levels=4, table_size=1024))
-SMALL = ["--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024", "--set", "texture.levels=4"]
+CONFIG = Config(
+    iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)
+)
+SETTINGS = ("texture.table_size=1024", "texture.levels=4", "exposures=false")
+SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS for text in ("--set", each))]
 
 
 def same(one: Model, other: Model) -> bool:
