@@ -21,8 +21,8 @@ from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
 # Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: trainings
-# with 18 to 37 photos and at least 1,080 surfels a photo gained, those with fewer than 560 mostly lost, and 230 photos
-# with 174 surfels each lost. Nothing between was tried, nor a run of fewer than 30,000 iterations.
+# with 18 to 37 photos and at least 1,080 surfels a photo gained, those with fewer than 560 mostly lost, and one with
+# 230 photos and 174 surfels a photo lost. Nothing between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
 SURFELS_A_PHOTO = 600
