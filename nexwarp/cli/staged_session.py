@@ -112,7 +112,7 @@ class StagedSession:
         before = sum(config.iterations for config in self.stages.teachers[:number])
         if number < count:
             trainer = self._make_trainer(self.stages.teachers[number], ())
-            stage = Stage(f"teacher {number + 1} of {count}", teacher=True, iterations=before, seconds=self.seconds)
+            stage = Stage(f"teacher {number + 1} of {count}", teacher=True, iterations=before)
             folder = teacher_folder(self.run, number + 1)
             return TrainingSession(trainer, folder, self.console, every=self.every, stage=stage)
         trainer = self._make_trainer(self.stages.student, self.models or self.given)

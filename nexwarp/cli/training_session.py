@@ -261,7 +261,10 @@ class TrainingSession:
         return model
 
     def _facts(self, model: Model, file: Path) -> dict[str, Json]:
-        """Return the entries of metrics.json beside the metrics; a student's time is that of its teachers, too."""
+        """Return the entries of metrics.json beside the metrics.
+
+        The iterations and seconds of a student include those of the run's teachers.
+        """
         trainer, device = self.trainer, self.trainer.device
         iterations, seconds = trainer.iteration, trainer.seconds
         if not self.stage.teacher:
