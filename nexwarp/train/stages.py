@@ -20,9 +20,9 @@ from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
-# Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: trainings
-# with 18 to 37 photos and at least 1,080 surfels a photo gained, those with fewer than 560 mostly lost, and one with
-# 230 photos and 174 surfels a photo lost. Nothing between was tried, nor fewer than 30,000 steps at full size.
+# Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: with 18 to
+# 37 photos and at least 830 surfels a photo no scene lost, with fewer than 560 surfels a photo most trainings did, as
+# did one with 230 photos and 174 surfels a photo. Nothing between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
 SURFELS_A_PHOTO = 600
