@@ -11,33 +11,29 @@ from pathlib import Path
 
 import warp as wp
 
-from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
+from nexwarp.kernels.catalogue import all_kernels, walk_kernels
+from nexwarp.kernels.fused_scatter import fused_scatter_kernel
+from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.ops.tiles import TILE_SIZE
 
 
 def usual() -> Iterator[wp.Kernel]:
-    """Yield those of the usual K."""
-    return all_kernels(max_hits=(*range(5), MAX_HITS))
+    """Yield those of K = 2 in all forms, and of the other usual K in the default's."""
+    found = [*all_kernels(max_hits=(2,))]
+    found += walk_kernels(wp.float32, TILE_SIZE, (0, 1, 3, 4, MAX_HITS), low_passes=(False,), fixed_point=False)
+    yield from {kernel.module.name: kernel for kernel in found}.values()
 
 
-def one_run() -> Iterator[wp.Kernel]:
-    """Yield those of a default run."""
-    yield from thread_kernels(
-        wp.float32,
-        wp.float16,
-        TILE_SIZE,
-        degrees=(3,),
-        features=(2, 4),
-        clamps=(False,),
-        low_passes=(False,),
-        ssim_lengths=(),
-    )
-    yield from walk_kernels(wp.float32, TILE_SIZE, (2,), low_passes=(False,))
-    yield from (kernel for kernel, _ in (*fused_kernel_builds((4,)), *ssim_tile_builds()))
+def atomic() -> Iterator[wp.Kernel]:
+    """Yield those whose atomics depend on the architecture."""
+    for count in (2, 4):
+        for storage in (wp.float16, wp.float32):
+            yield hashgrid_kernels(wp.float32, storage, count).backward
+        yield fused_scatter_kernel(count)
 
 
-CHOICES = {"all": all_kernels, "usual": usual, "one run": one_run}
+CHOICES = {"all": all_kernels, "usual": usual, "atomic": atomic}
 
 
 def compile_for(arch: int, kernels: list[wp.Kernel], folder: Path) -> dict[str, int]:

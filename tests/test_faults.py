@@ -25,9 +25,12 @@ from tests.faults import Disk, failing
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
-# Exposures are estimated without writing anything, and would take most of such a short command.
+# Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
+# short command.
 SMALL = Config(
     exposures=False,
+    smooth_sh=0.0,
+    footprints=False,
     texture=TextureConfig(levels=2, table_size=2**6, width=8),
     densify=DensifyConfig(every=2),
     sh_degree=1,

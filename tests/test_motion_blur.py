@@ -182,7 +182,7 @@ def test_ranks_learn_the_same_motions(tiny_scene: Scene, tmp_path: Path):
 
 def test_motions_come_back_in_training(shown: Scene, model: nw.Model):  # noqa: F811
     """With surfels that are right, motions of about 5 pixels are found but for their direction in time."""
-    config = small(iterations=320, max_hits=0, blur_poses=5, exposures=False, sh_every=1, background=(0.0, 0.0, 0.0))
+    config = small(iterations=200, max_hits=0, blur_poses=5, exposures=False, sh_every=1, background=(0.0, 0.0, 0.0))
     config = dataclasses.replace(config, rates=LearningRates(**STILL))
     config = dataclasses.replace(config, densify=DensifyConfig(stop=0))
     cameras = [view.camera for view in shown.train]
