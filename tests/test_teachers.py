@@ -271,6 +271,11 @@ def test_the_benchmarks_teachers_have_seeds_of_their_own(tiny_folder: Path) -> N
         trainer.run()
         assert torch.equal(trainer.finish().surfels.means, teacher.surfels.means)
     assert seconds > 0
+    (larger,), _ = train_teachers(job, tiny_folder.parent, 1, 8, 90)
+    config = config_of(dataclasses.replace(job, seed=301, iterations=8, size=90), DEFAULT)
+    trainer = Trainer(scene_of(job, tiny_folder.parent), config, CPU)
+    trainer.run()
+    assert torch.equal(trainer.finish().surfels.means, larger.surfels.means)
 
 
 def test_the_benchmarks_line_names_the_teachers(
@@ -284,6 +289,8 @@ def test_the_benchmarks_line_names_the_teachers(
     line = json.loads(out.read_text())
     assert (line["row"], line["iterations"], line["seed"]) == ("2 teachers of 8", 10, 3)
     assert line["teachers"]["count"] == 2 and line["teachers"]["seconds"] > 0
+    assert main([*command, "1", "--teacher-size", "70"]) == 0
+    assert json.loads(out.read_text().splitlines()[1])["row"] == "1 teachers of 8, 70 surfels"
     with pytest.raises(SystemExit):
         main([*command, "0"])
     assert "--teachers: expected at least one, got 0" in capsys.readouterr().err

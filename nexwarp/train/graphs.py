@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 
@@ -23,6 +23,8 @@ FORGOTTEN = 1000
 
 # How often to start again without any graph when memory does not suffice.
 CHANCES = 3
+
+T = TypeVar("T")
 
 
 class GraphKey(NamedTuple):
@@ -133,6 +135,17 @@ class StepGraphs:
                 self.chances -= 1
             self.clear()
         return work(target)
+
+    def beside(self, work: Callable[[], T]) -> T:
+        """Return what work gives that comes before a step; where it lacks memory and graphs keep some, without them."""
+        try:
+            return work()
+        except (MemoryError, RuntimeError) as error:
+            if needed_memory(error) is None or self.keeper is None:
+                raise
+            self.chances -= 1
+        self.clear()
+        return work()
 
     def clear(self) -> None:
         """Drop all graphs, those of frames too, and free their memory."""

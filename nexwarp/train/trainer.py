@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from pathlib import Path
 
 import torch
@@ -203,7 +203,8 @@ class Trainer:
         target = self.targets.make(index, self.iteration, upcoming)
         if self.teachers is None or not self.teachers.teaches(number):
             return target
-        return self.teachers.target(target, number)
+        teach = partial(self.teachers.target, target, number)
+        return teach() if self.graphs is None else self.graphs.beside(teach)
 
     def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
         surfels = initial_surfels(self.scene, self.config, self.generator, colors)
