@@ -129,23 +129,33 @@ class StepGraphs:
                     told = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
                     warnings.warn(told, stacklevel=2)
             except (MemoryError, RuntimeError) as error:
-                # Graphs keep memory of their own, which may be what is missing.
-                if needed_memory(error) is None or self.keeper is None or isinstance(error, UpdateError):
+                if not self._can_repeat(error):
                     raise
                 self.chances -= 1
             self.clear()
         return work(target)
 
     def beside(self, work: Callable[[], T]) -> T:
-        """Return what work gives that comes before a step; where it lacks memory and graphs keep some, without them."""
+        """Do work that is not part of a step; where it lacks memory, drop all graphs and do it again.
+
+        Args:
+            work: can be repeated.
+
+        Returns:
+            What `work` returns.
+        """
         try:
             return work()
         except (MemoryError, RuntimeError) as error:
-            if needed_memory(error) is None or self.keeper is None:
+            if not self._can_repeat(error):
                 raise
             self.chances -= 1
         self.clear()
         return work()
+
+    def _can_repeat(self, error: Exception) -> bool:
+        """Whether failed work can be repeated: it lacked memory, of which graphs keep some, and it updated nothing."""
+        return needed_memory(error) is not None and self.keeper is not None and not isinstance(error, UpdateError)
 
     def clear(self) -> None:
         """Drop all graphs, those of frames too, and free their memory."""
