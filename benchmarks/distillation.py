@@ -3,10 +3,9 @@
 Usage: `python -m benchmarks.distillation OUT.jsonl --scenes fox,saharov [--variant inner] [--teachers 2]
 [--teacher-iterations 9000] [--teacher-size 40000] [--iterations 21000] [--size 40000] [--seed 0] [--downscale 1]
 [--data DIR]`.
-For each scene, teachers are trained, as large as the student where nothing is said, then the student
-(`nexwarp.train(..., teachers=...)`). With S the student's seed, the teachers' are 100 S + 1, 100 S + 2 and so on. A
-line of OUT is one of `benchmarks.quality` and names the teachers; its seconds and, but for memory, all other figures
-are the student's.
+For each scene, teachers are trained, then the student (`nexwarp.train(..., teachers=...)`). With S the student's seed,
+the teachers' are 100 S + 1, 100 S + 2 and so on. A line of OUT is one of `benchmarks.quality` and names the teachers;
+its seconds and, but for memory, all other figures are the student's.
 """
 
 import argparse
@@ -28,9 +27,7 @@ from nexwarp import Model, Trainer
 from nexwarp.train.stages import student_trainer
 
 
-def train_teachers(
-    job: TrainingJob, data: Path, count: int, iterations: int, size: int | None = None
-) -> tuple[list[Model], float]:
+def train_teachers(job: TrainingJob, data: Path, count: int, iterations: int, size: int) -> tuple[list[Model], float]:
     """Train models with seeds of their own.
 
     Args:
@@ -38,7 +35,7 @@ def train_teachers(
         data: folder of the scenes.
         count: how many.
         iterations: of each.
-        size: budget of each; None is the student's.
+        size: budget of primitives of each.
 
     Returns:
         The models, and the seconds from the loaded scene to the last finished model.
@@ -46,8 +43,7 @@ def train_teachers(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     scene, teachers, begin = scene_of(job, data), [], time.perf_counter()
     for number in range(1, count + 1):
-        seed, budget = 100 * job.seed + number, job.size if size is None else size
-        one = dataclasses.replace(job, seed=seed, iterations=iterations, size=budget)
+        one = dataclasses.replace(job, seed=100 * job.seed + number, iterations=iterations, size=size)
         trainer = Trainer(scene, dataclasses.replace(config_of(one, DEFAULT), teachers=0), device)
         trainer.run()
         teachers.append(trainer.finish())
@@ -65,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--variant", default="inner", choices=("", *VARIANTS), help="of the scenes (default: %(default)s)")
     add("--teachers", type=int, default=2, help="default: %(default)s")
     add("--teacher-iterations", type=int, default=9000, help="of each teacher (default: %(default)s)")
-    add("--teacher-size", type=int, help="budget of each teacher (default: the student's)")
+    add("--teacher-size", type=int, help="budget of primitives of each teacher (default: the student's)")
     add("--iterations", type=int, default=21_000, help="of the student (default: %(default)s)")
     add("--size", type=int, default=SIZE, help="budget of primitives (default: %(default)s)")
     add("--seed", type=int, default=0, help="of the student (default: %(default)s)")
@@ -75,11 +71,11 @@ def main(arguments: list[str] | None = None) -> int:
     if given.teachers < 1:
         parser.error(f"--teachers: expected at least one, got {given.teachers}")
     for scene in given.scenes.split(","):
+        size = given.teacher_size or given.size
         row = f"{given.teachers} teachers of {given.teacher_iterations}"
-        row += "" if given.teacher_size is None else f", {given.teacher_size} surfels"
+        row += f", {size} surfels" if size != given.size else ""
         job = TrainingJob(scene, given.variant, row, given.size, given.seed, given.iterations, given.downscale)
-        asked = given.teachers, given.teacher_iterations, given.teacher_size
-        teachers, seconds = train_teachers(job, given.data, *asked)
+        teachers, seconds = train_teachers(job, given.data, given.teachers, given.teacher_iterations, size)
         result = run_job(job, given.data, DEFAULT, trainer=partial(student_trainer, teachers=teachers))
         result |= {"teachers": {"count": given.teachers, "iterations": given.teacher_iterations, "seconds": seconds}}
         with given.out.open("a", encoding="utf-8") as file:

@@ -264,18 +264,13 @@ def test_the_command_learns_from_runs(
 def test_the_benchmarks_teachers_have_seeds_of_their_own(tiny_folder: Path) -> None:
     """And are trained as any model of that seed."""
     job = TrainingJob(tiny_folder.name, "", "mine", 60, 3, 12)
-    found, seconds = train_teachers(job, tiny_folder.parent, 2, 8)
+    found, seconds = train_teachers(job, tiny_folder.parent, 2, 8, 50)
     for number, teacher in enumerate(found, 1):
-        one = dataclasses.replace(job, seed=300 + number, iterations=8)
+        one = dataclasses.replace(job, seed=300 + number, iterations=8, size=50)
         trainer = Trainer(scene_of(one, tiny_folder.parent), config_of(one, DEFAULT), CPU)
         trainer.run()
         assert torch.equal(trainer.finish().surfels.means, teacher.surfels.means)
     assert seconds > 0
-    (larger,), _ = train_teachers(job, tiny_folder.parent, 1, 8, 90)
-    config = config_of(dataclasses.replace(job, seed=301, iterations=8, size=90), DEFAULT)
-    trainer = Trainer(scene_of(job, tiny_folder.parent), config, CPU)
-    trainer.run()
-    assert torch.equal(trainer.finish().surfels.means, larger.surfels.means)
 
 
 def test_the_benchmarks_line_names_the_teachers(
