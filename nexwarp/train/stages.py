@@ -21,8 +21,8 @@ from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
 # Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: with 18 to
-# 37 photos and at least 830 surfels a photo no scene lost, with fewer than 560 surfels a photo most trainings did, as
-# did one with 230 photos and 174 surfels a photo. Nothing between was tried, nor fewer than 30,000 steps at full size.
+# 37 photos and at least 830 surfels a photo no scene lost PSNR on the mean of its trainings. With at most 560 most
+# trainings did, as did one with 230 photos. Nothing between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
 SURFELS_A_PHOTO = 600
