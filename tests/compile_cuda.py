@@ -19,14 +19,17 @@ from nexwarp.ops.tiles import TILE_SIZE
 
 
 def usual() -> Iterator[wp.Kernel]:
-    """Yield those of K = 2 in all forms, and of the other usual K in the default's."""
+    """Yield all kernels for K = 2, and for other K those that depend on it, in the form of a default run.
+
+    K and the other constants of a kernel do not depend on each other.
+    """
     found = [*all_kernels(max_hits=(2,))]
     found += walk_kernels(wp.float32, TILE_SIZE, (0, 1, 3, 4, MAX_HITS), low_passes=(False,), fixed_point=False)
     yield from {kernel.module.name: kernel for kernel in found}.values()
 
 
 def atomic() -> Iterator[wp.Kernel]:
-    """Yield those whose atomics depend on the architecture."""
+    """Yield the kernels whose atomics depend on the architecture."""
     for count in (2, 4):
         for storage in (wp.float16, wp.float32):
             yield hashgrid_kernels(wp.float32, storage, count).backward

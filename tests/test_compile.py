@@ -1,6 +1,6 @@
 """Kernels compile for CUDA without a GPU, for NVRTC comes with Warp (CI has no GPU).
 
-For sm_90 most of them, for sm_80, where only atomics differ, those that have such; all of them with `-m slow`.
+For sm_90 most of them; for sm_80 those whose atomics differ from sm_90's; all of them for both with `-m slow`.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Runs that train teachers of their own first: how they are divide, and that they are what three commands give."""
+"""Runs that train teachers of their own first: how they are divided, and that they are what three commands give."""
 
 import dataclasses
 import json
