@@ -13,7 +13,7 @@ from rich.console import Console
 
 import nexwarp as nw
 from benchmarks.quality.jobs import PHOTOS, TrainingJob, config_of, group_jobs, training_photos
-from benchmarks.quality.rows import DEFAULT, Row
+from benchmarks.quality.rows import DEFAULT, PAPER, Row
 from benchmarks.quality.run import config_name, run_job, trained_with
 from benchmarks.quality.scenes import scene_of
 from benchmarks.timing import ROOT
@@ -27,8 +27,9 @@ from nexwarp.run.evaluate import METRICS
 from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.config import TextureConfig
+from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, divide, plan_teachers, teacher_count
+from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, teacher_count
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -63,12 +64,19 @@ def same(one: Model, other: Model) -> bool:
     ],
 )
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
-    config = dataclasses.replace(Config(teachers=None), **changes)
+    config = dataclasses.replace(Config(), **changes)
     assert teacher_count(config, photos) == plan_teachers(config, photos).count == count
 
 
-def test_the_default_has_none() -> None:
-    assert plan_teachers(Config(), 21) == NO_TEACHERS
+def test_only_the_papers_preset_does_without() -> None:
+    assert {name: plan_teachers(preset(name), 21).count for name in PRESETS} == {"default": 2, "web": 2, "paper": 0}
+
+
+def test_settings_of_a_run_from_before_there_were_teachers_have_none() -> None:
+    data = Config().as_dict()
+    assert config_from_dict(data).teachers is None
+    del data["teachers"]
+    assert config_from_dict(data).teachers == 0
 
 
 @pytest.mark.parametrize("iterations", [7, 30, 12_345, 30_000])
@@ -484,9 +492,8 @@ def test_the_benchmark_knows_the_number_of_photos(scene: str) -> None:
 
 
 def test_the_benchmark_asks_for_the_scenes_teachers() -> None:
-    row = Row("by the photos", settings={"teachers": None})
     counts = {
-        (scene, size): config_of(TrainingJob(scene, "", "by the photos", size, 0, 30_000), row).teachers
+        (scene, size): config_of(TrainingJob(scene, "", "default", size, 0, 30_000), DEFAULT).teachers
         for scene in PHOTOS
         for size in (10_000, 20_000, 40_000)
     }
@@ -497,4 +504,4 @@ def test_the_benchmark_asks_for_the_scenes_teachers() -> None:
         "saharov",
         "kitchen25",
     ]
-    assert config_of(TrainingJob("fox", "", "default", 40_000, 0, 30_000), DEFAULT).teachers == 0
+    assert config_of(TrainingJob("fox", "", "paper", 40_000, 0, 30_000), PAPER).teachers == 0

@@ -141,7 +141,7 @@ class Config:
     """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
     behind a table. Initial surfels start on those around which photos show no point of the cloud. They are at most a
     sixth of the initial surfels. Where photos are transparent there are none."""
-    teachers: int | None = 0
+    teachers: int | None = None
     """Number of teachers: models of other seeds that are trained first, in two fifths of the iterations, and from whose
     renderings the run then learns, too, for captures of few photos (docs/sparse.md). None is 2 where there are at most
     64 training photos, at least 600 surfels of `max_surfels` for each of them and at least 30,000 iterations, and where

@@ -32,7 +32,7 @@ DEMO_SETTINGS: dict[str, object] = {
 PARTS = ("losses", "rates", "texture", "densify")
 
 # What runs did before a setting existed, where the default does something else; "" has the settings without a part.
-BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0}, "densify": {"relocate": 0.0}}
+BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0, "teachers": 0}, "densify": {"relocate": 0.0}}
 
 
 Part = TypeVar("Part", LossWeights, LearningRates, TextureConfig, DensifyConfig)
@@ -91,6 +91,7 @@ PRESETS: dict[str, Config] = {
         filter_points=False,
         orient_points=False,
         skybox=0,
+        teachers=0,
         texture=TextureConfig(
             levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
         ),
