@@ -1,5 +1,6 @@
 """Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -17,8 +18,10 @@ from nexwarp.model.model import Model
 from nexwarp.representation import exposures
 from nexwarp.representation.exposures import EVEN, Exposures
 from nexwarp.run.evaluate import evaluate
+from nexwarp.train import exposure_calibration
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.exposure_calibration import (
+    CalibrateOnce,
     ExposureCalibration,
     calibrate_exposures,
     choose_fit,
@@ -198,6 +201,26 @@ def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
     mean = float(np.exp(np.mean([np.log(exposure_at(view)) for view in scene.train])))
     ratio = colors[:-1][shown] / (mean * scene.colors[shown] / 255).clamp_min(0.05)
     assert ratio.median().item() == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("differ", [True, False])
+def test_trainings_of_a_run_share_one_calibration(tmp_path, monkeypatch, differ):
+    """Each has a copy of its own, whatever the one before does with its exposures."""
+    exposed = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
+    results = [calibrate_exposures(exposed, Config()) if differ else None]
+    expected = copy.deepcopy(results[0])
+    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", lambda *_: results.pop())
+    calibrate = CalibrateOnce()
+    for seed in range(3):
+        found = calibrate(exposed, Config(seed=seed))
+        assert (found is not None) == differ
+        if found is None:
+            continue
+        assert torch.equal(found.gains, present(expected).gains) and torch.equal(found.colors, present(expected).colors)
+        state = found.exposures.state_dict()
+        assert all(torch.equal(state[k], x) for k, x in present(expected).exposures.state_dict().items())
+        for value in (found.gains, found.colors, *state.values()):
+            value.zero_()
 
 
 def test_photos_that_share_nothing_keep_their_colours():

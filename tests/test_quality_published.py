@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.quality.__main__ import main
 from benchmarks.quality.documents import MISSING, blocks, figures
+from benchmarks.quality.equal_seconds import BEST
 from benchmarks.quality.jobs import TrainingJob, config_of
 from benchmarks.quality.published import fill, of_one_default
 from benchmarks.quality.results import Results, read_results
@@ -18,7 +19,7 @@ from benchmarks.timing import ROOT
 
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
-SAME = {"55fc7bc"}  # commits of the same default and kernels
+SAME = {"55fc7bc", "0e1a112", "92d09bb"}  # commits of the same default and kernels
 OLDER = False  # True while the tables are of a default with other settings than today's
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 
@@ -26,7 +27,8 @@ KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 def line(scene: str, row: str, size: int, psnr: float, seed: int = 0, **changes: object) -> dict[str, Any]:
     job = TrainingJob(scene, "", row, size, seed, 30_000)
     preset = ROWS[row].preset
-    config = {} if preset is None else {"config": config_name(config_of(job, ROWS[row]))}
+    trained = None if preset is None else config_of(job, ROWS[row])
+    config = {} if trained is None else {"config": config_name(trained), "teachers": {"count": trained.teachers}}
     figures: dict[str, object] = {"psnr": psnr, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0}
     facts: dict[str, object] = {"commit": "abc", "date": "2026-11-25", "device": "H200", "seconds": 5.0, "settings": {}}
     compact = {"psnr": psnr - 0.5, "ssim": 0.8, "flip": 0.2, "megabytes": 1.0}
@@ -95,18 +97,18 @@ def test_more_surfels_and_equal_megabytes(tmp_path: Path) -> None:
 def test_gsplat_with_our_seconds_stands_beside_us(tmp_path: Path) -> None:
     today = line("fox", "default", 40_000, 32.5, seconds=94.2)
     lines = [line("fox", "default", 40_000, 31.0, 1, config="other"), today, line("saharov", "default", 40_000, 22.0)]
-    lines += [line("fox", EXPOSED, 40_000, 30.0 + n / 1000, iterations=n, seconds=n / 150) for n in (1000, 3000)]
-    lines += [line("fox", EXPOSED, 40_000, 32.0, iterations=14_500, seconds=93.7)]
+    lines += [line("fox", BEST["fox"], 40_000, 30.0 + n / 1000, iterations=n, seconds=n / 150) for n in (1000, 3000)]
+    lines += [line("fox", BEST["fox"], 40_000, 32.0, iterations=14_500, seconds=93.7)]
     table = blocks({}, read(lines, tmp_path / "x.jsonl"))["seconds"]
-    own, peer = "32.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1000 (exposures, 14,500)"
+    own, peer = "32.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1000 (skybox, 14,500)"
     assert rows_of(table)["fox"] == ["H200", "94 s", own, "94 s", peer, "+0.50 dB, +0.0000, +0.0000"]
     assert rows_of(table)["saharov"] == rows_of(blocks({})["seconds"])["fox"] == [MISSING] * 6
     assert table.endswith("*Measured by* `python -m benchmarks.quality.equal_seconds`: 2026-11-25; abc.")
-    lines += [line("fox", EXPOSED, 40_000, 33.0, device="H100"), line("fox", GSPLAT, 40_000, 31.0)]
+    lines += [line("fox", BEST["fox"], 40_000, 33.0, device="H100"), line("fox", GSPLAT, 40_000, 31.0)]
     alone = read(lines, tmp_path / "y.jsonl")
     assert blocks({}, alone)["seconds"] == table, "neither another GPU nor another row is compared with"
-    whole = read([*lines, line("fox", EXPOSED, 40_000, 32.25, seconds=94.0)], tmp_path / "z.jsonl")
-    assert "32.25, 0.9000, 0.1000 (exposures, 30,000)" in rows_of(blocks({}, whole)["seconds"])["fox"]
+    whole = read([*lines, line("fox", BEST["fox"], 40_000, 32.25, seconds=94.0)], tmp_path / "z.jsonl")
+    assert "32.25, 0.9000, 0.1000 (skybox, 30,000)" in rows_of(blocks({}, whole)["seconds"])["fox"]
     short = read(lines[:5], tmp_path / "short.jsonl")
     assert rows_of(blocks({}, short)["seconds"])["fox"] == [MISSING] * 6, "the two short ones are no comparison"
 

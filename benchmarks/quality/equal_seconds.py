@@ -21,7 +21,7 @@ from benchmarks.timing import ROOT
 SHORT = (1_000, 3_000)
 BEST = {
     "train": "gsplat MCMC, even start",
-    "fox": "gsplat MCMC, exposures",
+    "fox": "gsplat MCMC, skybox",
     "saharov": "gsplat MCMC, skybox",
     "kitchen25": "gsplat MCMC, skybox",
 }

@@ -17,6 +17,7 @@ from nexwarp.run.contents import teacher_folder
 from nexwarp.run.folder import SceneSource, create_run, is_run, read_metrics, read_run, rewrite_config
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.config import Config
+from nexwarp.train.exposure_calibration import CalibrateOnce
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.stages import OwnTeachers, divide
 from nexwarp.train.trainer import Trainer
@@ -67,7 +68,7 @@ class StagedSession:
         """
         self.scene, self.config, self.stages, self.run, self.source = scene, config, divide(config, own), run, source
         self.console, self.ranks, self.resume, self.sinks, self.every = console, ranks, resume, sinks, every
-        self.given, self.models = teachers, list[Model]()
+        self.given, self.models, self.calibrate = teachers, list[Model](), CalibrateOnce()
         self.seconds = 0.0
         while resume and self._take_complete():
             pass
@@ -121,9 +122,10 @@ class StagedSession:
         return TrainingSession(trainer, self.run, self.console, sinks=self.sinks, every=self.every, stage=stage)
 
     def _make_trainer(self, config: Config, teachers: Sequence[Model]) -> Trainer:
+        device, calibrate = self.ranks.device, self.calibrate
         if self.ranks.size == 1:
-            return Trainer(self.scene, config, self.ranks.device, teachers=teachers)
-        return ParallelTrainer(self.scene, config, self.ranks.device, self.ranks, teachers=teachers)
+            return Trainer(self.scene, config, device, teachers=teachers, calibrate=calibrate)
+        return ParallelTrainer(self.scene, config, device, self.ranks, teachers=teachers, calibrate=calibrate)
 
     def _announce(self) -> None:
         """Say which of several trainings comes."""

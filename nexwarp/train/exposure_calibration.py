@@ -1,6 +1,7 @@
 """Estimates each training photo's exposure and the lens's vignetting, before training; decides whether to use them."""
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -44,6 +45,9 @@ class ExposureCalibration:
     exposures: Exposures
     gains: torch.Tensor
     colors: torch.Tensor
+
+
+Calibrate = Callable[[Scene, Config], ExposureCalibration | None]
 
 
 class Observations(NamedTuple):
@@ -317,6 +321,22 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
     log_gains = torch.from_numpy(fit.gains)
     exposures = Exposures.of(log_gains, cameras, _falloff(fit))
     return ExposureCalibration(exposures, log_gains.float().exp(), _point_colors(scene, seen, fit))
+
+
+class CalibrateOnce:
+    """Estimates the exposures of a scene for the first of several trainings, and returns copies for the others.
+
+    Their settings are to be alike in what `calibrate_exposures` reads.
+    """
+
+    def __init__(self) -> None:
+        self.found: list[ExposureCalibration | None] = []
+
+    def __call__(self, scene: Scene, config: Config) -> ExposureCalibration | None:
+        """Return what `calibrate_exposures` returns."""
+        if not self.found:
+            self.found.append(calibrate_exposures(scene, config))
+        return copy.deepcopy(self.found[0])  # a training moves its exposures to its device
 
 
 def _point_colors(scene: Scene, seen: Observations, fit: Fit) -> torch.Tensor:

@@ -25,6 +25,7 @@ from nexwarp.representation.surfels import Surfels
 from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
+from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
 from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
@@ -56,6 +57,7 @@ class ParallelTrainer(Trainer):
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
         teachers: Iterable[Model] = (),
+        calibrate: Calibrate = calibrate_exposures,
         beside: bool | None = None,
     ) -> None:
         """Make the same initial surfels and texture on all ranks.
@@ -68,6 +70,7 @@ class ParallelTrainer(Trainer):
             losses: see `Trainer`.
             optimizer: see `Trainer`.
             teachers: see `Trainer`; the same on all ranks.
+            calibrate: see `Trainer`.
             beside: sum gradients after a CUDA graph instead of inside; None decides by `sums_beside`.
 
         Raises:
@@ -78,7 +81,9 @@ class ParallelTrainer(Trainer):
             raise SceneError(
                 f"{scene.path}: expected at most as many ranks as training views, {len(scene.train)}, got {ranks.size}"
             )
-        super().__init__(scene, config, device, losses=losses, optimizer=optimizer, teachers=teachers)
+        super().__init__(
+            scene, config, device, losses=losses, optimizer=optimizer, teachers=teachers, calibrate=calibrate
+        )
         self.ranks = ranks
         ranks.check_same(
             {

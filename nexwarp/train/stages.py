@@ -15,6 +15,7 @@ from nexwarp.determinism import derived_seed
 from nexwarp.errors import SettingError
 from nexwarp.model.model import Model
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
+from nexwarp.train.exposure_calibration import CalibrateOnce
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.step_losses import OwnLoss
@@ -126,7 +127,7 @@ def student_trainer(
     """
     found = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` tells what is wrong with a model
     stages = divide(config, NO_TEACHERS if found else plan_teachers(config, len(scene.train)))
-    make = partial(Trainer, scene, device=device, losses=losses, optimizer=optimizer)
+    make = partial(Trainer, scene, device=device, losses=losses, optimizer=optimizer, calibrate=CalibrateOnce())
     own: list[Model] = []
     for number, settings in enumerate(stages.teachers):
         trainer = make(config=settings)

@@ -27,7 +27,7 @@ from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
-from nexwarp.train.exposure_calibration import calibrate_exposures
+from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
 from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
@@ -91,6 +91,7 @@ class Trainer:
         losses: Mapping[str, OwnLoss] | None = None,
         optimizer: OptimizerMaker | None = None,
         teachers: Iterable[Model] = (),
+        calibrate: Calibrate = calibrate_exposures,
     ) -> None:
         """Make the initial surfels and texture.
 
@@ -101,6 +102,7 @@ class Trainer:
             losses: own losses by name, added to ours; see `nexwarp.train`.
             optimizer: makes an optimizer of the parameter groups; None is Adam; see `nexwarp.train`.
             teachers: trained models of the scene, to learn from their renderings too; see `nexwarp.train`.
+            calibrate: estimates the photos' exposures.
 
         Raises:
             SceneError: the scene has no training views.
@@ -114,13 +116,12 @@ class Trainer:
         seed_everything(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(self.device).manual_seed(config.seed)
-        calibration = calibrate_exposures(scene, config)
+        calibration = calibrate(scene, config)
         self.surfels, self.texture = self._initial_model(None if calibration is None else calibration.colors)
         self.cells_unit, self.poses = cells_unit(scene, config), initial_poses(scene, config, self.device)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
-        self.iteration, self.seconds, self.rate_factor = 0, 0.0, 1.0
-        self.order: list[int] = []
+        self.iteration, self.seconds, self.rate_factor, self.order = 0, 0.0, 1.0, list[int]()
         self.exposures: Exposures | None = None if calibration is None else calibration.exposures
         gains = None if calibration is None else calibration.gains
         self.views = TrainingViews(scene.train, self.device, gains, self.exposures)
@@ -223,9 +224,8 @@ class Trainer:
         return self.order.pop()
 
     def _run_step(self, target: Target) -> StepResult:
-        if self.graphs is None:
-            return self._optimize(target)
-        return self.graphs.run(target, self._optimize, self._graph_key())
+        graphs = self.graphs
+        return self._optimize(target) if graphs is None else graphs.run(target, self._optimize, self._graph_key())
 
     def _optimize(self, target: Target) -> StepResult:
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
