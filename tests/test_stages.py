@@ -20,16 +20,20 @@ from benchmarks.timing import ROOT
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.cli.staged_session import StagedSession
+from nexwarp.data import write_demo
 from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.run.contents import list_files
 from nexwarp.run.evaluate import METRICS
 from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
+from nexwarp.train import exposure_calibration
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.config import TextureConfig
+from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
 from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, teacher_count
+from tests.exposed import expose_photos
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -136,6 +140,44 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
     alone = dataclasses.replace(CONFIG, teachers=0)
     given = nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
     assert same(given, nw.train(tiny_scene, alone, device=CPU, teachers=teachers))
+
+
+@pytest.fixture(scope="module")
+def exposed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene whose photos differ in exposure; not to be changed."""
+    folder = write_demo(tmp_path_factory.mktemp("scenes") / "demo", width=48, height=36, views=24, points=400)
+    expose_photos(folder)
+    return folder
+
+
+@pytest.fixture
+def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
+    """The settings of all trainings whose exposures are estimated."""
+    seen: list[Config] = []
+
+    def calibrate(scene: Scene, config: Config) -> ExposureCalibration | None:
+        seen.append(config)
+        return calibrate_exposures(scene, config)
+
+    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", calibrate)
+    return seen
+
+
+def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
+    """Its models are those of trainings that estimate them for themselves."""
+    scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
+    found = nw.train(scene, config, device=CPU)
+    assert len(calibrations) == 1 and found.exposures is not None
+    stages = divide(config, OwnTeachers(2, 4))
+    files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
+    assert same(found, nw.train(scene, stages.student, device=CPU, teachers=map(nw.load, files)))
+
+
+def test_the_command_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    small = ["--iterations", "10", *SMALL[:-2], "--set", "exposures=true", "--set", "teachers=2"]
+    assert cli.main(["train", str(exposed_folder), "--run", str(run), *small]) == 0
+    assert len(calibrations) == 1 and nw.load(run).exposures is not None
 
 
 @pytest.fixture(scope="module")

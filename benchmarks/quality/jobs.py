@@ -184,7 +184,7 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         return job, 0
     config = config_of(job, row)
     shared = min(config.settled - 1, job.iterations)
-    if shared <= 0 or config.teachers != 0:
+    if shared <= 0 or teacher_count(config, 1) > 0:  # or may have teachers, where the photos are not known
         return job, 0
     alike = dataclasses.replace(
         config,

@@ -196,7 +196,9 @@ def check_origin(
         extend: whether the run may have had fewer iterations.
     """
     state = snapshot.state
-    saved = dataclasses.replace(config_from_dict(state["config"]), cuda_graphs=config.cuda_graphs)
+    # Neither CUDA graphs nor a number of teachers, which only a run trains, change what a trainer does.
+    saved = config_from_dict(state["config"])
+    saved = dataclasses.replace(saved, cuda_graphs=config.cuda_graphs, teachers=config.teachers)
     if extend and saved.iterations < config.iterations:
         saved = dataclasses.replace(saved, iterations=config.iterations)
     if saved != config:
