@@ -21,8 +21,10 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure_calibration
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.exposure_calibration import (
+    PRIOR,
     CalibrateOnce,
     ExposureCalibration,
+    SharedPoints,
     calibrate_exposures,
     choose_fit,
     fit_exposures,
@@ -201,6 +203,26 @@ def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
     mean = float(np.exp(np.mean([np.log(exposure_at(view)) for view in scene.train])))
     ratio = colors[:-1][shown] / (mean * scene.colors[shown] / 255).clamp_min(0.05)
     assert ratio.median().item() == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("most_dense", [0, 1000])
+def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, most_dense):
+    """Also where a photo shows a point twice, or none; by a dense and by a sparse matrix of the photos."""
+    monkeypatch.setattr(exposure_calibration, "MOST_DENSE", most_dense)
+    random = np.random.default_rng(4)
+    photos, points, count = 7, 30, 150
+    view, point = random.integers(0, photos - 1, count), random.integers(0, points, count)
+    observed, weights = random.normal(size=count), random.uniform(0.1, 1.0, count)
+    design = np.zeros((count, photos + points))
+    design[np.arange(count), view] = design[np.arange(count), photos + point] = 1.0
+    root = np.sqrt(weights)
+    prior = np.sqrt(PRIOR) * np.eye(photos, photos + points)
+    together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
+    expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
+    shared = SharedPoints(view, point, photos)
+    for scale in (1.0, 3.0):  # the second problem of the same points leaves nothing of the first
+        found = shared.solve_gains(scale * observed, weights)
+        np.testing.assert_allclose(found, scale * (expected - expected.mean()), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("differ", [True, False])

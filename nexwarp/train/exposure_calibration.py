@@ -23,6 +23,7 @@ CLIPPED = (8, 247)
 ROUNDS = 6  # rounds of reweighted least squares
 NOISE = 0.05  # noise of log colours; larger differences count as outliers
 PRIOR = 0.1  # weight of the prior for a gain of 1, in observations
+MOST_DENSE = 1000  # photos, up to which a dense matrix of them is faster than a sparse one
 EVEN_PRIOR = 1.0  # weight of the prior for a lens without falloff, in observations
 FURTHER = 1.3  # the falloff is extrapolated to this many times the largest squared tangent of an observed point
 
@@ -125,12 +126,12 @@ def fit_exposures(seen: Observations, cameras: Sequence[Camera], *, vignetting: 
     largest = max(min(FURTHER * float(seen.squares.max()), max(map(_corner, cameras))), 10.0**-DECIMALS)
     fit = Fit(np.zeros((len(cameras), 3)), np.zeros(2), round(largest, DECIMALS))
     powers = _powers(seen, fit.largest)
-    weights = np.ones(seen.color.shape)
+    weights, shared = np.ones(seen.color.shape), SharedPoints(seen.view, seen.point, len(cameras))
     for _ in range(ROUNDS):
         observed = seen.color - (powers @ fit.lens)[:, None]
         for channel in range(3):
             columns = observed[:, channel], weights[:, channel]
-            fit.gains[:, channel] = _solve_gains(seen.view, seen.point, *columns, len(cameras))
+            fit.gains[:, channel] = shared.solve_gains(*columns)
         if vignetting:
             fit = fit._replace(lens=_solve_lens(seen.point, powers, seen.color - fit.gains[seen.view], weights))
         weights, _ = _robust(seen, fit, weights)
@@ -268,18 +269,52 @@ def _corner(camera: Camera) -> float:
     return x**2 + y**2
 
 
-def _solve_gains(view: np.ndarray, point: np.ndarray, observed: np.ndarray, w: np.ndarray, count: int) -> np.ndarray:
-    """Log gains (V,), mean 0, of one channel, by least squares with weights (M,)."""
-    from scipy.sparse import coo_array, csc_array, diags_array, eye_array
-    from scipy.sparse.linalg import spsolve
+class SharedPoints:
+    """Which photos show which points: what all least-squares problems of a fit have in common."""
 
-    # The points' own colours, eliminated, leave a Laplacian of the photos.
-    totals = 1 / np.bincount(point, w).clip(1e-9)
-    shared = coo_array((w, (view, point)), shape=(count, len(totals))).tocsr()
-    normal = diags_array(np.bincount(view, w, count)) - shared @ diags_array(totals) @ shared.T
-    right = np.bincount(view, w * observed, count) - shared @ (totals * np.bincount(point, w * observed))
-    found = spsolve(csc_array(normal + PRIOR * eye_array(count)), right)
-    return found - found.mean()
+    def __init__(self, view: np.ndarray, point: np.ndarray, photos: int) -> None:
+        """Prepare for M observations of points in photos.
+
+        Args:
+            view: (M,) index of the photo.
+            point: (M,) index of the point.
+            photos: V, how many photos there are.
+        """
+        from scipy.sparse import csr_array
+
+        def grouped(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, csr_array]:
+            order = np.argsort(rows, kind="stable")
+            starts = np.concatenate([[0], np.bincount(rows, minlength=shape[0]).cumsum()])
+            return order, csr_array((np.zeros(len(rows)), columns[order], starts), shape=shape)
+
+        self.view, self.point, self.photos, points = view, point, photos, int(point.max()) + 1
+        self.by_view, self.of_photos = grouped(view, point, (photos, points))
+        self.by_point, self.of_points = grouped(point, view, (points, photos))
+
+    def solve_gains(self, observed: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the log gains (V,), mean 0, of one channel: least squares.
+
+        Args:
+            observed: (M,) log colours.
+            weights: (M,) of the squared errors.
+        """
+        from scipy.linalg import solve
+        from scipy.sparse import csc_array, diags_array
+        from scipy.sparse.linalg import spsolve
+
+        # The points' own colours, eliminated, leave a Laplacian of the photos.
+        view, point, photos = self.view, self.point, self.photos
+        totals = np.bincount(point, weights).clip(1e-9)
+        shares = weights / np.sqrt(totals)[point]
+        self.of_photos.data, self.of_points.data = shares[self.by_view], shares[self.by_point]
+        shared, diagonal = self.of_photos @ self.of_points, np.bincount(view, weights, photos) + PRIOR
+        means = np.bincount(point, weights * observed) / totals
+        right = np.bincount(view, weights * (observed - means[point]), photos)
+        if photos <= MOST_DENSE:
+            found = solve(np.diag(diagonal) - shared.toarray(), right, assume_a="pos")
+        else:
+            found = spsolve(csc_array(diags_array(diagonal) - shared), right)
+        return found - found.mean()
 
 
 def _solve_lens(point: np.ndarray, powers: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> np.ndarray:
