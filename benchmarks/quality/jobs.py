@@ -184,7 +184,8 @@ def _shared_start(job: TrainingJob, row: Row) -> tuple[Hashable, int]:
         return job, 0
     config = config_of(job, row)
     shared = min(config.settled - 1, job.iterations)
-    if shared <= 0 or teacher_count(config, 1) > 0:  # or may have teachers, where the photos are not known
+    # Stages share no first iterations. Of an unknown scene a single photo is assumed, which leads to teachers soonest.
+    if shared <= 0 or teacher_count(config, 1) > 0:
         return job, 0
     alike = dataclasses.replace(
         config,

@@ -108,10 +108,11 @@ def run_job(
     Returns:
         A line of the results: the job and its row's settings; means of the metrics (None where one cannot be had);
         `primitives`, `megabytes` of the model file, `seconds` from the loaded scene to the finished model, `peak_mib`
-        of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either,
-        but its teachers; `compact`, the metrics and megabytes of a compact file, and its PSNR by view; of nexwarp
-        `config`, a digest of its settings, `teachers` where it had any, `train_psnr`, `zoom_psnr` and `quarter_psnr`;
-        `together`, the rows and iterations of its shared start, if any; the metrics by view; device, date and commit.
+        of GPU memory (torch's), `training_mib` without the evaluation, `steps_mib` without finishing the model either
+        (finishing teachers counts); `compact`, the metrics and megabytes of a compact file, and its PSNR by view; of
+        nexwarp `config`, a digest of its settings, `teachers` where it had any, `train_psnr`, `zoom_psnr` and
+        `quarter_psnr`; `together`, the rows and iterations of its shared start, if any; the metrics by view; device,
+        date and commit.
     """
     device = _device()
     scene = scene_of(job, data)

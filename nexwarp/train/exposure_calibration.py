@@ -23,12 +23,13 @@ CLIPPED = (8, 247)
 ROUNDS = 6  # rounds of reweighted least squares
 NOISE = 0.05  # noise of log colours; larger differences count as outliers
 PRIOR = 0.1  # weight of the prior for a gain of 1, in observations
-MOST_DENSE = 1000  # photos, up to which a dense matrix of them is faster than a sparse one
 EVEN_PRIOR = 1.0  # weight of the prior for a lens without falloff, in observations
 FURTHER = 1.3  # the falloff is extrapolated to this many times the largest squared tangent of an observed point
 
 MARGIN = 0.01  # share of the error at held-out points by which gains must lower it, and then the falloff
 MOST_CHECKED = 20_000  # largest number of points that this choice looks at
+
+MOST_DENSE = 300  # photos: up to 263 a dense matrix of them was solved faster than a sparse one, from 500 on slower
 
 Falloff = tuple[float, float, float]
 

@@ -196,7 +196,7 @@ def check_origin(
         extend: whether the run may have had fewer iterations.
     """
     state = snapshot.state
-    # Neither CUDA graphs nor a number of teachers, which only a run trains, change what a trainer does.
+    # Neither CUDA graphs nor how many teachers the run would train first changes what a trainer does.
     saved = config_from_dict(state["config"])
     saved = dataclasses.replace(saved, cuda_graphs=config.cuda_graphs, teachers=config.teachers)
     if extend and saved.iterations < config.iterations:
