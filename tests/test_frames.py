@@ -113,7 +113,7 @@ def test_buffers_are_copied_when_they_are_asked_for() -> None:
 
     frame: Any = Frame()
     stream: Any = None
-    frame.result = result
+    frame.result, frame.image = result, result.image
     out, same, deep = (frames.CapturedRendering.of(frame, stream) for _ in range(3))
     assert out.ids is not result.ids and "depths" in vars(out) and "depths" not in vars(same)
     assert out.ids is out.intermediates.hits.ids
@@ -155,6 +155,62 @@ def test_graphs_give_the_bits_of_launches(options: dict[str, Any], place: str) -
     background = torch.tensor([0.1, 0.2, 0.9], device="cuda")
     found, same = both(model, cameras(place)[1], **(options | {"background": background}))
     assert_same(found, same, (*BUFFERS, *LATER))
+
+
+def test_an_image_alone_is_that_of_the_rendering(device: torch.device) -> None:
+    model, (camera, *_) = finished(device), cameras("cpu")
+    for options in ({}, {"max_hits": 0}, {"exposure": "mean", "detail_limits": False, "background": (0.2, 0.5, 0.1)}):
+        with torch.no_grad():
+            expected = model.render(camera, **options).image
+        for _ in range(3):
+            image = model.render_image(camera, **options)
+            assert torch.equal(image, expected) and not image.requires_grad
+    with pytest.raises(TypeError, match=r"camera: expected a nexwarp.Camera, got list"):
+        model.render_image([camera])  # type: ignore[arg-type]
+
+
+@CUDA
+def test_images_alone_keep_less_and_leave_other_renderings_alone() -> None:
+    camera, held = cameras("cuda", 1, width=640, height=480)[0], {}
+    for name in ("render", "render_image"):
+        model = finished("cuda")
+        with torch.no_grad():
+            getattr(model, name)(camera)
+            gc.collect()
+            before = torch.cuda.memory_allocated()
+            getattr(model, name)(camera)  # captured
+        held[name] = torch.cuda.memory_allocated() - before
+    assert 640 * 480 * 3 * 4 <= held["render_image"] < 0.2 * held["render"]
+    with torch.no_grad():
+        whole = [model.render(camera) for _ in range(3)][-1]
+        with frames.without_graphs():
+            expected = model.render(camera)
+        for _ in range(3):
+            assert torch.equal(model.render_image(camera), expected.image)
+    assert_same(whole, expected, (*BUFFERS, "ids", *LATER))
+    assert len(graphs(model).frames) == 2
+
+
+@CUDA
+def test_models_that_share_graphs_have_memory_and_pictures_of_their_own() -> None:
+    views, models = cameras("cuda", width=640, height=480), [finished("cuda", seed) for seed in (0, 1, 2)]
+    with frames.without_graphs():
+        expected = [[model.render_image(camera) for camera in views] for model in models]
+    reserved = []
+    for shared in (False, True):
+        frames.release_graphs()
+        if shared:
+            frames.share_graphs([model.surfels for model in models])
+        torch.cuda.empty_cache()
+        before = torch.cuda.memory_reserved()
+        for _ in range(3):
+            for k, camera in enumerate(views):
+                for model, images in zip(models, expected, strict=True):
+                    assert torch.equal(model.render_image(camera), images[k])
+        torch.cuda.empty_cache()
+        reserved.append(torch.cuda.memory_reserved() - before)
+    assert len({id(graphs(model)) for model in models}) == 1 and len(graphs(models[0]).frames) == 3
+    assert reserved[1] < 0.5 * reserved[0]
 
 
 @CUDA

@@ -91,8 +91,7 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], 
     for _ in range(steps):
         views = views or torch.randperm(len(cameras), generator=order).tolist()
         camera = _window(cameras[views.pop()].to(model.device), order)
-        with torch.no_grad():
-            target = model.render(camera, exposure="mean").image
+        target = model.render_image(camera, exposure="mean")
         hits = hits_of(bare, camera)
         plain = ops.plain_colors((trained["sh0"], trained["shN"]), state["means"], camera.position.to(target), degree)
         added = sample(trained["atlas"], baked.layout.texels(hits.ids, hits.local))

@@ -149,7 +149,7 @@ def brightness(
     """
     found = []
     for camera in cameras:
-        image = model.render(reduced(camera, HEIGHT), exposure="mean").image
+        image = model.render_image(reduced(camera, HEIGHT), exposure="mean")
         found.append(image.clamp(0, 1).double().pow(LINEAR).mean((0, 1)).pow(1 / LINEAR))
         progress()
     return torch.stack(found).clamp_min(DARKEST).log().cpu()

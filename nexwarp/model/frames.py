@@ -16,9 +16,9 @@ import logging
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -27,20 +27,17 @@ from nexwarp import ops
 from nexwarp.camera import Camera, StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.memory import needed_memory
-from nexwarp.model.options import RenderOptions
+from nexwarp.model.frame_request import FrameRequest
 from nexwarp.render import Rendering
 from nexwarp.representation.background import Color, background_numbers
-from nexwarp.representation.detail_limits import DetailLimits
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
 
 log = logging.getLogger(__name__)
 
 # Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room.
 MOST_GRAPHS = 4
-# Kinds of frames that are remembered to have been launched once.
+# Kinds of frames of one model that are remembered to have been launched once.
 MOST_SEEN = 16
 # Of one frame, pixels times max(K, 1).
 MOST_POINTS = 2**23
@@ -50,7 +47,7 @@ CHANCES = 3
 FIELDS = frozenset(field.name for field in dataclasses.fields(Rendering))
 _RELEASABLE = FIELDS - {"image"}
 
-Work = Callable[[Camera, torch.Tensor], Rendering]
+T = TypeVar("T")
 
 _enabled = True
 
@@ -67,9 +64,10 @@ def without_graphs() -> Iterator[None]:
 
 
 class FrameGraphs:
-    """The captured frames of one model on one GPU. Threads take turns."""
+    """The captured frames of a model, or of several that share memory, on one GPU. Threads take turns."""
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, models: int = 1) -> None:
+        self.most, self.most_seen = MOST_GRAPHS * models, MOST_SEEN * models
         self.lock = threading.RLock()
         self.stream = torch.cuda.Stream(device)
         self.pool: tuple[int, int] | None = None
@@ -83,58 +81,49 @@ class FrameGraphs:
         # may lie where another one has its temporary buffers.
         self.latest: weakref.ref[CapturedRendering] | None = None
 
-    def render(
-        self,
-        camera: Camera,
-        background: Color,
-        work: Work,
-        options: Hashable,
-        state: Hashable,
-        exposures: Exposures | None,
-    ) -> Rendering | None:
-        """Render by a graph.
-
-        Args:
-            camera: on the GPU or the CPU, its pose in float32.
-            background: of the frame.
-            work: renders for a camera and a background (3,); called to capture.
-            options: whatever the frame's kind depends on beside the camera's size and near depth.
-            state: whatever the launches of `work` depend on beside its kind.
-            exposures: those that `work` multiplies the image by.
-
-        Returns:
-            The rendering; None if it is to be launched kernel by kernel.
-        """
-        kind = (options, camera.width, camera.height, camera.near)
+    def render(self, request: FrameRequest) -> Rendering | None:
+        """Render by a graph; None if the frame is to be launched kernel by kernel."""
         with self.lock:
-            frame = self.frames.get(kind)
-            if frame is None or frame.state != state or not self.chances:
-                self.frames.pop(kind, None)
-                if self.seen.get(kind) != state or not self.chances:
-                    self.seen[kind] = state
-                    self.seen.move_to_end(kind)
-                    while len(self.seen) > MOST_SEEN:
-                        self.seen.popitem(last=False)
-                    return None
-                while len(self.frames) >= MOST_GRAPHS:
-                    self.frames.popitem(last=False)
-                frame = self._capture(camera, work, exposures, state)
-                if frame is None:
-                    return None
-                self.frames[kind] = frame
-            self.frames.move_to_end(kind)
-            rendering, held = frame.replay(camera, background, exposures)
-            if not held:
-                # This rendering is right, but slow, as the next one by this graph would be.
-                del self.frames[kind]
+            rendering = self._run(request, whole=True, take=CapturedRendering.of)
+            if rendering is not None:
+                self.latest = weakref.ref(rendering)
             return rendering
 
-    def _capture(self, camera: Camera, work: Work, exposures: Exposures | None, state: Hashable) -> "_Frame | None":
+    def render_image(self, request: FrameRequest) -> torch.Tensor | None:
+        """Render by a graph that keeps the image alone; None if the frame is to be launched kernel by kernel."""
+        with self.lock:
+            return self._run(request, whole=False, take=_image_of)
+
+    def _run(self, request: FrameRequest, whole: bool, take: "Callable[[_Frame, torch.cuda.Stream], T]") -> T | None:
+        kind, state = (whole, *request.kind()), request.state
+        frame = self.frames.get(kind)
+        if frame is None or frame.state != state or not self.chances:
+            self.frames.pop(kind, None)
+            if self.seen.get(kind) != state or not self.chances:
+                self.seen[kind] = state
+                self.seen.move_to_end(kind)
+                while len(self.seen) > self.most_seen:
+                    self.seen.popitem(last=False)
+                return None
+            while len(self.frames) >= self.most:
+                self.frames.popitem(last=False)
+            frame = self._capture(request, whole)
+            if frame is None:
+                return None
+            self.frames[kind] = frame
+        self.frames.move_to_end(kind)
+        taken, held = frame.replay(request, take)
+        if not held:
+            # What was taken is right, but slow, as the next frame by this graph would be.
+            del self.frames[kind]
+        return taken
+
+    def _capture(self, request: FrameRequest, whole: bool) -> "_Frame | None":
         """Return the captured frame; None if that is not possible."""
         if not self.frames:
             self.pool = None  # it has gone with its last graph
         try:
-            return _Frame(self, camera, work, exposures, state)
+            return _Frame(self, request, whole)
         except Exception as error:
             memory = isinstance(error, OutOfMemoryError) or needed_memory(error) is not None
             log.debug("frames are launched kernel by kernel: %s", error)
@@ -175,10 +164,9 @@ class _Frame:
 
     @torch.inference_mode(False)  # later frames write to its tensors in any mode
     @torch.no_grad()
-    def __init__(
-        self, graphs: FrameGraphs, camera: Camera, work: Work, exposures: Exposures | None, state: Hashable
-    ) -> None:
-        self.graphs, self.state = graphs, state
+    def __init__(self, graphs: FrameGraphs, request: FrameRequest, whole: bool) -> None:
+        self.graphs, self.state = graphs, request.state
+        camera, exposures = request.camera, request.parts.exposures
         device = graphs.stream.device
         # Pose (4, 4), intrinsics (3, 3), two focal lengths and the background, so that one copy brings them all.
         self.numbers = torch.zeros(32, device=device)
@@ -200,26 +188,28 @@ class _Frame:
             graphs.pool = torch.cuda.graph_pool_handle()
         self.graph = torch.cuda.CUDAGraph()
         with graphs.using(), ops.captured(self.graph, graphs.stream, graphs.pool):
-            self.result = work(self.camera, self.background)
-        self.room = self.result.intermediates.tiles.room
+            result = request.work(self.camera, self.background)
+        self.image, self.room = result.image, result.intermediates.tiles.room
+        # Memory of what is not kept here serves other graphs.
+        self.result = result if whole else None
 
-    def replay(
-        self, camera: Camera, background: Color, exposures: Exposures | None
-    ) -> "tuple[CapturedRendering, bool]":
+    def replay(self, request: FrameRequest, take: "Callable[[_Frame, torch.cuda.Stream], T]") -> tuple[T, bool]:
         """Render another camera; what the rendering before still holds is copied for it first.
 
+        Args:
+            request: of the frame's kind and state.
+            take: takes what is asked for from the frame on the stream that it was replayed on.
+
         Returns:
-            The rendering, and whether the lists of surfels have held all entries, as far as is known.
+            What was taken, and whether the lists of surfels have held all entries, as far as is known.
         """
         if self.graphs.latest is not None and (latest := self.graphs.latest()) is not None:
             latest.take_buffers()
+        self.graphs.latest = None
         with self.graphs.using() as stream:
-            self._stage(camera, background, exposures)
+            self._stage(request.camera, request.background, request.parts.exposures)
             self.graph.replay()
-            rendering = CapturedRendering.of(self, stream)
-            held = ops.held(self.room)
-        self.graphs.latest = weakref.ref(rendering)
-        return rendering, held
+            return take(self, stream), ops.held(self.room)
 
     def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
         """Copy what differs from one frame to the next into the tensors that the graph reads."""
@@ -245,6 +235,10 @@ class _Frame:
             self.lens = lens
 
 
+def _image_of(frame: _Frame, _: torch.cuda.Stream) -> torch.Tensor:
+    return frame.image.clone()
+
+
 class CapturedRendering(Rendering):
     """A rendering by a graph. All but the image is copied from the graph's memory when it is first asked for.
 
@@ -257,7 +251,7 @@ class CapturedRendering(Rendering):
     def of(cls, frame: _Frame, stream: torch.cuda.Stream) -> "CapturedRendering":
         """Return the rendering that the graph was last replayed for, on a stream."""
         rendering = cls.__new__(cls)
-        rendering.__dict__.update(image=frame.result.image.clone(), frame=frame, stream=stream)
+        rendering.__dict__.update(image=_image_of(frame, stream), frame=frame, stream=stream)
         return rendering
 
     def __getattr__(self, name: str) -> Any:
@@ -297,64 +291,44 @@ def _copied(value: Any, copies: dict[int, torch.Tensor]) -> Any:
     return value
 
 
-class Parts(NamedTuple):
-    """What a frame reads beside its camera and background."""
-
-    surfels: Surfels
-    texture: NeuralTexture | None
-    exposures: Exposures | None
-    detail_limits: DetailLimits | None
-
-    def tensors(self) -> list[torch.Tensor]:
-        """Return parameters and buffers of all parts."""
-        return [x for part in self if part is not None for x in _tensors_of(part)]
-
-    def state(self, tensors: list[torch.Tensor]) -> Hashable:
-        """What the launches of a frame depend on beside its kind; changes of values in place do not count."""
-        texture, exposures, products = self.texture, self.exposures, torch.backends.cuda.matmul
-        return (
-            *((x.data_ptr(), x.shape) for x in tensors),
-            texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
-            # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
-            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
-            exposures and exposures.lens,
-            self.detail_limits is None,
-            torch.are_deterministic_algorithms_enabled(),
-            products.allow_tf32,
-            products.allow_fp16_reduced_precision_reduction,
-        )
-
-
 # By their surfels, which several models may share; released with them.
 _graphs: "weakref.WeakKeyDictionary[nn.Module, FrameGraphs]" = weakref.WeakKeyDictionary()
 _graphs_lock = threading.Lock()
 
 
-def render_by_graph(
-    work: Work, parts: Parts, options: RenderOptions, camera: Camera, background: Color
-) -> Rendering | None:
-    """Return a rendering without gradients and without depth jitter; None if it is to be launched kernel by kernel.
+def share_graphs(models: Sequence[nn.Module]) -> None:
+    """Let the frames of models, given by their surfels on one GPU, share memory from now on."""
+    with _graphs_lock:
+        graphs = FrameGraphs(next(models[0].parameters()).device, len(models))
+        for surfels in models:
+            _graphs[surfels] = graphs
 
-    Args:
-        work: renders for a camera and a background, with the parts and options.
-        parts: of the model.
-        options: of the rendering; the background counts instead of theirs.
-        camera: on the GPU or the CPU.
-        background: of the frame.
-    """
-    device = parts.surfels.device
-    if not _enabled or device.type != "cuda" or isinstance(parts.texture, MergedTexture):
+
+def render_by_graph(request: FrameRequest) -> Rendering | None:
+    """Return a rendering; None if the frame is to be launched kernel by kernel."""
+    graphs = _graphs_for(request)
+    return None if graphs is None else graphs.render(request)
+
+
+def render_image_by_graph(request: FrameRequest) -> torch.Tensor | None:
+    """Return the image alone, which takes less memory; None if the frame is to be launched kernel by kernel."""
+    graphs = _graphs_for(request)
+    return None if graphs is None else graphs.render_image(request)
+
+
+def _graphs_for(request: FrameRequest) -> FrameGraphs | None:
+    """Return the graphs of the request's model; None if the frame cannot be captured."""
+    surfels = request.parts.surfels
+    device = surfels.device
+    if not _enabled or device.type != "cuda" or isinstance(request.parts.texture, MergedTexture):
         return None
-    tensors = parts.tensors()
-    if not _can_capture(device, tensors, options, camera, background):
+    if not _can_capture(device, request):
         return None
     with _graphs_lock:
-        graphs = _graphs.get(parts.surfels)
+        graphs = _graphs.get(surfels)
         if graphs is None or graphs.stream.device != device:
-            graphs = _graphs[parts.surfels] = FrameGraphs(device)
-    there = tuple(part is not None for part in parts)
-    kind = (options.max_hits, options.sh_degree, options.low_pass, options.clamp_texture, options.order, there)
-    return graphs.render(camera, background, work, kind, parts.state(tensors), parts.exposures)
+            graphs = _graphs[surfels] = FrameGraphs(device)
+    return graphs
 
 
 def release_graphs() -> bool:
@@ -369,10 +343,9 @@ def capturing(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-def _can_capture(
-    device: torch.device, tensors: list[torch.Tensor], options: RenderOptions, camera: Camera, background: Color
-) -> bool:
+def _can_capture(device: torch.device, request: FrameRequest) -> bool:
     """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
+    tensors, options, camera, background = request.tensors, request.options, request.camera, request.background
     if camera.width * camera.height * max(options.max_hits, 1) > MOST_POINTS or isinstance(camera, StagedCamera):
         return False
     if camera.viewmat.dtype != torch.float32 or camera.device not in (device, torch.device("cpu")):
@@ -388,12 +361,3 @@ def _can_capture(
     if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
         return False
     return not capturing(device)
-
-
-def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
-    """Return parameters and buffers; torch's own iterators take a tenth of a small frame's time."""
-    found = [x for x in (*module._parameters.values(), *module._buffers.values()) if x is not None]
-    for child in module._modules.values():
-        if child is not None:
-            found += _tensors_of(child)
-    return found

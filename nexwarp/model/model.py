@@ -14,6 +14,7 @@ from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
 from nexwarp.model import frames
+from nexwarp.model.frame_request import FrameRequest, Parts
 from nexwarp.model.options import RenderChanges, RenderOptions
 from nexwarp.model.render_rays import RayRendering, render_rays
 from nexwarp.render import Rendering, render
@@ -167,6 +168,32 @@ class Model(nn.Module):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
         return self._render(camera, options.background if background is None else background, options, jitter)
 
+    def render_image(
+        self, camera: Camera, *, background: Color | None = None, **changes: Unpack[RenderChanges]
+    ) -> torch.Tensor:
+        """Return the image of `render` alone, without gradients. On a GPU, later frames keep less memory for it.
+
+        Args:
+            camera: see `render`; a `Camera`.
+            background: see `render`.
+            changes: see `render`.
+
+        Returns:
+            (H, W, 3) float32, the bits of `render(camera, ...).image`.
+
+        Raises:
+            TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
+        """
+        if not isinstance(camera, Camera):
+            raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
+        options = self.options.changed(**changes) if changes else self.options
+        with torch.no_grad():
+            request = self._request(
+                camera, options.background if background is None else background, options, (0.0, None)
+            )
+            image = frames.render_image_by_graph(request)
+            return self._launch(request).image if image is None else image
+
     def _render(
         self,
         camera: Camera,
@@ -175,7 +202,21 @@ class Model(nn.Module):
         jitter: tuple[float | torch.Tensor, torch.Generator | None],
     ) -> Rendering:
         """Render one camera, by a CUDA graph where that is possible."""
-        parts = frames.Parts(
+        request = self._request(camera, background, options, jitter)
+        if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:
+            rendering = frames.render_by_graph(request)
+            if rendering is not None:
+                return rendering
+        return self._launch(request)
+
+    def _request(
+        self,
+        camera: Camera,
+        background: Color,
+        options: RenderOptions,
+        jitter: tuple[float | torch.Tensor, torch.Generator | None],
+    ) -> FrameRequest:
+        parts = Parts(
             self.surfels,
             self.texture if options.max_hits else None,
             self.exposures if options.exposure == "photos" else None,
@@ -198,19 +239,20 @@ class Model(nn.Module):
                 order=options.order,
             )
 
-        if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:
-            rendering = frames.render_by_graph(work, parts, options, camera, background)
-            if rendering is not None:
-                return rendering
+        return FrameRequest(work, parts, options, camera, background)
+
+    def _launch(self, request: FrameRequest) -> Rendering:
+        """Render kernel by kernel; where memory does not suffice, again without any graphs."""
+        camera = request.camera
         camera = camera if camera.device == self.device else camera.to(self.device)
         try:
-            return work(camera, background)
+            return request.work(camera, request.background)
         except OutOfMemoryError:
             # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
             if frames.capturing(self.device) or not frames.release_graphs():
                 raise
         # Outside of the handler: the error's traceback would keep alive what has been allocated.
-        return work(camera, background)
+        return request.work(camera, request.background)
 
     def _render_rays(self, camera: RayCamera, options: RenderOptions, background: Color | None) -> RayRendering:
         return render_rays(

@@ -97,7 +97,7 @@ def _judge(
     model: Model, view: View, mask_mode: str, metrics: Sequence[str]
 ) -> tuple[torch.Tensor, dict[str, float | None]]:
     """Render a view; return the picture, (H, W, 3) uint8 on the CPU, and its metrics."""
-    picture = to_uint8(model.render(view.camera).image).cpu()
+    picture = to_uint8(model.render_image(view.camera)).cpu()
     photo, mask = _compared(model, view, mask_mode)
     return picture, {name: METRICS[name](picture, photo, mask) for name in metrics}
 

@@ -16,7 +16,7 @@ from nexwarp.camera import Camera
 from nexwarp.cameras.between import between
 from nexwarp.data import Scene
 from nexwarp.determinism import derived_seed
-from nexwarp.model.frames import MOST_GRAPHS, without_graphs
+from nexwarp.model.frames import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.target import Target
@@ -60,6 +60,8 @@ class Teachers:
                     f"got one of a scene of scale {scale:.6g}"
                 )
         self.models = [model.to(device) for model in models]
+        if device.type == "cuda":
+            share_graphs([model.surfels for model in self.models])
         self.cameras, self.seed, self.last = [view.camera for view in scene.train], config.seed, config.iterations
         sizes = {(camera.width, camera.height) for camera in self.cameras}
         self.launches = without_graphs if len(sizes) > MOST_GRAPHS else nullcontext
@@ -92,8 +94,8 @@ class Teachers:
         _, near, teacher = self.choice(number)
         c = of_photo.camera
         camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near)
-        with torch.no_grad(), self.launches():
-            picture = teacher.render(camera, background=of_photo.background, exposure="mean").image.clone()
+        with self.launches():
+            picture = teacher.render_image(camera, background=of_photo.background, exposure="mean")
         # Gains of 1, and depths of 0, which stand for no point: without masks, steps with photos have the same graph.
         exposure = None if of_photo.exposure is None else torch.ones_like(of_photo.exposure)
         depths = None if of_photo.expected is None else torch.zeros_like(of_photo.expected)

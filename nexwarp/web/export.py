@@ -130,7 +130,7 @@ def _poster(model: Model, camera: Camera) -> bytes:
 
     scale = min(POSTER_WIDTH / max(camera.width, camera.height), 1.0)
     small = resized(camera, max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-    pixels = to_uint8(model.render(small).image).cpu().numpy()
+    pixels = to_uint8(model.render_image(small)).cpu().numpy()
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "JPEG", quality=POSTER_QUALITY, optimize=True)
     return stream.getvalue()
