@@ -25,6 +25,7 @@ from benchmarks.timing import ROOT
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -230,13 +231,18 @@ def _train_nexwarp(
         "train_psnr": train_psnr(scene, image),
         "zoom_psnr": zoom_psnr(scene, image),
         "quarter_psnr": quarter_psnr(scene, image),
-        **({} if trainer.teachers is None else {"teachers": {"count": len(trainer.teachers.models)}}),
+        **({} if trainer.teachers is None else {"teachers": _teachers_facts(trainer.teachers.models)}),
         **memory,
         **shared,
     }
     return Trained(
         _renderings(scene, image), facts, _renderings(scene, lambda camera: compact.render(camera).image), compact_bytes
     )
+
+
+def _teachers_facts(models: Sequence[Model]) -> dict[str, int]:
+    """Return how many teachers a model has learned from, and how many surfels the largest of them has."""
+    return {"count": len(models), "surfels": max(len(model.surfels) for model in models)}
 
 
 @torch.no_grad()
