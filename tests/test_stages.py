@@ -41,7 +41,6 @@ CPU = torch.device("cpu")
 CONFIG = Config(
     iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)
 )
-OWN = {"count": 2, "iterations": 4, "max_surfels": 240}
 SETTINGS = ("texture.table_size=1024", "texture.levels=4", "exposures=false")
 SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS for text in ("--set", each))]
 
@@ -57,8 +56,8 @@ def same(one: Model, other: Model) -> bool:
         ({}, 21, 2),
         ({}, 64, 2),
         ({}, 65, 0),  # photos are many
-        ({"max_surfels": 12_600}, 42, 2),
-        ({"max_surfels": 12_600}, 43, 0),  # surfels are few for them
+        ({"max_surfels": 25_200}, 42, 2),
+        ({"max_surfels": 25_200}, 43, 0),  # surfels are few for them
         ({"iterations": 60_000}, 21, 2),
         ({"iterations": 29_999}, 21, 0),  # the run is short
         ({"refine_poses": True}, 21, 0),
@@ -102,17 +101,6 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
         assert each == dataclasses.replace(config, teachers=0, iterations=each.iterations, seed=each.seed)
 
 
-@pytest.mark.parametrize(
-    ("budget", "teachers"), [(60, 240), (9_999, 39_996), (10_000, 40_000), (39_999, 40_000), (40_001, 40_001)]
-)
-def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> None:
-    config = Config(max_surfels=budget, teachers=2)
-    stages = divide(config, plan_teachers(config, 20))
-    assert {each.max_surfels for each in stages.teachers} == {teachers} and stages.student.max_surfels == budget
-    # As in a run from before.
-    assert {each.max_surfels for each in divide(config, OwnTeachers(2, 10)).teachers} == {budget}
-
-
 def test_seeds_of_teachers_follow_from_the_runs() -> None:
     def seeds(seed: int) -> list[int]:
         return [each.seed for each in divide(Config(seed=seed), OwnTeachers(2, 10)).teachers]
@@ -143,7 +131,7 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
 
     found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
     assert seen == [*range(1, 21)]
-    stages = divide(CONFIG, OwnTeachers(2, 4, 240))
+    stages = divide(CONFIG, OwnTeachers(2, 4))
     files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
     teachers = [nw.load(file) for file in files]
     assert same(found, nw.train(tiny_scene, stages.student, device=CPU, teachers=teachers))
@@ -180,7 +168,7 @@ def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list
     scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
     found = nw.train(scene, config, device=CPU)
     assert len(calibrations) == 1 and found.exposures is not None
-    stages = divide(config, OwnTeachers(2, 4, 240))
+    stages = divide(config, OwnTeachers(2, 4))
     files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
     assert same(found, nw.train(scene, stages.student, device=CPU, teachers=map(nw.load, files)))
 
@@ -223,7 +211,7 @@ def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, run)
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["iterations"] == 20 and metrics["teachers"] == 2 and "psnr" in metrics
-    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == OWN
+    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == {"count": 2, "iterations": 4}
     seeds, spent = {0}, 0.0
     for folder in (run / "teachers" / "1", run / "teachers" / "2"):
         facts = json.loads((folder / "metrics.json").read_text())
@@ -306,7 +294,7 @@ def test_a_longer_run_keeps_its_teachers(
     assert command(run, "--resume", iterations=30) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
     assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
-    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == OWN
+    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == {"count": 2, "iterations": 4}
     model = model_of(run)
     (run / "model.safetensors").unlink()
     assert command(run, "--resume", iterations=30) == 0
@@ -422,7 +410,7 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
 ) -> None:
     """Although --iterations has grown before they were complete."""
     run = tmp_path / "run"
-    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4, 240))
+    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4))
     assert command(run, "--resume", iterations=30) == 0
     for number in "12":
         assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
@@ -432,7 +420,7 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
 def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
     """Of the training alone; a resumed run finds them by these."""
     scene = dataclasses.replace(tiny_scene, test=[])
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
     create_run(run, source, CONFIG, "cpu", own=own)
     models = []
     for resume in (False, True):
@@ -459,7 +447,7 @@ def test_weights_and_biases_gets_the_runs_settings(
         def close(self) -> None: ...
 
     monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
     create_run(run, source, CONFIG, "cpu", own=own)
     session = StagedSession(
         tiny_scene, CONFIG, own, run, source, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"]
@@ -479,8 +467,6 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
         {"count": "2", "iterations": 4},
         {"count": 9, "iterations": 4},
         {"count": 2, "iterations": 0},
-        {"count": 2, "iterations": 4, "max_surfels": 0},
-        {"count": 2, "iterations": 4, "max_surfels": "240"},
         {"count": 2, "iterations": 10},  # all that the run has
         [2, 4],
     ):
@@ -490,7 +476,7 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
             read_run(run)
     data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
     (run / "config.json").write_text(json.dumps(data))
-    assert read_own_teachers(run) == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
+    assert read_own_teachers(run) == OwnTeachers(2, 4)
 
 
 def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -505,8 +491,8 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     drawn: list[object] = []
     console = Console(quiet=True)
     source, run = SceneSource(str(tiny_scene.path)), tmp_path / "run"
-    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4, 240), run, source, console, Ranks.alone(CPU))
-    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4, 240))
+    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4), run, source, console, Ranks.alone(CPU))
+    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4))
     session.train(Shown())  # type: ignore[arg-type]
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
 

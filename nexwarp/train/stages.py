@@ -26,11 +26,8 @@ from nexwarp.train.trainer import Trainer
 # trainings did, as did one with 230 photos. Nothing between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
-SURFELS_A_PHOTO = 300
+SURFELS_A_PHOTO = 600
 SHARE = 0.4  # of the iterations that the teachers have together
-# Teachers of a small student have more surfels than it, so that what it learns from is better than what it can become.
-TEACHER_SURFELS = 40_000
-TEACHER_TIMES = 4  # at most so many times the student's
 STREAM = 3  # series of seeds, as `derived_seed` counts them
 
 
@@ -41,12 +38,10 @@ class OwnTeachers:
     Attributes:
         count: how many.
         iterations: of each.
-        max_surfels: of each; None is the student's.
     """
 
     count: int
     iterations: int
-    max_surfels: int | None = None
 
 
 NO_TEACHERS = OwnTeachers(0, 0)
@@ -85,9 +80,8 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
         config: of the run.
         photos: number of training photos.
     """
-    count, most = teacher_count(config, photos), config.max_surfels
-    surfels = max(most, min(TEACHER_TIMES * most, TEACHER_SURFELS))
-    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels) if count else NO_TEACHERS
+    count = teacher_count(config, photos)
+    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1)) if count else NO_TEACHERS
 
 
 def divide(config: Config, own: OwnTeachers) -> Stages:
@@ -101,11 +95,7 @@ def divide(config: Config, own: OwnTeachers) -> Stages:
         raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
     # Seeds of settings have 32 bits.
     seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
-    surfels = own.max_surfels or config.max_surfels
-    teachers = (
-        dataclasses.replace(config, seed=seed, iterations=own.iterations, max_surfels=surfels, teachers=0)
-        for seed in seeds
-    )
+    teachers = (dataclasses.replace(config, seed=seed, iterations=own.iterations, teachers=0) for seed in seeds)
     return Stages(tuple(teachers), dataclasses.replace(config, iterations=config.iterations - taken, teachers=0))
 
 
