@@ -189,7 +189,7 @@ def test_images_alone_keep_less_and_leave_other_renderings_alone() -> None:
         for _ in range(3):
             assert torch.equal(model.render_image(camera), expected.image)
     assert_same(whole, expected, (*BUFFERS, "ids", *LATER))
-    assert sorted(kind[0] for kind in graphs(model).frames if 640 in kind) == [False, True]
+    assert len(graphs(model).frames) == 3  # one of them is of the small cameras
 
 
 @CUDA

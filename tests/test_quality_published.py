@@ -19,7 +19,7 @@ from benchmarks.timing import ROOT
 
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
-SAME = {"55fc7bc", "0e1a112", "92d09bb"}  # commits of the same default and kernels
+SAME = {"55fc7bc", "0e1a112", "92d09bb", "e4bdad5", "aade3ba"}  # commits of the same default and kernels
 OLDER = False  # True while the tables are of a default with other settings than today's
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 

@@ -186,8 +186,18 @@ def test_only_some_rows_of_the_tables(tmp_path: Path, capsys: pytest.CaptureFixt
     command += ["--iterations", "100", "--out", str(file), "--only"]
     assert main([*command, "no gamma,K = 3"]) == 0
     assert "0 of 2 trainings to do" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"--only: expected some of default, paper, .*, got K = 9"):
+    with pytest.raises(ValueError, match=r"--only: expected some of default; paper; .*, got 'K = 9'"):
         main([*command, "no gamma,K = 9"])
+
+
+def test_rows_whose_names_have_commas_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "results.jsonl"
+    names = ("gsplat MCMC, skybox", "gsplat MCMC", "gsplat MCMC, even start")
+    lines = [result(name, 0) | {"size": size} for name in names for size in (10, 40)]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    command = ["train", "--tables", "peers", "--scenes", "fox", "--seeds", "0", "--size", "40"]
+    assert main([*command, "--iterations", "100", "--out", str(file), "--only", ",".join(names)]) == 0
+    assert "0 of 6 trainings to do" in capsys.readouterr().out
 
 
 def test_curves_have_means_and_spreads_by_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

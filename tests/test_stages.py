@@ -504,7 +504,7 @@ def test_the_benchmark_trains_teachers_first(
     row = Row("two", settings={"teachers": 2})
     job = TrainingJob(tiny_folder.name, "", "two", 60, 3, 20)
     result = run_job(job, tiny_folder.parent, row, models=tmp_path)
-    assert result["teachers"] == {"count": 2} and result["iterations"] == 20
+    assert result["teachers"] == {"count": 2, "surfels": 30} and result["iterations"] == 20  # half of the budget
     config = config_of(job, row)
     assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
     assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))

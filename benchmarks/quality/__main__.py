@@ -49,14 +49,24 @@ def _rows(texts: Iterable[str]) -> dict[str, Row]:
     return rows
 
 
+def _row_names(text: str) -> list[str]:
+    """Return the rows that a comma-separated list names; a name may have commas, too."""
+    parts, found = text.split(","), list[str]()
+    while parts:
+        ends = [end for end in range(len(parts), 0, -1) if ",".join(parts[:end]) in ROWS]
+        if not ends:
+            raise ValueError(f"--only: expected some of {'; '.join(ROWS)}, got {parts[0]!r}")
+        found.append(",".join(parts[: ends[0]]))
+        del parts[: ends[0]]
+    return found
+
+
 def _wanted_jobs(given: argparse.Namespace, rows: Mapping[str, Row]) -> list[TrainingJob]:
     """Return the jobs that are asked for, each once."""
     wanted: dict[TrainingJob, None] = {}
     seeds = [int(x) for x in given.seeds.split(",")]
     scenes = given.scenes.split(",")
-    only = given.only.split(",") if given.only else [*ROWS]
-    if unknown := [name for name in only if name not in ROWS]:
-        raise ValueError(f"--only: expected some of {', '.join(ROWS)}, got {', '.join(unknown)}")
+    only = _row_names(given.only) if given.only else [*ROWS]
     for table in filter(None, (given.tables or "").split(",")):
         for job in table_jobs(table, scenes, seeds, given.iterations, given.size):
             if job.row in only:
