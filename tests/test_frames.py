@@ -18,6 +18,7 @@ from nexwarp.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import frames
 from nexwarp.model import model as model_module
+from nexwarp.model.frame_request import FrameRequest
 from nexwarp.render import Rendering, render
 from nexwarp.representation.exposures import Exposures
 from tests.narrowing import present
@@ -193,7 +194,7 @@ def test_images_alone_keep_less_and_leave_other_renderings_alone() -> None:
 
 
 @CUDA
-def test_models_that_share_graphs_have_memory_and_pictures_of_their_own() -> None:
+def test_models_that_share_graphs_take_less_memory_and_keep_their_own_pictures() -> None:
     views, models = cameras("cuda", width=640, height=480), [finished("cuda", seed) for seed in (0, 1, 2)]
     with frames.without_graphs():
         expected = [[model.render_image(camera) for camera in views] for model in models]
@@ -212,6 +213,89 @@ def test_models_that_share_graphs_have_memory_and_pictures_of_their_own() -> Non
         reserved.append(torch.cuda.memory_reserved() - before)
     assert len({id(graphs(model)) for model in models}) == 1 and len(graphs(models[0]).frames) == 3
     assert reserved[1] < 0.5 * reserved[0]
+    one, other, _ = models
+    with torch.no_grad():
+        for model in (one, other):
+            for _ in range(2):
+                model.render(views[0])
+        whole = both(one, views[0])[1]
+        held = one.render(views[0])
+        for camera in views:
+            other.render(camera)
+            other.render_image(camera)
+    assert_same(held, whole, (*BUFFERS, "ids", *LATER))
+
+
+@pytest.fixture
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
+    """Frame graphs without a GPU: what is captured is noted, as (whole, width)."""
+    captured: list[tuple[bool, int]] = []
+
+    class Frame:
+        def __init__(self, graphs: frames.FrameGraphs, request: FrameRequest, whole: bool) -> None:
+            self.state = request.state
+            captured.append((whole, request.camera.width))
+
+        def replay(self, request: FrameRequest, take: object) -> tuple[torch.Tensor, bool]:
+            return torch.zeros(3), True
+
+    class Stream:
+        def __init__(self, device: torch.device) -> None:
+            self.device = device
+
+    monkeypatch.setattr(frames, "_Frame", Frame)
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "Event", object)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+    monkeypatch.setattr(frames, "_can_capture", lambda *_: True)
+    monkeypatch.setattr(frames, "_graphs", weakref.WeakKeyDictionary())
+    return captured
+
+
+def request_of(model: nw.Model, width: int = 61) -> FrameRequest:
+    camera = cameras("cpu", 1, width=width)[0]
+    return model._request(camera, (0.0, 0.0, 0.0), model.options, (0.0, None))
+
+
+def shared(models: list[nw.Model]) -> frames.FrameGraphs:
+    frames.share_graphs([model.surfels for model in models])
+    (found,) = {id(graphs(model)): graphs(model) for model in models}.values()
+    return found
+
+
+def test_a_graph_that_keeps_all_buffers_gives_images_too(stand_ins: list[tuple[bool, int]]) -> None:
+    model = finished("cpu")
+    group = shared([model])
+    for width in (61, 33):
+        assert group.render_image(request_of(model, width)) is None
+        for _ in range(3):
+            assert group.render_image(request_of(model, width)) is not None
+    assert stand_ins == [(False, 61), (False, 33)]
+    for _ in range(3):
+        group.render(request_of(model))
+        group.render_image(request_of(model))
+    assert stand_ins[2:] == [(True, 61)]
+    model.surfels.means = torch.nn.Parameter(model.surfels.means + 1)  # needs other graphs
+    assert group.render_image(request_of(model)) is None
+    assert group.render_image(request_of(model)) is not None
+    assert stand_ins[3:] == [(False, 61)]
+
+
+def test_models_that_share_graphs_have_graphs_of_their_own(stand_ins: list[tuple[bool, int]]) -> None:
+    models = [finished("cpu", seed) for seed in range(3)]
+    before = [shared([model]) for model in models[:2]]
+    for group, model in zip(before, models, strict=False):
+        for _ in range(2):
+            group.render(request_of(model))
+        assert len(group.frames) == 1
+    group = shared(models)
+    assert [len(each.frames) for each in before] == [0, 0], "graphs that nobody can drop any more stay in memory"
+    del stand_ins[:]
+    for _ in range(3):
+        for model in models:
+            for width in range(30, 30 + frames.MOST_GRAPHS):
+                group.render_image(request_of(model, width))
+    assert len(stand_ins) == len(group.frames) == 3 * frames.MOST_GRAPHS
 
 
 @CUDA

@@ -168,9 +168,13 @@ def config_name(config: Config) -> str:
 
 
 def trained_with(result: Mapping[str, Any], config: Config) -> bool:
-    """Whether a result of nexwarp was trained with settings, whatever the seed, and as many teachers."""
-    teachers = (result.get("teachers") or {}).get("count", 0)
-    return result.get("config") == config_name(config) and teachers == (config.teachers or 0)
+    """Whether a result of nexwarp was trained with settings, whatever the seed, and as many teachers, no larger ones.
+
+    Lines that do not say how large the teachers were are of teachers with the student's budget.
+    """
+    teachers = result.get("teachers") or {}
+    alike = teachers.get("count", 0) == (config.teachers or 0) and teachers.get("surfels", 0) <= config.max_surfels
+    return result.get("config") == config_name(config) and alike
 
 
 def _device() -> torch.device:

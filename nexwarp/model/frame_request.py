@@ -48,10 +48,10 @@ class Parts(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FrameRequest:
-    """A frame to render without gradients and without depth jitter.
+    """What a frame renders. A graph can do so only without gradients, and without a depth jitter in `work`.
 
     Attributes:
-        work: renders for a camera and a background (3,), by the parts and options.
+        work: renders for a camera and a background, by the parts and options.
         parts: of the model.
         options: of the rendering; the background counts instead of theirs.
         camera: on the GPU or the CPU.

@@ -6,6 +6,10 @@ the model's own parameters, so that changes in place show at once. Whatever else
 number of surfels or a parameter that is replaced, needs another graph: the first frame after it is launched kernel by
 kernel, the next one is captured. Both do the same arithmetic on the same numbers.
 
+A graph keeps all buffers of its rendering, or the image alone where no more is asked for. Graphs of a model, or of
+several that share them, have their temporary buffers in the same memory, in which one may overwrite what another left:
+whatever of the last rendering is still asked for is copied before any of them is replayed.
+
 Where a frame cannot be captured, it is launched kernel by kernel: on a CPU, with gradients, in float64, with a depth
 jitter, of very large images (which keep the GPU busy anyway), of models merged from blocks, and where memory does not
 suffice.
@@ -32,10 +36,12 @@ from nexwarp.render import Rendering
 from nexwarp.representation.background import Color, background_numbers
 from nexwarp.representation.exposures import Exposures
 from nexwarp.representation.merged_texture import MergedTexture
+from nexwarp.representation.surfels import Surfels
 
 log = logging.getLogger(__name__)
 
-# Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room.
+# Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room;
+# models that share graphs have so many each on the mean.
 MOST_GRAPHS = 4
 # Kinds of frames of one model that are remembered to have been launched once.
 MOST_SEEN = 16
@@ -95,7 +101,10 @@ class FrameGraphs:
             return self._run(request, whole=False, take=_image_of)
 
     def _run(self, request: FrameRequest, whole: bool, take: "Callable[[_Frame, torch.cuda.Stream], T]") -> T | None:
-        kind, state = (whole, *request.kind()), request.state
+        state, common = request.state, request.kind()
+        if not whole and (frame := self.frames.get((True, *common))) is not None and frame.state == state:
+            whole = True  # a graph that keeps all buffers is there: it has the image, too
+        kind = (whole, *common)
         frame = self.frames.get(kind)
         if frame is None or frame.state != state or not self.chances:
             self.frames.pop(kind, None)
@@ -296,12 +305,21 @@ _graphs: "weakref.WeakKeyDictionary[nn.Module, FrameGraphs]" = weakref.WeakKeyDi
 _graphs_lock = threading.Lock()
 
 
-def share_graphs(models: Sequence[nn.Module]) -> None:
-    """Let the frames of models, given by their surfels on one GPU, share memory from now on."""
+def share_graphs(models: Sequence[Surfels]) -> None:
+    """Let the frames of models share memory and turns from now on; graphs that they have are dropped.
+
+    Their graphs go with the last of them. Where memory does not suffice to capture a frame of one, all are launched.
+
+    Args:
+        models: surfels of at least one model, all on one GPU.
+    """
     with _graphs_lock:
-        graphs = FrameGraphs(next(models[0].parameters()).device, len(models))
+        before = {id(graphs): graphs for surfels in models if (graphs := _graphs.get(surfels)) is not None}
+        graphs = FrameGraphs(models[0].device, len(models))
         for surfels in models:
             _graphs[surfels] = graphs
+    for dropped in before.values():
+        dropped.clear()  # nobody else would: the frames refer to it, so that it would stay until garbage is collected
 
 
 def render_by_graph(request: FrameRequest) -> Rendering | None:

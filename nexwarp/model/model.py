@@ -171,10 +171,10 @@ class Model(nn.Module):
     def render_image(
         self, camera: Camera, *, background: Color | None = None, **changes: Unpack[RenderChanges]
     ) -> torch.Tensor:
-        """Return the image of `render` alone, without gradients. On a GPU, later frames keep less memory for it.
+        """Return the image of `render` alone, never with gradients; many calls take less memory of a GPU than `render`.
 
         Args:
-            camera: see `render`; a `Camera`.
+            camera: see `render`; one `Camera`, neither several nor a `RayCamera`.
             background: see `render`.
             changes: see `render`.
 

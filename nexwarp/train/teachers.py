@@ -35,7 +35,7 @@ class Teachers:
     """
 
     def __init__(self, models: Sequence[Model], scene: Scene, config: Config, device: torch.device) -> None:
-        """Check that the models fit.
+        """Check that the models fit; on a GPU their frames share memory from then on.
 
         Args:
             models: trained ones of the scene, at least one; they are moved to the device.
