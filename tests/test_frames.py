@@ -257,7 +257,7 @@ def request_of(model: nw.Model, width: int = 61) -> FrameRequest:
     return model._request(camera, (0.0, 0.0, 0.0), model.options, (0.0, None))
 
 
-def shared(models: list[nw.Model]) -> frames.FrameGraphs:
+def share(models: list[nw.Model]) -> frames.FrameGraphs:
     frames.share_graphs([model.surfels for model in models])
     (found,) = {id(graphs(model)): graphs(model) for model in models}.values()
     return found
@@ -265,7 +265,7 @@ def shared(models: list[nw.Model]) -> frames.FrameGraphs:
 
 def test_a_graph_that_keeps_all_buffers_gives_images_too(stand_ins: list[tuple[bool, int]]) -> None:
     model = finished("cpu")
-    group = shared([model])
+    group = share([model])
     for width in (61, 33):
         assert group.render_image(request_of(model, width)) is None
         for _ in range(3):
@@ -283,12 +283,12 @@ def test_a_graph_that_keeps_all_buffers_gives_images_too(stand_ins: list[tuple[b
 
 def test_models_that_share_graphs_have_graphs_of_their_own(stand_ins: list[tuple[bool, int]]) -> None:
     models = [finished("cpu", seed) for seed in range(3)]
-    before = [shared([model]) for model in models[:2]]
+    before = [share([model]) for model in models[:2]]
     for group, model in zip(before, models, strict=False):
         for _ in range(2):
             group.render(request_of(model))
         assert len(group.frames) == 1
-    group = shared(models)
+    group = share(models)
     assert [len(each.frames) for each in before] == [0, 0], "graphs that nobody can drop any more stay in memory"
     del stand_ins[:]
     for _ in range(3):

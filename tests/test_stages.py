@@ -507,6 +507,7 @@ def test_the_benchmark_trains_teachers_first(
     assert result["teachers"] == {"count": 2, "surfels": 30} and result["iterations"] == 20  # half of the budget
     config = config_of(job, row)
     assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
+    assert not trained_with(result | {"teachers": {"count": 2, "surfels": 61}}, config), "larger than the student"
     assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))
     (file,) = tmp_path.iterdir()
     expected = nw.train(scene_of(job, tiny_folder.parent), config, device=CPU)

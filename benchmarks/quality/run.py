@@ -168,9 +168,9 @@ def config_name(config: Config) -> str:
 
 
 def trained_with(result: Mapping[str, Any], config: Config) -> bool:
-    """Whether a result of nexwarp was trained with settings, whatever the seed, and as many teachers, no larger ones.
+    """Whether a result of nexwarp has these settings, whatever the seed, and as many teachers, of at most its budget.
 
-    Lines that do not say how large the teachers were are of teachers with the student's budget.
+    Teachers whose size is not in the result had the student's budget.
     """
     teachers = result.get("teachers") or {}
     alike = teachers.get("count", 0) == (config.teachers or 0) and teachers.get("surfels", 0) <= config.max_surfels

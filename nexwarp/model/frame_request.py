@@ -48,7 +48,7 @@ class Parts(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FrameRequest:
-    """What a frame renders. A graph can do so only without gradients, and without a depth jitter in `work`.
+    """What a frame renders. Only frames without gradients and without depth jitter can be captured.
 
     Attributes:
         work: renders for a camera and a background, by the parts and options.

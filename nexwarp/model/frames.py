@@ -6,9 +6,9 @@ the model's own parameters, so that changes in place show at once. Whatever else
 number of surfels or a parameter that is replaced, needs another graph: the first frame after it is launched kernel by
 kernel, the next one is captured. Both do the same arithmetic on the same numbers.
 
-A graph keeps all buffers of its rendering, or the image alone where no more is asked for. Graphs of a model, or of
-several that share them, have their temporary buffers in the same memory, in which one may overwrite what another left:
-whatever of the last rendering is still asked for is copied before any of them is replayed.
+A graph keeps all buffers of its rendering, or only the image (`Model.render_image`). Graphs of one model, or of models
+that share graphs, use the same memory for temporary buffers, so that a replay may overwrite the buffers of an earlier
+rendering. The buffers of a rendering that is still referenced are therefore copied before the next replay.
 
 Where a frame cannot be captured, it is launched kernel by kernel: on a CPU, with gradients, in float64, with a depth
 jitter, of very large images (which keep the GPU busy anyway), of models merged from blocks, and where memory does not
@@ -40,8 +40,8 @@ from nexwarp.representation.surfels import Surfels
 
 log = logging.getLogger(__name__)
 
-# Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room;
-# models that share graphs have so many each on the mean.
+# Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes room.
+# M models that share graphs have M times as many.
 MOST_GRAPHS = 4
 # Kinds of frames of one model that are remembered to have been launched once.
 MOST_SEEN = 16
@@ -101,6 +101,7 @@ class FrameGraphs:
             return self._run(request, whole=False, take=_image_of)
 
     def _run(self, request: FrameRequest, whole: bool, take: "Callable[[_Frame, torch.cuda.Stream], T]") -> T | None:
+        """Replay the request's graph, captured first where needed; None if the frame is to be launched."""
         state, common = request.state, request.kind()
         if not whole and (frame := self.frames.get((True, *common))) is not None and frame.state == state:
             whole = True  # a graph that keeps all buffers is there: it has the image, too
@@ -207,7 +208,7 @@ class _Frame:
 
         Args:
             request: of the frame's kind and state.
-            take: takes what is asked for from the frame on the stream that it was replayed on.
+            take: copies the wanted result from the frame, on the stream of its replay.
 
         Returns:
             What was taken, and whether the lists of surfels have held all entries, as far as is known.
@@ -305,21 +306,21 @@ _graphs: "weakref.WeakKeyDictionary[nn.Module, FrameGraphs]" = weakref.WeakKeyDi
 _graphs_lock = threading.Lock()
 
 
-def share_graphs(models: Sequence[Surfels]) -> None:
-    """Let the frames of models share memory and turns from now on; graphs that they have are dropped.
+def share_graphs(surfels: Sequence[Surfels]) -> None:
+    """Let the graphs of several models share memory from now on, and drop the graphs that the models have.
 
-    Their graphs go with the last of them. Where memory does not suffice to capture a frame of one, all are launched.
+    The graphs are freed with the last of the models. If a frame of one model cannot be captured, all are dropped.
 
     Args:
-        models: surfels of at least one model, all on one GPU.
+        surfels: those of the models, at least one, all on one GPU.
     """
     with _graphs_lock:
-        before = {id(graphs): graphs for surfels in models if (graphs := _graphs.get(surfels)) is not None}
-        graphs = FrameGraphs(models[0].device, len(models))
-        for surfels in models:
-            _graphs[surfels] = graphs
+        before = {id(graphs): graphs for each in surfels if (graphs := _graphs.get(each)) is not None}
+        graphs = FrameGraphs(surfels[0].device, len(surfels))
+        for each in surfels:
+            _graphs[each] = graphs
     for dropped in before.values():
-        dropped.clear()  # nobody else would: the frames refer to it, so that it would stay until garbage is collected
+        dropped.clear()  # it and its frames refer to each other, so that only the garbage collector would free them
 
 
 def render_by_graph(request: FrameRequest) -> Rendering | None:

@@ -171,7 +171,7 @@ class Model(nn.Module):
     def render_image(
         self, camera: Camera, *, background: Color | None = None, **changes: Unpack[RenderChanges]
     ) -> torch.Tensor:
-        """Return the image of `render` alone, never with gradients; many calls take less memory of a GPU than `render`.
+        """Return only the image of `render`, without gradients. On a GPU, the other buffers do not stay in memory.
 
         Args:
             camera: see `render`; one `Camera`, neither several nor a `RayCamera`.
