@@ -41,6 +41,7 @@ CPU = torch.device("cpu")
 CONFIG = Config(
     iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)
 )
+OWN = {"count": 2, "iterations": 4, "max_surfels": 240}
 SETTINGS = ("texture.table_size=1024", "texture.levels=4", "exposures=false")
 SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS for text in ("--set", each))]
 
@@ -56,8 +57,8 @@ def same(one: Model, other: Model) -> bool:
         ({}, 21, 2),
         ({}, 64, 2),
         ({}, 65, 0),  # photos are many
-        ({"max_surfels": 25_200}, 42, 2),
-        ({"max_surfels": 25_200}, 43, 0),  # surfels are few for them
+        ({"max_surfels": 12_600}, 42, 2),
+        ({"max_surfels": 12_600}, 43, 0),  # surfels are few for them
         ({"iterations": 60_000}, 21, 2),
         ({"iterations": 29_999}, 21, 0),  # the run is short
         ({"refine_poses": True}, 21, 0),
@@ -101,6 +102,17 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
         assert each == dataclasses.replace(config, teachers=0, iterations=each.iterations, seed=each.seed)
 
 
+@pytest.mark.parametrize(
+    ("budget", "teachers"), [(60, 240), (9_999, 39_996), (10_000, 40_000), (39_999, 40_000), (40_001, 40_001)]
+)
+def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> None:
+    config = Config(max_surfels=budget, teachers=2)
+    stages = divide(config, plan_teachers(config, 20))
+    assert {each.max_surfels for each in stages.teachers} == {teachers} and stages.student.max_surfels == budget
+    # As in a run from before.
+    assert {each.max_surfels for each in divide(config, OwnTeachers(2, 10)).teachers} == {budget}
+
+
 def test_seeds_of_teachers_follow_from_the_runs() -> None:
     def seeds(seed: int) -> list[int]:
         return [each.seed for each in divide(Config(seed=seed), OwnTeachers(2, 10)).teachers]
@@ -131,7 +143,7 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
 
     found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
     assert seen == [*range(1, 21)]
-    stages = divide(CONFIG, OwnTeachers(2, 4))
+    stages = divide(CONFIG, OwnTeachers(2, 4, 240))
     files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
     teachers = [nw.load(file) for file in files]
     assert same(found, nw.train(tiny_scene, stages.student, device=CPU, teachers=teachers))
@@ -168,7 +180,7 @@ def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list
     scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
     found = nw.train(scene, config, device=CPU)
     assert len(calibrations) == 1 and found.exposures is not None
-    stages = divide(config, OwnTeachers(2, 4))
+    stages = divide(config, OwnTeachers(2, 4, 240))
     files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
     assert same(found, nw.train(scene, stages.student, device=CPU, teachers=map(nw.load, files)))
 
@@ -211,7 +223,7 @@ def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, run)
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["iterations"] == 20 and metrics["teachers"] == 2 and "psnr" in metrics
-    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == {"count": 2, "iterations": 4}
+    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == OWN
     seeds, spent = {0}, 0.0
     for folder in (run / "teachers" / "1", run / "teachers" / "2"):
         facts = json.loads((folder / "metrics.json").read_text())
@@ -294,7 +306,7 @@ def test_a_longer_run_keeps_its_teachers(
     assert command(run, "--resume", iterations=30) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
     assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
-    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == {"count": 2, "iterations": 4}
+    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == OWN
     model = model_of(run)
     (run / "model.safetensors").unlink()
     assert command(run, "--resume", iterations=30) == 0
@@ -410,7 +422,7 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
 ) -> None:
     """Although --iterations has grown before they were complete."""
     run = tmp_path / "run"
-    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4))
+    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4, 240))
     assert command(run, "--resume", iterations=30) == 0
     for number in "12":
         assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
@@ -420,7 +432,7 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
 def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
     """Of the training alone; a resumed run finds them by these."""
     scene = dataclasses.replace(tiny_scene, test=[])
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
     create_run(run, source, CONFIG, "cpu", own=own)
     models = []
     for resume in (False, True):
@@ -447,7 +459,7 @@ def test_weights_and_biases_gets_the_runs_settings(
         def close(self) -> None: ...
 
     monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
     create_run(run, source, CONFIG, "cpu", own=own)
     session = StagedSession(
         tiny_scene, CONFIG, own, run, source, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"]
@@ -467,6 +479,8 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
         {"count": "2", "iterations": 4},
         {"count": 9, "iterations": 4},
         {"count": 2, "iterations": 0},
+        {"count": 2, "iterations": 4, "max_surfels": 0},
+        {"count": 2, "iterations": 4, "max_surfels": "240"},
         {"count": 2, "iterations": 10},  # all that the run has
         [2, 4],
     ):
@@ -476,7 +490,7 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
             read_run(run)
     data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
     (run / "config.json").write_text(json.dumps(data))
-    assert read_own_teachers(run) == OwnTeachers(2, 4)
+    assert read_own_teachers(run) == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
 
 
 def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -491,8 +505,8 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     drawn: list[object] = []
     console = Console(quiet=True)
     source, run = SceneSource(str(tiny_scene.path)), tmp_path / "run"
-    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4), run, source, console, Ranks.alone(CPU))
-    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4))
+    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4, 240), run, source, console, Ranks.alone(CPU))
+    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4, 240))
     session.train(Shown())  # type: ignore[arg-type]
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
 
@@ -504,10 +518,15 @@ def test_the_benchmark_trains_teachers_first(
     row = Row("two", settings={"teachers": 2})
     job = TrainingJob(tiny_folder.name, "", "two", 60, 3, 20)
     result = run_job(job, tiny_folder.parent, row, models=tmp_path)
-    assert result["teachers"] == {"count": 2, "surfels": 30} and result["iterations"] == 20  # half of the budget
+    assert result["teachers"] == {"count": 2, "surfels": 120, "max_surfels": 240}  # half of the budget
+    assert result["iterations"] == 20
     config = config_of(job, row)
     assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
-    assert not trained_with(result | {"teachers": {"count": 2, "surfels": 61}}, config), "larger than the student"
+    for older in ({"count": 2}, {"count": 2, "surfels": 60}, {"count": 2, "max_surfels": 60}):
+        assert not trained_with(result | {"teachers": older}, config), "as large as the student"
+    large = dataclasses.replace(config, max_surfels=60_000)
+    for today in ({"count": 2}, {"count": 2, "surfels": 60_000}, {"count": 2, "surfels": 9, "max_surfels": 60_000}):
+        assert trained_with({"teachers": today, "config": config_name(large)}, large), "as large as the student"
     assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))
     (file,) = tmp_path.iterdir()
     expected = nw.train(scene_of(job, tiny_folder.parent), config, device=CPU)
@@ -540,11 +559,8 @@ def test_the_benchmark_asks_for_the_scenes_teachers() -> None:
         for scene in PHOTOS
         for size in (10_000, 20_000, 40_000)
     }
-    assert [scene for (scene, size), count in counts.items() if size == 10_000 and count] == []
-    assert [scene for (scene, size), count in counts.items() if size == 20_000 and count] == ["saharov", "kitchen25"]
-    assert [scene for (scene, size), count in counts.items() if size == 40_000 and count] == [
-        "fox",
-        "saharov",
-        "kitchen25",
-    ]
+    assert [scene for (scene, size), count in counts.items() if size == 10_000 and count] == ["saharov", "kitchen25"]
+    for large in (20_000, 40_000):
+        taught = [scene for (scene, size), count in counts.items() if size == large and count]
+        assert taught == ["fox", "saharov", "kitchen25"]
     assert config_of(TrainingJob("fox", "", "paper", 40_000, 0, 30_000), PAPER).teachers == 0

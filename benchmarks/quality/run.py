@@ -31,7 +31,7 @@ from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.schedules import MOTION_RATES, POSE_RATES
-from nexwarp.train.stages import student_trainer
+from nexwarp.train.stages import plan_teachers, student_trainer
 from nexwarp.train.step_losses import POSE_PRIOR
 from nexwarp.train.trainer import Trainer
 
@@ -127,6 +127,8 @@ def run_job(
         config = config_of(job, row)
         trained = _train_nexwarp(job, scene, lambda: trainer(scene, config, device), models, start)
         trained.facts["config"] = config_name(config)
+        if "teachers" in trained.facts:
+            trained.facts["teachers"]["max_surfels"] = plan_teachers(config, len(scene.train)).max_surfels
     peak = _peak("peak_mib", device)
     views = _compare(job, trained.renderings, pictures)
     coded = _compare(job, trained.compact, None)
@@ -160,7 +162,7 @@ def config_name(config: Config) -> str:
     settings = {name: value for name, value in config.as_dict().items() if name != "seed"} | {"clamp_image": True}
     if not config.skybox:
         del settings["skybox"]
-    del settings["teachers"]  # `trained_with` compares their number
+    del settings["teachers"]  # `trained_with` compares them
     settings["losses"] |= {"poses": POSE_PRIOR}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
@@ -168,12 +170,13 @@ def config_name(config: Config) -> str:
 
 
 def trained_with(result: Mapping[str, Any], config: Config) -> bool:
-    """Whether a result of nexwarp has these settings, whatever the seed, and as many teachers, of at most its budget.
+    """Whether a result of nexwarp has these settings, whatever the seed, and the teachers that they lead to today.
 
-    Teachers whose size is not in the result had the student's budget.
+    Teachers whose budget is not in the result had the student's.
     """
-    teachers = result.get("teachers") or {}
-    alike = teachers.get("count", 0) == (config.teachers or 0) and teachers.get("surfels", 0) <= config.max_surfels
+    teachers, own = result.get("teachers") or {}, plan_teachers(config, 1)
+    budget = teachers.get("max_surfels", max(teachers.get("surfels", 0), config.max_surfels))
+    alike = teachers.get("count", 0) == own.count and (own.count == 0 or budget == own.max_surfels)
     return result.get("config") == config_name(config) and alike
 
 

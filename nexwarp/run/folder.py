@@ -283,15 +283,20 @@ def _own_teachers(data: Mapping[str, Json]) -> OwnTeachers:
     own = data.get("own_teachers", dataclasses.asdict(NO_TEACHERS))
     if not isinstance(own, dict):
         raise ValueError(f"own_teachers: expected an object, got {own!r:.60}")
-    count, iterations = own.get("count"), own.get("iterations")
+    # Teachers of a run from before they had a budget of their own have the run's.
+    count, iterations, surfels = own.get("count"), own.get("iterations"), own.get("max_surfels")
     if (
         type(count) is not int
         or type(iterations) is not int
+        or not (surfels is None or type(surfels) is int)
         or not 0 <= count <= MOST_TEACHERS
         or iterations < min(count, 1)
+        or (surfels is not None and surfels < 1)
     ):
-        raise ValueError(f"own_teachers: expected a count of 0 to {MOST_TEACHERS} and iterations, got {own!r:.60}")
-    return OwnTeachers(count, iterations)
+        raise ValueError(
+            f"own_teachers: expected a count of 0 to {MOST_TEACHERS}, iterations and max_surfels, got {own!r:.60}"
+        )
+    return OwnTeachers(count, iterations, surfels)
 
 
 def is_run(folder: Path) -> bool:

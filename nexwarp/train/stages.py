@@ -27,8 +27,11 @@ from nexwarp.train.trainer import Trainer
 # between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
-SURFELS_A_PHOTO = 600
+SURFELS_A_PHOTO = 300
 SHARE = 0.4  # of the iterations that the teachers have together
+# Teachers of a small student have more surfels than it, so that what it learns from is better than what it can become.
+TEACHER_SURFELS = 40_000
+TEACHER_TIMES = 4  # at most so many times the student's
 STREAM = 3  # series of seeds, as `derived_seed` counts them
 
 
@@ -39,10 +42,12 @@ class OwnTeachers:
     Attributes:
         count: how many.
         iterations: of each.
+        max_surfels: of each; None is the student's.
     """
 
     count: int
     iterations: int
+    max_surfels: int | None = None
 
 
 NO_TEACHERS = OwnTeachers(0, 0)
@@ -81,8 +86,9 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
         config: of the run.
         photos: number of training photos.
     """
-    count = teacher_count(config, photos)
-    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1)) if count else NO_TEACHERS
+    count, most = teacher_count(config, photos), config.max_surfels
+    surfels = max(most, min(TEACHER_TIMES * most, TEACHER_SURFELS))
+    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels) if count else NO_TEACHERS
 
 
 def divide(config: Config, own: OwnTeachers) -> Stages:
@@ -96,7 +102,11 @@ def divide(config: Config, own: OwnTeachers) -> Stages:
         raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
     # Seeds of settings have 32 bits.
     seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
-    teachers = (dataclasses.replace(config, seed=seed, iterations=own.iterations, teachers=0) for seed in seeds)
+    surfels = own.max_surfels or config.max_surfels
+    teachers = (
+        dataclasses.replace(config, seed=seed, iterations=own.iterations, max_surfels=surfels, teachers=0)
+        for seed in seeds
+    )
     return Stages(tuple(teachers), dataclasses.replace(config, iterations=config.iterations - taken, teachers=0))
 
 
