@@ -22,14 +22,14 @@ from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
 # Where a run decides, it has teachers if photos are few and surfels many for them. The bounds are guesses: with 18 to
-# 37 photos and at least 830 surfels a photo no scene lost PSNR on the mean of its trainings. With 270 to 560 fox lost
-# up to 0.13 dB, the others gained up to 0.39, and FLIP was worse in each pair; with 230 photos a training lost. Nothing
-# between was tried, nor fewer than 30,000 steps at full size.
+# 37 photos and at least 420 surfels a photo no scene lost PSNR on the mean of its pairs; with 230 photos a training
+# lost. Nothing between was tried, nor fewer than 30,000 steps at full size.
 TEACHERS = 2
 MOST_PHOTOS = 64
 SURFELS_A_PHOTO = 300
 SHARE = 0.4  # of the iterations that the teachers have together
-# Teachers of a small student have more surfels than it, so that what it learns from is better than what it can become.
+# Teachers of a small student have more surfels than it: what it learns from is then better than what it can become.
+# With as many as the student 10,000 surfels gained less on all four folds, and FLIP was worse than without teachers.
 TEACHER_SURFELS = 40_000
 TEACHER_TIMES = 4  # at most so many times the student's
 STREAM = 3  # series of seeds, as `derived_seed` counts them
