@@ -77,7 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
         job = TrainingJob(scene, given.variant, row, given.size, given.seed, given.iterations, given.downscale)
         teachers, seconds = train_teachers(job, given.data, given.teachers, given.teacher_iterations, size)
         result = run_job(job, given.data, DEFAULT, trainer=partial(student_trainer, teachers=teachers))
-        result |= {"teachers": {"count": given.teachers, "iterations": given.teacher_iterations, "seconds": seconds}}
+        facts = {"count": given.teachers, "iterations": given.teacher_iterations, "max_surfels": size}
+        result |= {"teachers": facts | {"seconds": seconds}}
         with given.out.open("a", encoding="utf-8") as file:
             file.write(json.dumps(result) + "\n")
         print(result_line(job, result), flush=True)

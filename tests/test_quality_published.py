@@ -16,11 +16,10 @@ from benchmarks.quality.results import Results, read_results
 from benchmarks.quality.rows import GSPLAT, ROWS
 from benchmarks.quality.run import config_name, sources_digest
 from benchmarks.timing import ROOT
-from nexwarp.train.stages import plan_teachers
 
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
-# Commits with the settings and the arithmetic of today's default: `trained_with` refuses results of other teachers.
+# Commits whose kept results have the settings and the arithmetic of today's default.
 SAME = {"55fc7bc", "0e1a112", "92d09bb", "e4bdad5", "aade3ba", "7c85264"}
 OLDER = False  # True while the tables are of a default with other settings than today's
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
@@ -30,10 +29,9 @@ def line(scene: str, row: str, size: int, psnr: float, seed: int = 0, **changes:
     job = TrainingJob(scene, "", row, size, seed, 30_000)
     preset = ROWS[row].preset
     trained = None if preset is None else config_of(job, ROWS[row])
-    config: dict[str, object] = {}
-    if trained is not None:
-        own = plan_teachers(trained, 1)
-        config = {"config": config_name(trained), "teachers": {"count": own.count, "max_surfels": own.max_surfels}}
+    config: dict[str, object] = {} if trained is None else {"config": config_name(trained)}
+    if trained is not None and trained.teachers:
+        config["teachers"] = {"count": 2, "max_surfels": max(size, 40_000)}
     figures: dict[str, object] = {"psnr": psnr, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0}
     facts: dict[str, object] = {"commit": "abc", "date": "2026-11-25", "device": "H200", "seconds": 5.0, "settings": {}}
     compact = {"psnr": psnr - 0.5, "ssim": 0.8, "flip": 0.2, "megabytes": 1.0}
@@ -133,6 +131,10 @@ def test_results_of_two_defaults_are_not_mixed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"fox default 40000 seed 0 \(abc\): expected the settings of today, got"):
         of_one_default([read([line("fox", "default", 40_000, 32.0, config="other")], tmp_path / "y.jsonl")])
     assert len(of_one_default([read_results([tmp_path / "y.jsonl"])], older=True)) == 1
+    for teachers in (None, {"count": 2}):  # teachers of an older default were missing, or as large as the student
+        other = line("saharov", "default", 20_000, 22.0, teachers=teachers)
+        with pytest.raises(ValueError, match=r"saharov default 20000 seed 0 \(abc\): expected the settings of today"):
+            of_one_default([read([other], tmp_path / "t.jsonl")])
     mixed = [line("fox", "default", 40_000, 32.0, seed, config=config) for seed, config in enumerate(("one", "other"))]
     with pytest.raises(ValueError, match=r"seed 1 .*: expected the settings of other trainings of the row, got"):
         of_one_default([read(mixed, tmp_path / "m.jsonl")], older=True)

@@ -22,7 +22,7 @@ from nexwarp.cli import main as cli
 from nexwarp.cli.staged_session import StagedSession
 from nexwarp.data import write_demo
 from nexwarp.distributed.ranks import Ranks
-from nexwarp.errors import SettingError
+from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
 from nexwarp.run.evaluate import METRICS
 from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
@@ -229,7 +229,7 @@ def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
         facts = json.loads((folder / "metrics.json").read_text())
         assert facts["iterations"] == 4 and "psnr" not in facts and not has_checkpoint(folder)
         config = read_run(folder)[1]
-        assert config.iterations == 4 and config.teachers == 0
+        assert (config.iterations, config.max_surfels, config.teachers) == (4, 240, 0)
         seeds, spent = seeds | {config.seed}, spent + facts["seconds"]
         assert cli.main(["eval", str(folder), "--device", "cpu"]) == 0
         assert "psnr" in json.loads((folder / "metrics.json").read_text())
@@ -260,7 +260,7 @@ def test_a_run_resumes_in_each_stage(
     assert model_of(run) == model_of(finished)
     told = capsys.readouterr().out
     for number in (1, 2):
-        assert (f"teacher {number} of 2: 4 iterations" in told) == (number >= first)
+        assert (f"teacher {number} of 2: 4 iterations, at most 240 surfels, seed" in told) == (number >= first)
         assert (run / "teachers" / str(number) / "metrics.json").is_file()
     after = [(run / "teachers" / str(number) / "model.safetensors").stat().st_mtime_ns for number in range(1, first)]
     assert after == before
@@ -429,6 +429,50 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
 
 
+def test_an_older_run_keeps_teachers_of_its_own_budget(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """Its config.json does not say how large they are; it resumes with the teacher that is complete."""
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    source, config = read_run(finished)[:2]
+    create_run(whole, source, config, "cpu", own=OwnTeachers(2, 4))
+    data = json.loads((whole / "config.json").read_text())
+    del data["own_teachers"]["max_surfels"]
+    (whole / "config.json").write_text(json.dumps(data))
+    shutil.copytree(whole, run)
+    assert command(whole, "--resume") == 0
+    shutil.copytree(whole / "teachers" / "1", run / "teachers" / "1")
+    assert command(run, "--resume") == 0
+    assert {read_run(run / "teachers" / name)[1].max_surfels for name in "12"} == {60}
+    assert model_of(run) == model_of(whole) != model_of(finished)
+
+
+@pytest.mark.parametrize("api", [True, False])
+def test_memory_that_a_teacher_lacks_is_told_as_its_own(
+    command: Callable[..., int],
+    tiny_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    api: bool,
+) -> None:
+    """Its budget is not that of the run, so that lowering this may not help."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. And more")
+
+    monkeypatch.setattr("nexwarp.model.model.render", fail)
+    if api:
+        with pytest.raises(OutOfMemoryError) as caught:
+            nw.train(tiny_scene, CONFIG, device=CPU)
+        told = str(caught.value)
+    else:
+        assert command(tmp_path / "run") == 2
+        told = capsys.readouterr().err.removeprefix("nexwarp: error: ").strip()
+    assert told.startswith("teacher 1 of 2: out of memory at iteration 1: it needed 2.50 GiB")
+    assert "--max-surfels (now 240)" in told and told.endswith(", or do without teachers (--set teachers=0)")
+
+
 def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
     """Of the training alone; a resumed run finds them by these."""
     scene = dataclasses.replace(tiny_scene, test=[])
@@ -479,7 +523,7 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
         {"count": "2", "iterations": 4},
         {"count": 9, "iterations": 4},
         {"count": 2, "iterations": 0},
-        {"count": 2, "iterations": 4, "max_surfels": 0},
+        {"count": 2, "iterations": 4, "max_surfels": 15},
         {"count": 2, "iterations": 4, "max_surfels": "240"},
         {"count": 2, "iterations": 10},  # all that the run has
         [2, 4],
@@ -524,6 +568,9 @@ def test_the_benchmark_trains_teachers_first(
     assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
     for older in ({"count": 2}, {"count": 2, "surfels": 60}, {"count": 2, "max_surfels": 60}):
         assert not trained_with(result | {"teachers": older}, config), "as large as the student"
+    unknown = dataclasses.replace(config, teachers=None, iterations=30_000, max_surfels=10_000)  # number of photos
+    found = [{}, {"teachers": {"count": 2, "max_surfels": 40_000}}, {"teachers": {"count": 2}}]
+    assert [trained_with(each | {"config": config_name(unknown)}, unknown) for each in found] == [True, True, False]
     large = dataclasses.replace(config, max_surfels=60_000)
     for today in ({"count": 2}, {"count": 2, "surfels": 60_000}, {"count": 2, "surfels": 9, "max_surfels": 60_000}):
         assert trained_with({"teachers": today, "config": config_name(large)}, large), "as large as the student"

@@ -283,9 +283,10 @@ def test_the_benchmarks_line_names_the_teachers(
     assert main([*command, "2"]) == 0
     line = json.loads(out.read_text())
     assert (line["row"], line["iterations"], line["seed"]) == ("2 teachers of 8", 10, 3)
-    assert line["teachers"]["count"] == 2 and line["teachers"]["seconds"] > 0
+    assert (line["teachers"]["count"], line["teachers"]["max_surfels"]) == (2, 60) and line["teachers"]["seconds"] > 0
     assert main([*command, "1", "--teacher-size", "70"]) == 0
-    assert json.loads(out.read_text().splitlines()[1])["row"] == "1 teachers of 8, 70 surfels"
+    second = json.loads(out.read_text().splitlines()[1])
+    assert (second["row"], second["teachers"]["max_surfels"]) == ("1 teachers of 8, 70 surfels", 70)
     with pytest.raises(SystemExit):
         main([*command, "0"])
     assert "--teachers: expected at least one, got 0" in capsys.readouterr().err

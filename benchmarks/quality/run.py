@@ -127,8 +127,9 @@ def run_job(
         config = config_of(job, row)
         trained = _train_nexwarp(job, scene, lambda: trainer(scene, config, device), models, start)
         trained.facts["config"] = config_name(config)
-        if "teachers" in trained.facts:
-            trained.facts["teachers"]["max_surfels"] = plan_teachers(config, len(scene.train)).max_surfels
+        own = plan_teachers(config, len(scene.train))
+        if own.count and "teachers" in trained.facts:
+            trained.facts["teachers"]["max_surfels"] = own.max_surfels
     peak = _peak("peak_mib", device)
     views = _compare(job, trained.renderings, pictures)
     coded = _compare(job, trained.compact, None)
@@ -172,11 +173,16 @@ def config_name(config: Config) -> str:
 def trained_with(result: Mapping[str, Any], config: Config) -> bool:
     """Whether a result of nexwarp has these settings, whatever the seed, and the teachers that they lead to today.
 
-    Teachers whose budget is not in the result had the student's.
+    Where the settings leave the number of teachers to the run, none is as good as what few photos lead to. Teachers
+    whose budget is not in the result had the student's.
     """
     teachers, own = result.get("teachers") or {}, plan_teachers(config, 1)
-    budget = teachers.get("max_surfels", max(teachers.get("surfels", 0), config.max_surfels))
-    alike = teachers.get("count", 0) == own.count and (own.count == 0 or budget == own.max_surfels)
+    count = teachers.get("count", 0)
+    if count == 0:
+        alike = not config.teachers
+    else:
+        budget = teachers.get("max_surfels", max(teachers.get("surfels", 0), config.max_surfels))
+        alike = (count, budget) == (own.count, own.max_surfels)
     return result.get("config") == config_name(config) and alike
 
 

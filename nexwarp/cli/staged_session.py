@@ -19,7 +19,7 @@ from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import CalibrateOnce
 from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.stages import OwnTeachers, divide
+from nexwarp.train.stages import OwnTeachers, divide, training_teacher
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -92,7 +92,8 @@ class StagedSession:
         while self.session.stage.teacher:
             if self.ranks.first and not (self.resume and is_run(self.session.run)):
                 create_run(self.session.run, self.source, self.trainer.config, self.ranks.device.type)
-            self.session.train(viewer)
+            with training_teacher(len(self.models) + 1, len(self.stages.teachers)):
+                self.session.train(viewer)
             self.models.append(self.session.finish())
             self.seconds += self.trainer.seconds
             if self.ranks.first:
@@ -131,7 +132,8 @@ class StagedSession:
         """Say which of several trainings comes."""
         if self.stages.teachers:
             config = self.trainer.config
-            self.console.print(f"{self.session.stage.name}: {config.iterations:,} iterations, seed {config.seed}")
+            told = f"{config.iterations:,} iterations, at most {config.max_surfels:,} surfels, seed {config.seed}"
+            self.console.print(f"{self.session.stage.name}: {told}")
 
     def _take_complete(self) -> bool:
         """Take the next teacher if it is complete; return whether it is."""

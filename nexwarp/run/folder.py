@@ -28,7 +28,7 @@ from nexwarp.run.contents import (
     teacher_folders,
 )
 from nexwarp.run.lock import locked_run
-from nexwarp.train.config import MOST_TEACHERS, Config
+from nexwarp.train.config import MIN_SURFELS, MOST_TEACHERS, Config
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 
@@ -291,11 +291,10 @@ def _own_teachers(data: Mapping[str, Json]) -> OwnTeachers:
         or not (surfels is None or type(surfels) is int)
         or not 0 <= count <= MOST_TEACHERS
         or iterations < min(count, 1)
-        or (surfels is not None and surfels < 1)
+        or (surfels is not None and surfels < MIN_SURFELS)
     ):
-        raise ValueError(
-            f"own_teachers: expected a count of 0 to {MOST_TEACHERS}, iterations and max_surfels, got {own!r:.60}"
-        )
+        expected = f"a count of 0 to {MOST_TEACHERS}, iterations, and max_surfels of at least {MIN_SURFELS}"
+        raise ValueError(f"own_teachers: expected {expected}, got {own!r:.60}")
     return OwnTeachers(count, iterations, surfels)
 
 
