@@ -67,7 +67,7 @@ def test_the_first_cell_finds_the_helper_from_any_folder(tmp_path: Path) -> None
     (setup,) = first
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for folder in (tmp_path, ROOT, FOLDER):
-        # Found, not imported: that takes 4 s each time, and the notebooks do it.
+        # It is only looked for: an import takes 4 s, and the notebooks import it.
         command = [sys.executable, "-c", f"{setup}\nprint(importlib.util.find_spec('figures').origin)"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         assert (done.stdout, done.stderr) == (f"{FOLDER / 'figures.py'}\n", ""), folder

@@ -173,7 +173,7 @@ def config_name(config: Config) -> str:
 def trained_with(result: Mapping[str, Any], config: Config) -> bool:
     """Whether a result of nexwarp has these settings, whatever the seed, and the teachers that they lead to today.
 
-    Where the settings leave the number of teachers to the run, none is as good as what few photos lead to. Teachers
+    Where `config.teachers` is None, the number of photos is not known: a result without teachers counts, too. Teachers
     whose budget is not in the result had the student's.
     """
     teachers, own = result.get("teachers") or {}, plan_teachers(config, 1)

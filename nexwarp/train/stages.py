@@ -113,7 +113,7 @@ def divide(config: Config, own: OwnTeachers) -> Stages:
 
 @contextmanager
 def training_teacher(number: int, count: int) -> Iterator[None]:
-    """Let an error of memory say that a teacher needed it, whose budget is not the run's.
+    """Name the teacher in an OutOfMemoryError of its training, and say how to train without teachers.
 
     Args:
         number: of the teacher, counted from 1.
