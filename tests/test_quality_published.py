@@ -20,7 +20,7 @@ from benchmarks.timing import ROOT
 EXPOSED = "gsplat MCMC, exposures"
 PAGES = ("docs/quality.md", "README.md")
 # Commits whose kept results have the settings and the arithmetic of today's default.
-SAME = {"55fc7bc", "0e1a112", "92d09bb", "e4bdad5", "aade3ba", "7c85264"}
+SAME = {"55fc7bc", "0e1a112", "92d09bb", "e4bdad5", "aade3ba", "7c85264", "cf10875"}
 OLDER = False  # True while the tables are of a default with other settings than today's
 KEPT = ("quality", "quality_checks", "quality_peers", "quality_default")
 
@@ -53,22 +53,27 @@ def test_the_best_gsplat_row_of_each_scene_is_the_peer(tmp_path: Path) -> None:
         line("fox", "default", 40_000, 32.5),
         line("fox", "default", 40_000, 32.3, seed=1, ssim=0.92),
         line("fox", GSPLAT, 40_000, 31.5, commit="older"),
-        line("fox", EXPOSED, 40_000, 32.0, flip=0.12, commit="older"),
+        line("fox", EXPOSED, 40_000, 32.0, flip=0.12, commit="newer"),
         line("saharov", "default", 40_000, 22.0),
+        line("saharov", GSPLAT, 40_000, 20.0, commit="oldest"),
     ]
     tables = blocks(of_one_default([read(lines, tmp_path / "x.jsonl")]))
     rows = rows_of(tables["peers-40000"])
     assert rows["scene"][1:3] == ["gsplat MCMC as in its example", "and background, exposures"]
     two = "32.50 and 32.30, 0.9100, 0.1000"
     assert rows["fox"] == [two, "31.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1200", "+0.40 dB, +0.0100, -0.0200"]
-    assert rows["saharov"] == ["22.00, 0.9000, 0.1000", MISSING, MISSING, MISSING]
+    peer = ["20.00, 0.9000, 0.1000", MISSING, "+2.00 dB, +0.0000, +0.0000"]
+    assert rows["saharov"] == ["22.00, 0.9000, 0.1000", *peer]
     assert rows["train"] == [MISSING] * 4
-    assert "nexwarp H200, 2026-11-25, abc, seeds 0, 1; gsplat H200, 2026-11-25, older, seed 0" in tables["peers-40000"]
+    assert (
+        "nexwarp H200, 2026-11-25, abc, seeds 0, 1; gsplat H200, 2026-11-25, newer, older and oldest, seed 0"
+        in tables["peers-40000"]
+    )
     assert "Not run with 40,000: gsplat MCMC, background;" in tables["peers-40000"]
     readme = rows_of(tables["readme"])
     assert readme["fox"] == ["32.40", "0.9100", "0.1000", "2.0", "32.00", "0.9000", "0.1200", "2.0"]
     assert readme["kitchen25"] == [MISSING, "", "", ""] * 2
-    assert "scene: fox +0.40 dB." in tables["short"]
+    assert "scene: fox +0.40 dB, saharov +2.00 dB." in tables["short"]
 
 
 def test_three_seeds_are_a_mean_and_a_range() -> None:

@@ -62,6 +62,12 @@ def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
+def _listed(values: Iterable[str]) -> str:
+    """Return different values in their order: "a", "a and b", "a, b and c"."""
+    *most, last = sorted(set(values)) or [""]
+    return f"{', '.join(most)} and {last}" if most else last
+
+
 def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterable[str], short: bool = False) -> str:
     """Return the line below a table: command, devices, dates, and unless `short` commits and seeds of what it shows."""
     sizes, rows = set(sizes), set(rows)
@@ -74,7 +80,7 @@ def _measured(results: Results, tables: str, sizes: Iterable[int], rows: Iterabl
         of = {job: x for job, x in shown.items() if ROWS[job.row].preset == preset}
         if of:
             keys = ("device", "date") if short else ("device", "date", "commit")
-            named = ", ".join(" and ".join(sorted({str(x[key]) for x in of.values()})) for key in keys)
+            named = ", ".join(_listed(str(x[key]) for x in of.values()) for key in keys)
             seeds = sorted({job.seed for job in of})
             of_seeds = "" if short else f", seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
             facts.append(f"{kind} {named}{of_seeds}")
@@ -165,7 +171,7 @@ def _equal_seconds(alone: Results) -> str:
         cells = [f"{own['seconds']:.0f} s", figures([own]), f"{peer['seconds']:.0f} s", told, difference([own], [peer])]
         lines.append([scene, own["device"], *cells])
     header = ["scene", "GPU", "nexwarp", "30,000 iterations", "gsplat", "row, iterations", "difference"]
-    named = "; ".join(" and ".join(sorted({str(x[key]) for x in shown})) for key in ("date", "commit"))
+    named = "; ".join(_listed(str(x[key]) for x in shown) for key in ("date", "commit"))
     caption = f"*{'Measured' if shown else 'To be measured'} by* `python -m benchmarks.quality.equal_seconds`"
     return f"{_table(header, lines)}\n\n{caption}{': ' * bool(shown)}{named}."
 
