@@ -22,7 +22,7 @@ from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_til
 from nexwarp.kernels.rays import collect_rays_kernel, ray_list_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.tsdf import fuse_kernel
-from nexwarp.kernels.types import MAX_HITS, types
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE, types
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops._interop import array, launch
 from nexwarp.ops.expose import expose
@@ -118,6 +118,8 @@ def _jobs(device: torch.device, hits: Sequence[int], sizes: Sequence[tuple[int, 
     for (degree, features), clamp in itertools.product(enumerate(FEATURES), (False, True)):
         for fixed in fixed_points:
             yield partial(render, fixed, next(size), 2, degree=degree, features=features, clamp=clamp)
+    for degree in range(MAX_TEXTURE_SH_DEGREE + 1, MAX_SH_DEGREE + 1):
+        yield partial(render, False, next(size), 2, degree=degree)
     for width, height in sizes:
         yield partial(_losses, device, width, height)
         yield partial(render, False, (width, height), 2, surfels=0)
@@ -156,7 +158,9 @@ def _scene(device: torch.device, width: int, height: int, surfels: int) -> tuple
     means = uniform(surfels, 3, low=-1.5, high=1.5) + torch.tensor([0.0, 0.0, 1.5], device=device)
     quats = torch.randn(surfels, 4, generator=generator).to(device) + 1e-3
     opacities, gammas = uniform(surfels, low=0.05, high=1.0), uniform(surfels, 2, low=1.0, high=6.0)
-    made = nw.Surfels.from_activated(means, quats, scales, opacities, gammas, uniform(surfels, 16, 3, low=-0.5))
+    made = nw.Surfels.from_activated(
+        means, quats, scales, opacities, gammas, uniform(surfels, (MAX_SH_DEGREE + 1) ** 2, 3, low=-0.5)
+    )
     viewmat = torch.tensor([[0.8, 0.0, 0.6, 0.1], [0.0, 1.0, 0.0, 0.0], [-0.6, 0.0, 0.8, 1.0], [0.0, 0.0, 0.0, 1.0]])
     focal = float(max(width, height))
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
@@ -177,7 +181,7 @@ def _render(
 ) -> None:
     """Render an image, with all further buffers, and differentiate it with respect to everything."""
     made, camera = _scene(device, *size, surfels)
-    texture = nw.NeuralTexture(4, 2**8, features, 1.0, 6.0, 16, 1, degree).to(device)
+    texture = nw.NeuralTexture(4, 2**8, features, 1.0, 6.0, 16, 1, min(degree, MAX_TEXTURE_SH_DEGREE)).to(device)
     depths = 1.5 + torch.rand(2, surfels, generator=torch.Generator().manual_seed(0))
     limits = nw.DetailLimits(*(depths / camera.focal).to(device))
     background = torch.tensor([0.2, 0.5, 0.8], device=device, requires_grad=True)

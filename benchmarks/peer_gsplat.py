@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
+from nexwarp.checks import check_range
 from nexwarp.data import Scene
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.compact import decode, encode
@@ -36,9 +37,9 @@ CODED = {  # names of the coding of our model files
     "sh0": "surfels.sh0",
     "shN": "surfels.shN",
 }
-FLOATS = {"3dgs": 59, "2dgs": 58}  # a primitive: means 3, quats 4, scales 3 or 2, opacity 1, SH 48
+FLOATS = {"3dgs": 11, "2dgs": 10}  # a primitive without SH: means 3, quats 4, scales 3 or 2, opacity 1
 NEAR = {"3dgs": 0.01, "2dgs": 0.2}  # the examples' near planes, in the normalised frame
-SH_DEGREE = 3
+MOST_SH_DEGREE = 4  # gsplat evaluates no more
 SH_EVERY = 1000
 REFERENCE_ITERATIONS = 30_000
 
@@ -56,6 +57,7 @@ class PeerSettings:
             gate uses exposures.
         even_start: start at half the budget from points chosen by farthest point sampling, as we do.
         skybox: with `even_start`, as `Config.skybox`: some of these points lie on a sphere around the scene.
+        sh_degree: 0 to 4; the examples have 3.
     """
 
     primitive: str = "3dgs"
@@ -64,6 +66,7 @@ class PeerSettings:
     exposures: bool = False
     even_start: bool = False
     skybox: int = 0
+    sh_degree: int = 3
 
     def __post_init__(self) -> None:
         if self.primitive not in FLOATS:
@@ -72,6 +75,7 @@ class PeerSettings:
             raise ValueError(f"strategy: expected mcmc or default, got {self.strategy!r}")
         if self.primitive == "2dgs" and self.strategy == "mcmc":
             raise ValueError("strategy: expected default for 2dgs, got mcmc")
+        check_range("sh_degree", self.sh_degree, 0, MOST_SH_DEGREE)
 
 
 @dataclass
@@ -97,7 +101,13 @@ class Gaussians:
     @property
     def megabytes(self) -> float:
         """On disk as float32, 10^6 bytes."""
-        return len(self.splats["means"]) * FLOATS[self.primitive] * 4 / 1e6
+        floats = FLOATS[self.primitive] + 3 * (self.sh_degree + 1) ** 2
+        return len(self.splats["means"]) * floats * 4 / 1e6
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the colours."""
+        return math.isqrt(1 + self.splats["shN"].shape[1]) - 1
 
     def compact(self) -> tuple["Gaussians", int]:
         """Return the Gaussians as a file with the coding of our compact model files gives them, and its bytes."""
@@ -113,8 +123,13 @@ class Gaussians:
         image, _ = self.render(camera)
         return image if self.exposures is None else image * self.exposures.factors(camera)
 
-    def render(self, camera: Camera, degree: int = SH_DEGREE) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Return an image (H, W, 3), not clamped, and gsplat's intermediate results for its strategy."""
+    def render(self, camera: Camera, degree: int | None = None) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Return an image (H, W, 3), not clamped, and gsplat's intermediate results for its strategy.
+
+        Args:
+            camera: the view.
+            degree: SH degree to evaluate; None is that of the colours.
+        """
         from gsplat import rendering
 
         s = self.splats
@@ -132,7 +147,7 @@ class Gaussians:
             width=camera.width,
             height=camera.height,
             near_plane=NEAR[self.primitive],
-            sh_degree=degree,
+            sh_degree=self.sh_degree if degree is None else degree,
             packed=False,
             backgrounds=self.background[None],
         )
@@ -170,7 +185,7 @@ def train(
         order = order or torch.randperm(len(views)).tolist()
         index = order.pop()
         camera, photo = views.get(index, 1, order[:-3:-1])
-        degree = min(step // max(round(SH_EVERY * stretch), 1), SH_DEGREE)
+        degree = min(step // max(round(SH_EVERY * stretch), 1), settings.sh_degree)
         image, info = gaussians.render(camera, degree)
         control.before(step, info)
         exposure = views.exposure(index, 1)
@@ -261,14 +276,13 @@ def _initial(
     spacing = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float().clamp_min(1e-9)
     mcmc = settings.strategy == "mcmc"
     opacity = 0.5 if mcmc else 0.1
-    bands = (SH_DEGREE + 1) ** 2
     splats = {
         "means": points,
         "scales": (spacing * (0.1 if mcmc else 1.0)).log()[:, None].repeat(1, 3),  # 2DGS reads two of them
         "quats": torch.rand(len(points), 4),
         "opacities": torch.full((len(points),), math.log(opacity / (1 - opacity))),
         "sh0": ((colors - 0.5) / BAND_0)[:, None],
-        "shN": torch.zeros(len(points), bands - 1, 3),
+        "shN": torch.zeros(len(points), (settings.sh_degree + 1) ** 2 - 1, 3),
     }
     parameters = torch.nn.ParameterDict({name: torch.nn.Parameter(x.contiguous()) for name, x in splats.items()})
     background = torch.tensor(mean_color(scene.train, calibration) if settings.background else (0.0, 0.0, 0.0))

@@ -10,7 +10,7 @@ from nexwarp import ops
 from nexwarp.camera import Camera
 from nexwarp.checks import check_range, check_tensors
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.kernels.types import MAX_HITS
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.memory import keep_freed_memory, needed_memory
 from nexwarp.ops.tiles import Order, check_order
 from nexwarp.representation.background import Color, color_tensor
@@ -178,7 +178,7 @@ def render(
         max_hits: K, number of hits textured in each pixel, 0 to 8.
         background: a number, three numbers or a (3,) tensor, weighted by the final transmittance. The values of a CUDA
             tensor are not checked, which would wait for the GPU.
-        sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
+        sh_degree: largest SH degree of the plain colours, 0 to 6, and of the textured ones, which have 3 at most.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
         depth_jitter: for training, random shifts of the texture's points along their rays. A number is their standard
@@ -324,7 +324,7 @@ def _check_types(
         raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
     if texture is not None and not isinstance(texture, NeuralTexture):
         raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
-    for name, number, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, 3)):
+    for name, number, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, MAX_SH_DEGREE)):
         if isinstance(number, bool) or not isinstance(number, int):
             raise TypeError(f"{name}: expected an int, got {type(number).__name__}")
         check_range(name, number, 0, high)

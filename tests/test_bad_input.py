@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.kernels.types import MAX_SH_DEGREE
 from tests.scenes import (
     CAMERA_KEYS,
     SURFEL_KEYS,
@@ -138,9 +139,9 @@ def test_bad_surfels(argument: str, error: type[Exception], spoil: Callable[[Any
     assert_refused(error, argument, nw.Surfels.from_activated, **spoiled)
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16, 25, 36, 49])
 def test_surfels_take_any_degree(coefficients: int) -> None:
-    scene = random_scene(8)
+    scene = random_scene(8, sh_degree=MAX_SH_DEGREE)
     scene["sh"] = scene["sh"][:, :coefficients]
     assert make_surfels(scene).sh.shape == (8, coefficients, 3)
 
@@ -186,7 +187,7 @@ BAD_TEXTURES = [
     ("max_resolution", ValueError, float("inf")),
     ("width", ValueError, 0),
     ("hidden_layers", ValueError, -1),
-    ("sh_degree", ValueError, 4),
+    ("sh_degree", ValueError, 7),
     ("sh_degree", ValueError, -1),
 ]
 
@@ -212,7 +213,7 @@ BAD_RENDERS = [
     ("max_hits", ValueError, -1),
     ("max_hits", ValueError, 9),
     ("max_hits", TypeError, 1.5),
-    ("sh_degree", ValueError, 4),
+    ("sh_degree", ValueError, 7),
     ("sh_degree", ValueError, -1),
     ("sh_degree", TypeError, "3"),
     ("background", ValueError, (0.0, 0.0)),

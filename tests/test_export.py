@@ -41,7 +41,7 @@ def numbered(name: str, count: int) -> list[str]:
     return [f"{name}_{i}" for i in range(count)]
 
 
-@pytest.mark.parametrize("sh_degree", [0, 2, 3])
+@pytest.mark.parametrize("sh_degree", [0, 2, 3, 6])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_surfels_read_back_bit_for_bit(
     tmp_path: Path, sh_degree: int, dtype: torch.dtype, device: torch.device
@@ -89,7 +89,7 @@ def test_surfel_properties_as_another_program_sees_them(tmp_path: Path) -> None:
     assert_close(stack(columns, "nx", "ny", "nz"), axes[..., 2], kind="value", name="normal")
 
 
-@pytest.mark.parametrize("given", [0, 1, 3])
+@pytest.mark.parametrize("given", [0, 1, 3, 5])
 @pytest.mark.parametrize("kept", [0, 2, 3])
 def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> None:
     scene = random_scene(sh_degree=given)

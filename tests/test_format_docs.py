@@ -29,7 +29,7 @@ def run(tmp_path_factory, one_torch_thread: None) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
     expose_photos(scene)
-    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
+    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16", "sh_degree=6")
     flags = [x for change in changes for x in ("--set", change)]
     flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
     assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
@@ -78,7 +78,7 @@ def test_tensors(run):
     tensors, meta = header(run)
     rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
     shape = meta["texture"]
-    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "3": 3, "1": 1, "2": 2, "4": 4}
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 48, "3": 3, "1": 1, "2": 2, "4": 4}
     sizes |= {
         "V": len(json.loads((run / "cameras.json").read_text())["train"]),
         "L": shape["levels"],
@@ -144,13 +144,14 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         (True, {"exposure": "mean"}),
         (True, {"detail_limits": False}),
         (True, {"order": "distance"}),
+        (True, {"sh_degree": 3}),
         (None, {}),  # without a texture
     ):
         if residual is None:
             model.texture = None
         else:
             texture.residual = texture.config["residual"] = residual
-        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7)).changed(**changes)
+        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7), sh_degree=6).changed(**changes)
         file = model.save(tmp_path)
         stored = nw.load(file)
         tensors, meta = reader["read"](file)

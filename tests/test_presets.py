@@ -98,7 +98,7 @@ def test_settings_of_another_kind_are_refused(change):
         ("max_hits", 9),
         ("max_hits", -1),
         ("more_hits_from", -1),
-        ("sh_degree", 4),
+        ("sh_degree", 7),
     ],
 )
 def test_settings_out_of_range_are_refused(name, value):

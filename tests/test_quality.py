@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.peer_gsplat import PeerSettings
+from benchmarks.peer_gsplat import Gaussians, PeerSettings
 from benchmarks.quality.__main__ import main
 from benchmarks.quality.jobs import ARC_VIEWS, TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import read_results
@@ -301,3 +301,12 @@ def test_settings_of_the_peers_are_checked() -> None:
         PeerSettings(primitive="2dgs")
     with pytest.raises(ValueError, match="primitive: expected one of 3dgs, 2dgs, got '4dgs'"):
         PeerSettings(primitive="4dgs")
+    with pytest.raises(ValueError, match="sh_degree: expected at least 0 and at most 4, got 5"):
+        PeerSettings(sh_degree=5)
+
+
+@pytest.mark.parametrize(("degree", "megabytes"), [(3, 9.44), (4, 13.76)])
+def test_gaussians_count_their_sh(degree: int, megabytes: float) -> None:
+    splats = {"means": torch.zeros(40_000, 3), "shN": torch.zeros(40_000, (degree + 1) ** 2 - 1, 3)}
+    gaussians = Gaussians(torch.nn.ParameterDict(splats), torch.zeros(3), 1.0, "3dgs", torch.zeros(3))
+    assert gaussians.sh_degree == degree and gaussians.megabytes == pytest.approx(megabytes)

@@ -7,6 +7,7 @@ import pytest
 import scipy.special
 import torch
 
+from nexwarp.kernels.types import MAX_SH_DEGREE
 from tests.reference.collect import collect, power
 from tests.reference.hashgrid import encode, hash_corners, map_positive
 from tests.reference.render import Texture, render
@@ -63,18 +64,18 @@ def test_basis_is_the_real_form_of_scipys() -> None:
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     polar, azimuth = directions[:, 2].acos(), torch.atan2(directions[:, 1], directions[:, 0])
     columns = []
-    for degree in range(4):
+    for degree in range(MAX_SH_DEGREE + 1):
         for order in range(-degree, degree + 1):
             values = scipy.special.sph_harm_y(degree, abs(order), polar.numpy(), azimuth.numpy())
             part = values.imag if order < 0 else values.real
             columns.append(torch.as_tensor(part) * (math.sqrt(2) if order else 1))
-    assert_close(basis(directions, 3), torch.stack(columns, dim=-1), kind="value", name="basis")
+    assert_close(basis(directions, MAX_SH_DEGREE), torch.stack(columns, dim=-1), kind="value", name="basis")
 
 
 def test_lower_degrees_are_prefixes() -> None:
     directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=-1)
-    for degree in range(3):
-        assert torch.equal(basis(directions, degree), basis(directions, 3)[:, : (degree + 1) ** 2])
+    for degree in range(MAX_SH_DEGREE):
+        assert torch.equal(basis(directions, degree), basis(directions, MAX_SH_DEGREE)[:, : (degree + 1) ** 2])
 
 
 def test_plain_color_by_hand() -> None:

@@ -8,11 +8,12 @@ import torch
 
 from nexwarp import ops
 from nexwarp.kernels import launch
+from nexwarp.kernels.types import MAX_SH_DEGREE
 from tests.narrowing import present
 from tests.reference import sh as reference
 from tests.tolerances import assert_close
 
-DEGREES = list(itertools.product(range(4), range(4)))
+DEGREES = list(itertools.product(range(MAX_SH_DEGREE + 1), repeat=2))
 NAMES = ("sh0", "shN", "means", "position")
 Leaves = list[torch.Tensor]
 
@@ -117,10 +118,10 @@ def test_moving_the_camera_is_moving_the_surfels_the_other_way(device: torch.dev
     assert_close(grad_position, -grad_means.sum(0), kind="gradient", name="position")
 
 
-@pytest.mark.parametrize("stored", range(4))
+@pytest.mark.parametrize("stored", range(MAX_SH_DEGREE + 1))
 def test_gradcheck(stored: int, device: torch.device) -> None:
     leaves = make(6, stored, torch.float64, device)
-    assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), 3), leaves)
+    assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), MAX_SH_DEGREE), leaves)
 
 
 @pytest.mark.parametrize("wanted", NAMES)

@@ -167,11 +167,17 @@ def test_degrees_that_are_not_rendered_take_no_part(device: torch.device, degree
     assert torch.equal(shN[:, count - 1 :], surfels.shN[:, count - 1 :])
 
 
-def test_many_surfels_are_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_surfels_are_seen_and_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     surfels, views = make_surfels(random_scene(50, device=device)), around([0.0, 0.4])
-    whole = smooth_sh(nw.Model(surfels, None), views, 0.01)
-    monkeypatch.setattr("nexwarp.finish.sh_smoothing.SURFELS", 7)
-    for a, b in zip(smooth_sh(nw.Model(surfels, None), views, 0.01), whole, strict=True):
+    told: list[tuple[int, int]] = []
+    whole = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
+    assert told == [(1, 2), (2, 2)]
+    monkeypatch.setattr("nexwarp.finish.sh_smoothing.SOLVED", 7 * 16**2)
+    monkeypatch.setattr("nexwarp.finish.sh_smoothing.PRODUCTS", 20 * 16 * 17 // 2)
+    told.clear()
+    parts = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
+    assert told == [(done, 6) for done in range(1, 7)]  # 20, 20 and 10 surfels
+    for a, b in zip(parts, whole, strict=True):
         assert_close(a, b, kind="value", name="parts")
 
 

@@ -61,7 +61,7 @@ def finish_model(
     if settings.smooth_sh > 0:
         # Detail limits and brightness are the same whatever the order of threads.
         with deterministic(settings.deterministic and model.device.type == "cuda"):
-            sh0, shN = smooth_sh(finished, counted(views, "smoothing SH", observe), settings.smooth_sh)
+            sh0, shN = smooth_sh(finished, views, settings.smooth_sh, partial(observe, "smoothing SH"))
         finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
     if settings.detail_limits:
         seen = counted(cameras, "measuring detail limits", observe)

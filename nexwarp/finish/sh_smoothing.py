@@ -11,7 +11,7 @@ that view; Y the harmonics, before colours are clamped to >= 0; and D the Laplac
 l, divided by that of degree 3. The colours in the training views change little; all others become as even as possible.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -19,13 +19,16 @@ from nexwarp import ops
 from nexwarp.data import View
 from nexwarp.model.model import Model
 
-SURFELS = 2**13  # number of surfels whose equations are summed and solved at once: 2 kB each, several times
+PRODUCTS = 2**26  # values of the normal equations held at once, float64; more surfels take turns with the views
+SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # 0 is allowed too; less is lost in the harmonics' rounding
 
 
 @torch.no_grad()
-def smooth_sh(model: Model, views: Iterable[View], strength: float) -> tuple[torch.Tensor, torch.Tensor]:
+def smooth_sh(
+    model: Model, views: Sequence[View], strength: float, progress: Callable[[int, int], object] = lambda _, __: None
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3).
 
     A surfel that no view shows gets one colour for all directions, that of its `sh0`. Coefficients above the rendered
@@ -35,57 +38,80 @@ def smooth_sh(model: Model, views: Iterable[View], strength: float) -> tuple[tor
         model: its N surfels and options are used; it does not change.
         views: all training views, on any device; masked pixels do not count.
         strength: factor of the smoothness term, `MIN_STRENGTH` to `MAX_STRENGTH`; the data term has factor 1.
+        progress: called after each view that was rendered, with their number and how many there will be. Many surfels
+            of a high degree need each view more than once.
     """
     surfels = model.surfels
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
     count = _count(model)
     if count == 1 or not len(surfels):
         return sh0.clone(), shN.clone()
-    products, total = seen_directions(model, views)
-    row, column = _pairs(count, surfels.device)
-    degrees = torch.arange(count, device=surfels.device, dtype=torch.float64).sqrt().floor()
-    penalty = strength * (degrees * (degrees + 1) / 12).square()
     every = torch.cat([sh0, shN], dim=1)
     found = every[:, :count]
-    for part in torch.arange(len(surfels), device=surfels.device).split(SURFELS):
-        known = total[part] > LEAST
-        some = part[known]
-        left = products.new_zeros(len(some), count, count)
-        left[:, row, column] = left[:, column, row] = products[some] / total[some, None]
-        left += torch.diag(penalty)
-        # Of what is to be taken away, which is nothing where training views tell all.
-        rough = penalty[:, None] * found[some].double()
-        found[some] -= torch.linalg.solve(left, rough).to(found)
-        found[part[~known], 1:] = 0.0
+    turns = torch.arange(len(surfels), device=surfels.device).split(PRODUCTS // (count * (count + 1) // 2))
+    for turn, ids in enumerate(turns):
+
+        def done(number: int, before: int = turn * len(views)) -> None:
+            progress(before + number, len(turns) * len(views))
+
+        products, total = seen_directions(model, views, ids, done)
+        for part in torch.arange(len(ids), device=surfels.device).split(SOLVED // count**2):
+            known = total[part] > LEAST
+            _smooth(found, ids[part[known]], products[part[known]] / total[part[known], None], strength)
+            found[ids[part[~known]], 1:] = 0.0
     return every[:, :1].contiguous(), every[:, 1:].contiguous()
 
 
+def _smooth(coefficients: torch.Tensor, ids: torch.Tensor, equations: torch.Tensor, strength: float) -> None:
+    """Smooth some surfels' coefficients (N, C, 3) in place, given their normal equations, divided by their weight."""
+    count, device = coefficients.shape[1], coefficients.device
+    degrees = torch.arange(count, device=device, dtype=torch.float64).sqrt().floor()
+    penalty = strength * (degrees * (degrees + 1) / 12).square()
+    row, column = _pairs(count, device)
+    left = equations.new_zeros(len(ids), count, count)
+    left[:, row, column] = left[:, column, row] = equations
+    left += torch.diag(penalty)
+    # Of what is to be taken away, which is nothing where training views tell all.
+    rough = penalty[:, None] * coefficients[ids].double()
+    coefficients[ids] -= torch.linalg.solve(left, rough).to(coefficients)
+
+
 @torch.no_grad()
-def seen_directions(model: Model, views: Iterable[View]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the normal equations of the regression: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
+def seen_directions(
+    model: Model,
+    views: Sequence[View],
+    ids: torch.Tensor | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the normal equations of the regression: sum_v w_v Y_i(d_v) Y_j(d_v), (M, P), and sum_v w_v, (M,).
 
     Both are float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
 
     Args:
-        model: its N surfels and options are used. With C rendered coefficients per channel there are
+        model: its surfels and options are used. With C rendered coefficients per channel there are
             P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle.
         views: views v, on any device; masked pixels do not count.
+        ids: (M,) int64, surfels on their device; None is all N.
+        progress: called after each view, with its number, counted from 1.
     """
     bare = model.bare()
     surfels = bare.surfels
+    if ids is None:
+        ids = torch.arange(len(surfels), device=surfels.device)
     count = _count(model)
     row, column = _pairs(count, surfels.device)
-    products = torch.zeros(len(surfels), len(row), dtype=torch.float64, device=surfels.device)
-    total = products.new_zeros(len(surfels))
-    for view in views:
+    products = torch.zeros(len(ids), len(row), dtype=torch.float64, device=surfels.device)
+    total = products.new_zeros(len(ids))
+    for number, view in enumerate(views, 1):
         camera = view.camera.to(surfels.device)
         out = bare.render(camera)
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
-        weights = out.splat_error(counts).double()
-        for seen in weights.nonzero()[:, 0].split(SURFELS):
-            basis = _basis(surfels.means.detach()[seen], camera.position, count).double()
+        weights = out.splat_error(counts)[ids].double()
+        for seen in weights.nonzero()[:, 0].split(SOLVED // count**2):
+            basis = _basis(surfels.means.detach()[ids[seen]], camera.position, count).double()
             products[seen] += weights[seen, None] * basis[:, row] * basis[:, column]
         total += weights
+        progress(number)
     return products, total
 
 

@@ -38,7 +38,7 @@ from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
 from nexwarp.kernels.tiles import tile_polygon_kernel
-from nexwarp.kernels.types import MAX_HITS, types
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE, types
 from nexwarp.kernels.unproject import unproject_kernels
 
 
@@ -70,7 +70,7 @@ def thread_kernels(
     storage: type,
     tile_size: int,
     *,
-    degrees: Sequence[int] = range(4),
+    degrees: Sequence[int] = range(MAX_SH_DEGREE + 1),
     features: Sequence[int] = (1, 2, 4, 8),
     clamps: Sequence[bool] = (False, True),
     low_passes: Sequence[bool] = (False, True),
@@ -104,6 +104,8 @@ def thread_kernels(
     for degree in degrees:
         plain = plain_colors_kernels(real, degree)
         yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
+        if degree > MAX_TEXTURE_SH_DEGREE:
+            continue
         if cpu and simd and storage is real:
             yield from (mlp_simd_kernels(real, degree).forward, mlp_simd_kernels(real, degree).backward)
         for clamp in clamps if layered else ():

@@ -1,11 +1,13 @@
-"""Spherical harmonics colours of degree 0 to 3: plain and textured appearance (paper Sec. 4.1).
+"""Spherical harmonics colours: plain ones of degree 0 to 6, textured ones of degree 0 to 3 (paper Sec. 4.1).
 
 A thread is a surfel (plain) or a point (textured). Read: coefficients and directions. Written: colours; backward, the
 gradients of coefficients and directions, which `wp.grad` of the basis gives. Nothing is added up. A colour that was
-clamped to 0 has no gradient. Constants and signs are the field's.
+clamped to 0 has no gradient. Constants and signs are the field's. Degrees above 3 are not in the paper; recurrences
+give them, with the same signs.
 """
 
 import functools
+import math
 from types import SimpleNamespace
 
 import warp as wp
@@ -16,6 +18,19 @@ BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
 BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def first_factor(m: int) -> float:
+    """Return the normalised associated Legendre function of degree and order m over (1 - z^2)^(m / 2), a constant."""
+    product = math.prod((2 * j + 1) / (2 * j) for j in range(1, m + 1))
+    return (-1) ** m * math.sqrt(product * (2 if m else 1) / (4 * math.pi))
+
+
+def recurrence(degree: int, m: int) -> tuple[float, float]:
+    """Return a and b of P(degree) = a (z P(degree - 1) - b P(degree - 2)), of order m < degree, normalised."""
+    a = math.sqrt((4 * degree**2 - 1) / (degree**2 - m**2))
+    b = math.sqrt(((degree - 1) ** 2 - m**2) / (4 * (degree - 1) ** 2 - 1))
+    return a, b
 
 
 @functools.cache
@@ -55,6 +70,26 @@ def basis_function(real: type, degree: int) -> wp.Function:
             out[13] = -D2 * d[0] * (real(4.0) * z2 - x2 - y2)
             out[14] = D4 * d[2] * (x2 - y2)
             out[15] = -D0 * d[0] * (x2 - real(3.0) * y2)
+        if wp.static(degree >= 4):
+            cosine = real(1.0)  # times sin^m, of m times the azimuth
+            sine = real(0.0)
+            for m in range(wp.static(degree + 1)):
+                before = real(0.0)
+                value = wp.static(real(first_factor(m)))
+                for n in range(m, wp.static(degree + 1)):
+                    if wp.static(n > m):
+                        following = wp.static(real(recurrence(n, m)[0])) * (
+                            d[2] * value - wp.static(real(recurrence(n, m)[1])) * before
+                        )
+                        before = value
+                        value = following
+                    if wp.static(n >= 4):
+                        out[n * n + n + m] = value * cosine
+                        if wp.static(m > 0):
+                            out[n * n + n - m] = value * sine
+                turned = d[0] * cosine - d[1] * sine
+                sine = d[0] * sine + d[1] * cosine
+                cosine = turned
         return out
 
     return basis
@@ -72,6 +107,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     vec3 = types(real).vec3
     basis = basis_function(real, degree)
     count = (degree + 1) ** 2
+    options = {"max_unroll": max(count, 16)}  # else the basis is in memory, not in registers
     vec = wp.types.vector(length=count, dtype=real)
     # A surfel at the camera's very centre has no direction; it takes the forward one, without gradient.
     TINY = wp.constant(real(1e-12))
@@ -97,7 +133,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
                 out[c] = grad[c]
         return out
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def plain_colors(
         first: wp.int32,
         sh0: wp.array2d(dtype=vec3),
@@ -114,7 +150,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
             color += shN[i, k - 1] * b[k]
         colors[i] = wp.max(color, vec3())
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def plain_coefficients_backward(
         first: wp.int32,
         sharing: wp.int32,
@@ -140,7 +176,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
             else:
                 grad_shN[i, k - 1] = grad * value
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def plain_rays_backward(
         first: wp.int32,
         shN: wp.array2d(dtype=vec3),

@@ -9,7 +9,7 @@ from typing_extensions import Unpack
 
 from nexwarp.checks import check_range
 from nexwarp.io.files import one_line
-from nexwarp.kernels.types import MAX_HITS
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.ops.tiles import Order, check_order
 
 Exposure = Literal["photos", "mean"]
@@ -35,7 +35,7 @@ class RenderOptions:
     Attributes:
         max_hits: K, number of hits textured in each pixel, 0 to 8.
         background: sRGB colour behind the surfels, weighted by the final transmittance.
-        sh_degree: largest SH degree of the plain and the textured colours, 0 to 3.
+        sh_degree: largest SH degree of the plain colours, 0 to 6, and of the textured ones, which have 3 at most.
         low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
         exposure: "photos" predicts the gains from the training photos near the camera, and applies the falloff of their
@@ -59,7 +59,7 @@ class RenderOptions:
     order: Order = "depth"
 
     def __post_init__(self) -> None:
-        for name, high in (("max_hits", MAX_HITS), ("sh_degree", 3)):
+        for name, high in (("max_hits", MAX_HITS), ("sh_degree", MAX_SH_DEGREE)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int):
                 raise TypeError(f"{name}: expected an int, got {value!r:.60}")

@@ -12,7 +12,7 @@ import numpy as np
 from nexwarp.camera import Camera
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.io.files import one_line, write_atomically
-from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply
+from nexwarp.model.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply
 from nexwarp.representation.surfels import Surfels
 
 LARGEST_COORDINATE = 2047.0  # SPZ has 24 bits, 12 of them behind the point; values beyond would wrap around
@@ -23,7 +23,7 @@ ARRAYS = ("positions", "scales", "rotations", "alphas", "colors", "sh")
 def save_splats_spz(
     path: str | os.PathLike[str],
     surfels: Surfels,
-    sh_degree: int = 3,
+    sh_degree: int = SPLAT_DEGREE,
     *,
     cameras: Sequence[Camera] = (),
     max_extent: float = MAX_EXTENT,

@@ -27,7 +27,8 @@ MAX_EXTENT = 0.3
 THINNESS = 1e-3
 
 # Viewers expect the coefficients of SH degree 3.
-SPLAT_COEFFICIENTS = 16
+SPLAT_DEGREE = 3
+SPLAT_COEFFICIENTS = (SPLAT_DEGREE + 1) ** 2
 
 TYPES = {"float": np.dtype("<f4"), "float32": np.dtype("<f4"), "double": np.dtype("<f8"), "float64": np.dtype("<f8")}
 
@@ -61,7 +62,7 @@ def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
 def save_splats_ply(
     path: str | os.PathLike[str],
     surfels: Surfels,
-    sh_degree: int = 3,
+    sh_degree: int = SPLAT_DEGREE,
     *,
     cameras: Sequence[Camera] = (),
     max_extent: float = MAX_EXTENT,
@@ -87,7 +88,7 @@ def save_splats_ply(
         ValueError: `sh_degree` is out of its range, or `max_extent` is not > 0.
         OSError: `path` cannot be written.
     """
-    check_range("sh_degree", sh_degree, 0, 3)
+    check_range("sh_degree", sh_degree, 0, SPLAT_DEGREE)
     if not max_extent > 0:
         raise ValueError(f"max_extent: expected more than 0, got {max_extent}")
     raw = surfels.state_dict()

@@ -7,8 +7,10 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.checks import check_finite, check_tensors
+from nexwarp.kernels.types import MAX_SH_DEGREE
 
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
+COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
 END = 1e-6
 
 PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
@@ -87,7 +89,7 @@ class Surfels(nn.Module):
             scales: (N, 2) > 0, world units along the surfel's x and y axes.
             opacities: (N,) in [0, 1].
             gammas: (N, 2) >= 1; 1 is a Gaussian, large values a hard-edged quad.
-            sh: (N, C, 3) spherical harmonics of the plain colour, DC first, C in 1, 4, 9, 16.
+            sh: (N, C, 3) spherical harmonics of the plain colour, DC first; C = (d + 1)^2, d of 0 to 6.
 
         Raises:
             TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
@@ -168,9 +170,11 @@ class Surfels(nn.Module):
 
 
 def check_coefficients(name: str, count: int) -> None:
-    """Raise ValueError unless `count` is the number of coefficients of SH degree 0, 1, 2 or 3."""
-    if count not in (1, 4, 9, 16):
-        raise ValueError(f"{name}: expected 1, 4, 9 or 16 spherical harmonics coefficients, got {count}")
+    """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 6."""
+    if count not in COEFFICIENTS:
+        *most, last = COEFFICIENTS
+        told = f"{', '.join(map(str, most))} or {last}"
+        raise ValueError(f"{name}: expected {told} spherical harmonics coefficients, got {count}")
 
 
 def _check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:

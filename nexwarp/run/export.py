@@ -13,7 +13,7 @@ from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
 from nexwarp.model.model_file import save_model
 from nexwarp.model.splats_spz import save_splats_spz
-from nexwarp.model.surfels_ply import MAX_EXTENT, save_splats_ply, save_surfels_ply
+from nexwarp.model.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.run.contents import (
     CAMERA_PATH_FILE,
     COMPACT_FILE,
@@ -80,7 +80,7 @@ def export_run(
     if kind == "glb":
         return _export_glb(opened, folder, device)
     views = list(_all_cameras(opened).values())
-    gaussians = (opened.model.surfels, opened.model.options.sh_degree)
+    gaussians = (opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE))
     if kind == "spz":
         save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=views, max_extent=max_extent)
         return [folder / SPZ_FILE]

@@ -51,8 +51,8 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     """Return the catalogue's kernels that training and rendering with these settings need on a device."""
     textured, cpu = config.max_hits > 0, device.type == "cpu"
     shape = config.texture
-    degree = config.sh_degree if shape.sh_degree is None else shape.sh_degree
-    sizes = [shape.levels * shape.features, *[shape.width] * shape.hidden_layers, 3 * (degree + 1) ** 2]
+    outputs = 3 * (config.texture_sh_degree + 1) ** 2
+    sizes = [shape.levels * shape.features, *[shape.width] * shape.hidden_layers, outputs]
     simd = cpu and textured and fits_simd(sizes)
     threads = thread_kernels(
         wp.float32,

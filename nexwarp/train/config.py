@@ -7,7 +7,7 @@ from typing import Any
 
 from nexwarp.checks import check_range
 from nexwarp.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
-from nexwarp.kernels.types import MAX_HITS
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE
 from nexwarp.ops.tiles import check_order
 from nexwarp.render import MAX_JITTER
 from nexwarp.train.densify import DensifyConfig
@@ -73,7 +73,7 @@ class TextureConfig:
     hidden_layers: int = 2
     """Number of hidden layers of the MLP."""
     sh_degree: int | None = None
-    """SH degree of the texture's colours; None takes that of the run."""
+    """SH degree of the texture's colours, 0 to 3; None takes that of the run, or 3 where that is higher."""
     residual: bool = True
     """Add the texture's colours to the plain ones instead of replacing them."""
     down_weighting: bool = True
@@ -96,7 +96,8 @@ class Config:
     """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
     with K = 2 has fewer floaters."""
     sh_degree: int = 3
-    """SH degree of the surfels' and the texture's colours. Training starts at degree 0."""
+    """SH degree of the surfels' colours, 0 to 6, and of the texture's, which have 3 at most. Training starts at degree
+    0."""
     sh_every: int = 1000
     """Iterations, of a run of 30,000, after which the SH degree rises by one."""
     coarse: float = 0.0
@@ -167,7 +168,7 @@ class Config:
         check_range("max_surfels", self.max_surfels, MIN_SURFELS)
         check_range("max_hits", self.max_hits, 0, MAX_HITS)
         check_range("more_hits_from", self.more_hits_from, 0)
-        check_range("sh_degree", self.sh_degree, 0, 3)
+        check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("skybox", self.skybox, 0)
@@ -196,6 +197,12 @@ class Config:
     def learns_poses(self) -> bool:
         """Whether poses or motions of the training cameras are learned."""
         return self.refine_poses or self.blur_poses > 1
+
+    @property
+    def texture_sh_degree(self) -> int:
+        """SH degree of the texture's colours."""
+        own = self.texture.sh_degree
+        return min(self.sh_degree, MAX_TEXTURE_SH_DEGREE) if own is None else own
 
     @property
     def settled(self) -> int:

@@ -158,7 +158,7 @@ def texture_shape(scene: Scene, config: Config) -> TextureShape:
         "max_resolution": finest,
         "width": asked.width,
         "hidden_layers": asked.hidden_layers,
-        "sh_degree": config.sh_degree if asked.sh_degree is None else asked.sh_degree,
+        "sh_degree": config.texture_sh_degree,
         "residual": asked.residual,
         "down_weighting": asked.down_weighting,
     }

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from nexwarp.camera import Camera
-from nexwarp.kernels.types import MAX_HITS
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
 from nexwarp.render import Rendering
@@ -40,7 +40,7 @@ class Settings:
     Attributes:
         mode: a key of `MODES`.
         max_hits: K, 0 to 8.
-        sh_degree: 0 to 3.
+        sh_degree: 0 to 6.
         slot: rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8.
         as_trained: where the picture's resolution is finer than the photos', weight the texture's levels as at the
             photos' resolution.
@@ -49,7 +49,7 @@ class Settings:
 
     mode: str = "image"
     max_hits: int = 2
-    sh_degree: int = 3
+    sh_degree: int = MAX_SH_DEGREE
     slot: int = 1
     as_trained: bool = True
     photo_exposure: bool = True
@@ -72,7 +72,7 @@ class Settings:
         return Settings(
             mode=mode,
             max_hits=_clamped(merged, "max_hits", 0, MAX_HITS),
-            sh_degree=_clamped(merged, "sh_degree", 0, 3),
+            sh_degree=_clamped(merged, "sh_degree", 0, MAX_SH_DEGREE),
             slot=_clamped(merged, "slot", 1, MAX_HITS),
             as_trained=_switch(merged, "as_trained"),
             photo_exposure=_switch(merged, "photo_exposure"),

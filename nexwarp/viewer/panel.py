@@ -5,7 +5,7 @@ import math
 from collections.abc import Awaitable, Callable, Sequence
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
-from nexwarp.kernels.types import MAX_HITS
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.viewer.modes import BY_SLOT, MODES, Picture, Settings, viridis
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Panel:
         self.sh_degree = gui.add_slider(
             "SH degree",
             0,
-            3,
+            MAX_SH_DEGREE,
             1,
             settings.sh_degree,
             hint="Degree of the spherical harmonics; 0: no dependence on direction",

@@ -1,6 +1,7 @@
 """The files of the baked scene, which the page draws where there is no WebGPU; docs/web.md describes them."""
 
 import io
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -87,11 +88,11 @@ def encode_harmonics(surfels: Surfels) -> tuple[np.ndarray, list[float]]:
     A code c is the value sign(c - 128) ((c - 128) / 127)^2 range: small values, which are most, have fine steps.
 
     Returns:
-        (N, C - 1, 3) uint8 codes, and the ranges of degrees 1, 2 and 3.
+        (N, C - 1, 3) uint8 codes, and the ranges of degrees 1, 2, 3 and of what the surfels have above.
     """
     values = surfels.shN.detach().float().cpu().numpy()
     codes, ranges = np.full(values.shape, 128, np.uint8), []
-    for degree in (1, 2, 3):
+    for degree in range(1, max(3, math.isqrt(values.shape[1])) + 1):
         band = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
         some = values[:, band]
         ranges.append(float(np.float32(np.abs(some).max(initial=1e-6))))

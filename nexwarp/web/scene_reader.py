@@ -16,6 +16,7 @@ from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
 from nexwarp.model.options import RenderOptions
 from nexwarp.representation.detail_limits import NEVER
+from nexwarp.representation.surfels import COEFFICIENTS, check_coefficients
 from nexwarp.representation.texture import NeuralTexture, TextureShape
 from nexwarp.web.quantise import (
     decode_chunks,
@@ -96,13 +97,12 @@ def read_header(content: bytes) -> tuple[dict[str, object], int]:
         raise FormatError("header: expected a JSON object")
     if header.get("quality") not in QUALITIES:
         raise FormatError(f"quality: expected {' or '.join(QUALITIES)}, got {header.get('quality')!r:.60}")
-    for name, low, high in (("surfels", 0, LARGEST_SURFELS), ("sh_coefficients", 1, 16)):
+    for name, low, high in (("surfels", 0, LARGEST_SURFELS), ("sh_coefficients", 1, COEFFICIENTS[-1])):
         value = header.get(name)
         if isinstance(value, bool) or not isinstance(value, int):
             raise FormatError(f"{name}: expected an integer, got {value!r:.60}")
         check_range(name, value, low, high)
-    if header["sh_coefficients"] not in (1, 4, 9, 16):
-        raise FormatError(f"sh_coefficients: expected 1, 4, 9 or 16, got {header['sh_coefficients']}")
+    check_coefficients("sh_coefficients", header["sh_coefficients"])
     exposures = header.setdefault("exposures", None)
     if exposures is not None:
         if not isinstance(exposures, dict) or not isinstance(exposures.get("count"), int):

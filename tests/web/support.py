@@ -27,13 +27,14 @@ def web_model(
     residual: bool = True,
     hidden_layers: int = 2,
     texture_degree: int = 3,
+    sh_degree: int = 3,
     options: nw.RenderOptions | None = None,
 ) -> tuple[nw.Model, nw.Camera]:
     """Return a small model with texture, exposures with a falloff and detail limits, and a camera.
 
     Values of the texture are exact in half precision, as those of model files are.
     """
-    scene = random_scene(count, width=37, height=27)
+    scene = random_scene(count, width=37, height=27, sh_degree=sh_degree)
     generator = torch.Generator().manual_seed(3)
     texture = nw.NeuralTexture(
         levels=3,

@@ -79,15 +79,15 @@ def cameras() -> dict[str, nw.Camera]:
 
 @pytest.fixture(scope="module")
 def model(cameras) -> nw.Model:
-    """A small model with everything that a page has to show: exposures, vignetting, detail limits, SH of degree 3."""
-    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
+    """A small model with everything that a page has to show: exposures, vignetting, detail limits, SH of degree 6."""
+    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3, sh_degree=6))
     gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
     exposures = Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
     limits = DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
     texture = make_texture(residual=True)
     with torch.no_grad():
         texture.grid.mul_(0.3)
-    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3), sh_degree=6))
 
 
 @pytest.fixture(scope="module")

@@ -90,10 +90,13 @@ def entry_of(camera: nw.Camera) -> dict[str, object]:
     return {"viewmat": camera.viewmat.flatten().tolist(), "K": K, **size}
 
 
-@pytest.mark.parametrize("quality", ["full", pytest.param("quantised", marks=pytest.mark.slow)])
-def test_the_picture_is_that_of_the_model(page, quality):
+@pytest.mark.parametrize(
+    ("quality", "degree"),
+    [("full", 3), ("full", 6), *(pytest.param("quantised", d, marks=pytest.mark.slow) for d in (3, 6))],
+)
+def test_the_picture_is_that_of_the_model(page, quality, degree):
     opened, folder, errors = page
-    model, camera = web_model()
+    model, camera = web_model(sh_degree=degree, options=nw.RenderOptions(sh_degree=degree))
     with torch.no_grad():
         expected = model.render(camera)
     (folder / "scene.nxw").write_bytes(encode_scene(model, named_cameras(camera), quality=quality, poster=b"picture"))
@@ -115,7 +118,11 @@ def test_the_picture_is_that_of_the_model(page, quality):
 
 def test_constants_and_shaders_are_those_of_python(page):
     opened, _, _ = page
-    cases: list[dict[str, Any]] = [{}, {"features": 4, "residual": False, "hidden_layers": 0, "texture_degree": 1}]
+    cases: list[dict[str, Any]] = [
+        {},
+        {"sh_degree": 6, "options": nw.RenderOptions(sh_degree=6)},
+        {"features": 4, "residual": False, "hidden_layers": 0, "texture_degree": 1},
+    ]
     for case in cases:
         model, camera = web_model(**case)
         scene = SceneData.of(model)

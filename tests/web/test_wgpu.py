@@ -33,6 +33,7 @@ CASES: dict[str, dict[str, Any]] = {
     "no hits": {"options": RenderOptions(max_hits=0)},
     "1 hit, degree 1": {"features": 1, "texture_degree": 1, "hidden_layers": 1, "options": RenderOptions(max_hits=1)},
     "no hidden layers, degree 2": {"features": 8, "hidden_layers": 0, "options": RenderOptions(sh_degree=2)},
+    "degree 6": {"sh_degree": 6, "options": RenderOptions(sh_degree=6)},
     "no limits, mean exposure": {"options": RenderOptions(detail_limits=False, exposure="mean")},
 }
 
@@ -44,7 +45,7 @@ def default() -> tuple[nw.Model, nw.Camera, Renderer]:
 
 
 @pytest.mark.parametrize(
-    "case", [name if name in ("default",) else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+    "case", [name if name in ("default", "degree 6") else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
 def test_all_buffers_are_those_of_the_model(case):
     model, camera = web_model(**CASES[case])

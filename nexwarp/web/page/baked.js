@@ -109,7 +109,7 @@ export class BakedRenderer {
         const uniforms = {};
         for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); ++i) {
             const {name} = gl.getActiveUniform(program, i);
-            uniforms[name] = gl.getUniformLocation(program, name);
+            uniforms[name.replace("[0]", "")] = gl.getUniformLocation(program, name);
         }
         return {program, uniforms};
     }
@@ -185,7 +185,7 @@ export class BakedRenderer {
         gl.uniform1f(uniforms.near, camera.near);
         gl.uniform1i(uniforms.mode, MODES.indexOf(mode));
         gl.uniform1i(uniforms.coefficients, scene.usedCoefficients);
-        gl.uniform3fv(uniforms.bands, scene.header.sh_ranges);
+        gl.uniform1fv(uniforms.bands, scene.header.sh_ranges);
         gl.uniform3f(uniforms.atlasScale, scene.header.atlas.width, scene.header.atlas.height, scene.header.atlas.scale);
         gl.bindVertexArray(this.vertices);
         gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, scene.count);

@@ -111,9 +111,9 @@ function checkHeader(header) {
     };
     expect(header && typeof header === "object", "an object");
     expect(integer(header.surfels, 0, LARGEST_COUNT), `at most ${LARGEST_COUNT} surfels`);
-    expect([1, 4, 9, 16].includes(header.sh_coefficients), "1, 4, 9 or 16 SH coefficients");
-    expect(numbers(header.sh_ranges, 3), "three ranges of SH");
-    expect(numbers(header.options?.background, 3) && integer(header.options.sh_degree, 0, 3), "the options of the rendering");
+    expect([1, 4, 9, 16, 25, 36, 49].includes(header.sh_coefficients), "1, 4, 9, 16, 25, 36 or 49 SH coefficients");
+    expect(numbers(header.sh_ranges, Math.max(3, Math.sqrt(header.sh_coefficients) - 1)), "ranges of SH");
+    expect(numbers(header.options?.background, 3) && integer(header.options.sh_degree, 0, 6), "the options of the rendering");
     expect(Array.isArray(header.sections) && header.sections.length < 100, "a list of sections");
     const {atlas, exposures, cameras} = header;
     expect(atlas && integer(atlas.width, 1, LARGEST_SIDE) && integer(atlas.height, 1, LARGEST_SIDE), "the size of the atlas");

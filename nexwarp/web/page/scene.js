@@ -16,6 +16,7 @@ const LARGEST_SECTION = 2 ** 30;
 const LARGEST_VALUE = 1e16;
 const NEVER = 1e30;
 const CHUNK = 256;
+const COEFFICIENTS = [1, 4, 9, 16, 25, 36, 49]; // of SH degrees 0 to 6
 const SIZES = { u8: 1, u16: 2, u32: 4, f16: 2, f32: 4 };
 const ARRAYS = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f16: Uint16Array, f32: Float32Array };
 
@@ -47,11 +48,11 @@ export function checkHeader(header) {
     expect(header.format_version === VERSION, `expected format version ${VERSION}`);
     expect(header.quality === "quantised" || header.quality === "full", "quality: expected quantised or full");
     expect(isInteger(header.surfels, 0, LARGEST_SURFELS), `surfels: expected 0 to ${LARGEST_SURFELS}`);
-    expect([1, 4, 9, 16].includes(header.sh_coefficients), "sh_coefficients: expected 1, 4, 9 or 16");
+    expect(COEFFICIENTS.includes(header.sh_coefficients), `sh_coefficients: expected one of ${COEFFICIENTS}`);
     const options = header.options;
     expect(isObject(options), "options: expected an object");
     expect(isInteger(options.max_hits, 0, 8), "options.max_hits: expected 0 to 8");
-    expect(isInteger(options.sh_degree, 0, 3), "options.sh_degree: expected 0 to 3");
+    expect(isInteger(options.sh_degree, 0, 6), "options.sh_degree: expected 0 to 6");
     expect(areNumbers(options.background, 3, -1e6, 1e6), "options.background: expected three numbers");
     for (const name of ["low_pass", "clamp_texture", "detail_limits"]) {
         expect(typeof options[name] === "boolean", `options.${name}: expected true or false`);
