@@ -9,8 +9,8 @@ from nexwarp import ops
 from nexwarp.checks import check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 
+COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 6
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
-COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
 END = 1e-6
 
 PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
