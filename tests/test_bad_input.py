@@ -187,7 +187,7 @@ BAD_TEXTURES = [
     ("max_resolution", ValueError, float("inf")),
     ("width", ValueError, 0),
     ("hidden_layers", ValueError, -1),
-    ("sh_degree", ValueError, 7),
+    ("sh_degree", ValueError, 4),
     ("sh_degree", ValueError, -1),
 ]
 

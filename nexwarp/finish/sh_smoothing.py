@@ -19,7 +19,7 @@ from nexwarp import ops
 from nexwarp.data import View
 from nexwarp.model.model import Model
 
-PRODUCTS = 2**26  # values of the normal equations held at once, float64; more surfels take turns with the views
+PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 GiB
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # 0 is allowed too; less is lost in the harmonics' rounding
@@ -38,8 +38,8 @@ def smooth_sh(
         model: its N surfels and options are used; it does not change.
         views: all training views, on any device; masked pixels do not count.
         strength: factor of the smoothness term, `MIN_STRENGTH` to `MAX_STRENGTH`; the data term has factor 1.
-        progress: called after each view that was rendered, with their number and how many there will be. Many surfels
-            of a high degree need each view more than once.
+        progress: called after each view that was rendered, with their number and how many there will be: each view
+            once for every group of surfels whose equations are held at once.
     """
     surfels = model.surfels
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()

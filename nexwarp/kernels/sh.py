@@ -21,7 +21,7 @@ BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.373176332
 
 
 def first_factor(m: int) -> float:
-    """Return the normalised associated Legendre function of degree and order m over (1 - z^2)^(m / 2), a constant."""
+    """Return the normalised associated Legendre function of degree and order m, divided by (1 - z^2)^(m / 2)."""
     product = math.prod((2 * j + 1) / (2 * j) for j in range(1, m + 1))
     return (-1) ** m * math.sqrt(product * (2 if m else 1) / (4 * math.pi))
 
