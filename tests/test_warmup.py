@@ -126,6 +126,20 @@ def test_what_runs_is_listed(name: str, launched: set[tuple[str, int]], device: 
     assert {module for module, _ in listed} <= everything
 
 
+def test_keys_of_kernels_do_not_depend_on_what_was_compiled_before() -> None:
+    """Constants that Warp finds only while it generates code are in a kernel's key, but not if a function has them."""
+
+    def late(adjoint: Any) -> Iterator[str]:
+        for function in adjoint.get_references()[2]:
+            if not function.is_builtin():
+                if function.adj.has_unresolved_static_expressions:
+                    yield function.key
+                yield from late(function.adj)
+
+    kernels = [*all_kernels(), *all_kernels(storage=wp.float32, cpu=True)]
+    assert not {kernel.key: found for kernel in kernels if (found := [*late(kernel.adj)])}
+
+
 def test_few_kernels_are_listed_in_vain(launched: set[tuple[str, int]]) -> None:
     """On a CPU all but the row sum of the low-pass runs; a longer list only takes longer."""
     listed = {kernel.module.name: kernel.key for kernel, _ in warmup.needed(Config(), CPU)}

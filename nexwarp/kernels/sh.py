@@ -36,6 +36,12 @@ def recurrence(degree: int, m: int) -> tuple[float, float]:
 @functools.cache
 def basis_function(real: type, degree: int) -> wp.Function:
     """Make the function that evaluates the (degree + 1)^2 basis functions at a unit direction."""
+    return lower_bands(real, degree) if degree < 4 else higher_bands(real, degree, degree)
+
+
+@functools.cache
+def lower_bands(real: type, degree: int) -> wp.Function:
+    """Make the function that evaluates the basis functions of degrees 0 to 3, in a vector for those of `degree`."""
     vec3 = types(real).vec3
     vec = wp.types.vector(length=(degree + 1) ** 2, dtype=real)
     A0, B0 = wp.constant(real(BAND_0)), wp.constant(real(BAND_1))
@@ -70,26 +76,49 @@ def basis_function(real: type, degree: int) -> wp.Function:
             out[13] = -D2 * d[0] * (real(4.0) * z2 - x2 - y2)
             out[14] = D4 * d[2] * (x2 - y2)
             out[15] = -D0 * d[0] * (x2 - real(3.0) * y2)
-        if wp.static(degree >= 4):
-            cosine = real(1.0)  # times sin^m, of m times the azimuth
-            sine = real(0.0)
-            for m in range(wp.static(degree + 1)):
-                before = real(0.0)
-                value = wp.static(real(first_factor(m)))
-                for n in range(m, wp.static(degree + 1)):
-                    if wp.static(n > m):
-                        following = wp.static(real(recurrence(n, m)[0])) * (
-                            d[2] * value - wp.static(real(recurrence(n, m)[1])) * before
-                        )
-                        before = value
-                        value = following
-                    if wp.static(n >= 4):
-                        out[n * n + n + m] = value * cosine
-                        if wp.static(m > 0):
-                            out[n * n + n - m] = value * sine
-                turned = d[0] * cosine - d[1] * sine
-                sine = d[0] * sine + d[1] * cosine
-                cosine = turned
+        return out
+
+    return basis
+
+
+@functools.cache
+def higher_bands(real: type, degree: int, m: int) -> wp.Function:
+    """Make the function that evaluates the basis functions of degrees 0 to 3, and of orders -m to m of those above.
+
+    Each order is a function of its own, so that Warp knows all constants when it declares it. With constants that
+    depend on a loop, the key of a kernel in Warp's cache would depend on what the process had compiled before.
+    """
+    vec3 = types(real).vec3
+    lower = higher_bands(real, degree, m - 1) if m else lower_bands(real, degree)
+    lowest = max(m, 4)  # degree that has this order and is not among the lower bands
+    steps = [recurrence(n, m) for n in range(m + 1, degree + 1)] + [(0.0, 0.0)]
+    factors = wp.types.vector(length=len(steps), dtype=real)
+    A, B = (wp.constant(factors(*each)) for each in zip(*steps, strict=True))
+    FIRST = wp.constant(real(first_factor(m)))
+
+    @wp.func
+    def basis(d: vec3):
+        out = lower(d)
+        cosine = real(1.0)  # times sin^m, of m times the azimuth
+        sine = real(0.0)
+        for _turn in range(wp.static(m)):
+            turned = d[0] * cosine - d[1] * sine
+            sine = d[0] * sine + d[1] * cosine
+            cosine = turned
+        before = real(0.0)
+        value = FIRST
+        for k in range(wp.static(lowest - m)):
+            following = A[k] * (d[2] * value - B[k] * before)
+            before = value
+            value = following
+        for k in range(wp.static(degree + 1 - lowest)):
+            n = k + wp.static(lowest)
+            out[n * n + n + wp.static(m)] = value * cosine
+            if wp.static(m > 0):
+                out[n * n + n - wp.static(m)] = value * sine
+            following = A[k + wp.static(lowest - m)] * (d[2] * value - B[k + wp.static(lowest - m)] * before)
+            before = value
+            value = following
         return out
 
     return basis
