@@ -169,7 +169,7 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Densifier, "step", counted)
     warmup.rehearse(Config(), CPU)
     degrees, heights, watches = zip(*steps, strict=True)
-    assert set(degrees) == {0, 1, 2, 3} and list(degrees) == sorted(degrees)
+    assert set(degrees) == set(range(6)) and list(degrees) == sorted(degrees)
     assert set(heights) == {warmup.HEIGHT, warmup.HEIGHT // 2}
     assert set(watches) == {True, False} and list(watches) == sorted(watches, reverse=True)
     assert any(count for count, _ in rounds), "nothing was split"
@@ -178,9 +178,10 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_rehearsal_changes_only_what_is_not_compiled_in() -> None:
     for config in SETTINGS.values():
         tiny = warmup.tiny(config)
-        kept = ("preset", "max_hits", "sh_degree", "low_pass", "losses", "background")
+        kept = ("preset", "max_hits", "low_pass", "losses", "background")
         assert all(getattr(tiny, name) == getattr(config, name) for name in kept)
         assert replace(tiny.texture, table_size=config.texture.table_size) == config.texture
+        assert tiny.sh_degree == config.plain_sh_degree() >= config.plain_sh_degree(35)
 
 
 @pytest.mark.parametrize(

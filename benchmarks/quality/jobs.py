@@ -140,13 +140,16 @@ def table_jobs(
 def config_of(job: TrainingJob, row: Row) -> Config:
     """Return the settings of a training of nexwarp; `row.preset` must not be None.
 
-    The number of teachers is that of the scene; of a scene that is not one of `PHOTOS` the run decides.
+    The number of teachers and the SH degree are those of the scene; of a scene that is not one of `PHOTOS` the run
+    decides.
     """
     assert row.preset is not None
     config = with_settings(preset(row.preset), row.settings)
     config = dataclasses.replace(config, max_surfels=job.size, seed=job.seed, iterations=job.iterations)
-    photos = training_photos(job)
-    return config if photos is None else dataclasses.replace(config, teachers=teacher_count(config, photos))
+    if (photos := training_photos(job)) is None:
+        return config
+    degree = config.plain_sh_degree(photos)
+    return dataclasses.replace(config, teachers=teacher_count(config, photos), sh_degree=degree)
 
 
 def training_photos(job: TrainingJob) -> int | None:

@@ -168,6 +168,11 @@ class Surfels(nn.Module):
         """(N, C, 3) spherical harmonics of the plain colour, DC first."""
         return torch.cat([self.sh0, self.shN], dim=1)
 
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the plain colour."""
+        return COEFFICIENTS.index(self.shN.shape[1] + 1)
+
 
 def check_coefficients(name: str, count: int) -> None:
     """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 6."""

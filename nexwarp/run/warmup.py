@@ -32,7 +32,7 @@ BINARIES = (".o", ".cubin", ".ptx")
 
 WIDTH, HEIGHT, POINTS = 64, 48, 100
 
-ITERATIONS = 8
+ITERATIONS = 12
 
 
 class Build(NamedTuple):
@@ -58,7 +58,7 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         wp.float32,
         wp.float32 if cpu else wp.float16,
         TILE_SIZE,
-        degrees=range(config.sh_degree + 1),
+        degrees=range(config.plain_sh_degree() + 1),
         features=(config.texture.features,) * textured,
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
@@ -129,7 +129,8 @@ def tiny(config: Config) -> Config:
         config,
         iterations=ITERATIONS,
         max_surfels=POINTS,
-        sh_every=2 * step,  # SH degrees of the steps: 0 1 1 2 2 3 3 3
+        sh_degree=config.plain_sh_degree(),
+        sh_every=2 * step,  # SH degrees of the steps: 0 1 1 2 2 3 3 4 4 5 5 5
         coarse=0.5,
         texture=dataclasses.replace(config.texture, table_size=2**10),
         densify=dataclasses.replace(config.densify, start=0, every=3, stop=ITERATIONS * step),

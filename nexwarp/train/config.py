@@ -20,6 +20,9 @@ LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
 MOST_BLUR_POSES = 31
 MOST_TEACHERS = 8
+# Where a run decides, the SH degree is the paper's with few photos, and 5 with at least as many as it has coefficients.
+FEW_PHOTOS_SH_DEGREE = 3
+MANY_PHOTOS_SH_DEGREE = 5
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,9 @@ class Config:
     more_hits_from: int = 25_000
     """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
     with K = 2 has fewer floaters."""
-    sh_degree: int = 3
+    sh_degree: int | None = None
     """SH degree of the surfels' colours, 0 to 6, and of the texture's, which have 3 at most. Training starts at degree
-    0."""
+    0. None is 5 with 36 training photos or more, otherwise 3."""
     sh_every: int = 1000
     """Iterations, of a run of 30,000, after which the SH degree rises by one."""
     coarse: float = 0.0
@@ -168,7 +171,8 @@ class Config:
         check_range("max_surfels", self.max_surfels, MIN_SURFELS)
         check_range("max_hits", self.max_hits, 0, MAX_HITS)
         check_range("more_hits_from", self.more_hits_from, 0)
-        check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
+        if self.sh_degree is not None:
+            check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
         check_range("seed", self.seed, 0, 2**32 - 1)
         check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("skybox", self.skybox, 0)
@@ -198,11 +202,18 @@ class Config:
         """Whether poses or motions of the training cameras are learned."""
         return self.refine_poses or self.blur_poses > 1
 
+    def plain_sh_degree(self, photos: float = math.inf) -> int:
+        """SH degree of the surfels' colours, with that number of training photos; by default the highest of all."""
+        if self.sh_degree is not None:
+            return self.sh_degree
+        many = photos >= (MANY_PHOTOS_SH_DEGREE + 1) ** 2
+        return MANY_PHOTOS_SH_DEGREE if many else FEW_PHOTOS_SH_DEGREE
+
     @property
     def texture_sh_degree(self) -> int:
         """SH degree of the texture's colours."""
-        own = self.texture.sh_degree
-        return min(self.sh_degree, MAX_TEXTURE_SH_DEGREE) if own is None else own
+        own, run = self.texture.sh_degree, self.sh_degree
+        return min(MAX_TEXTURE_SH_DEGREE if run is None else run, MAX_TEXTURE_SH_DEGREE) if own is None else own
 
     @property
     def settled(self) -> int:

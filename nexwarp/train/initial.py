@@ -45,7 +45,7 @@ def initial_surfels(
         "logit_opacities": torch.logit(torch.full((count,), INITIAL_OPACITY)),
         "raw_gammas": torch.full((count, 2), INITIAL_RAW_GAMMA),
         "sh0": ((points.colors - 0.5) / BAND_0)[:, None],
-        "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
+        "shN": torch.zeros(count, (config.plain_sh_degree(len(scene.train)) + 1) ** 2 - 1, 3),
     }
     return Surfels(raw)
 

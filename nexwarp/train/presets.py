@@ -79,10 +79,11 @@ def _fits(value: object, kind: object) -> bool:
 PRESETS: dict[str, Config] = {
     "default": Config(),
     # A texture that weak GPUs evaluate in real time: a third of the arithmetic.
-    "web": Config(preset="web", texture=TextureConfig(width=32, hidden_layers=1, sh_degree=1)),
+    "web": Config(preset="web", sh_degree=3, texture=TextureConfig(width=32, hidden_layers=1, sh_degree=1)),
     "paper": Config(
         preset="paper",
         more_hits_from=0,
+        sh_degree=3,
         background=(0.0, 0.0, 0.0),
         depth_jitter=0.0,
         footprints=False,

@@ -135,7 +135,7 @@ def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int,
 
 
 def options_at(
-    config: Config, iteration: int, background: tuple[float, float, float], texture_degree: int
+    config: Config, iteration: int, background: tuple[float, float, float], *sh_degrees: int
 ) -> RenderOptions:
     """Return how the scene is rendered after an iteration: more hits and SH degrees are unlocked on the way.
 
@@ -143,13 +143,13 @@ def options_at(
         config: settings.
         iteration: from 0, before the first step.
         background: of the run.
-        texture_degree: SH degree of the texture.
+        sh_degrees: of surfels and texture.
     """
     unlocked = iteration // config.scaled(config.sh_every)
     return RenderOptions(
         max_hits=config.hits_at(iteration),
         background=background,
-        sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
+        sh_degree=min(max(sh_degrees), unlocked),
         low_pass=config.low_pass,
         order=cast(Order, config.order),
     )

@@ -276,7 +276,7 @@ class Trainer:
 
     def render_options(self) -> RenderOptions:
         """Return how the scene is rendered at this point of the run."""
-        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
+        return options_at(self.config, self.iteration, self.background, self.surfels.sh_degree, self.texture.sh_degree)
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures.
