@@ -193,9 +193,16 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
     config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
     asked, other = Trainer(scene, config, device), Trainer(scene, config, device)
-    asked.run(until=30)
-    if asked.graphs is not None:
-        assert any(stage.graph is not None for stage in asked.graphs.stages.values())
+    replayed: list[
+        bool
+    ] = []  # at any one step there may be no graph: where lists turn out too short, the next step drops it
+
+    def observe(_: nw.StepReport) -> None:
+        if asked.graphs is not None:
+            replayed.extend(stage.graph is not None for stage in asked.graphs.stages.values())
+
+    asked.run(observe, until=30)
+    assert any(replayed) == (device.type == "cuda")
     model = asked.finish()
     assert model.meta["smooth_sh"] == 0.01 and model.surfels is not asked.surfels
     assert model.detail_limits is not None
