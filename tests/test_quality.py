@@ -15,7 +15,7 @@ import torch
 import nexwarp as nw
 from benchmarks.peer_gsplat import Gaussians, PeerSettings
 from benchmarks.quality.__main__ import main
-from benchmarks.quality.jobs import ARC_VIEWS, TABLES, JobGroup, TrainingJob, group_jobs, table_jobs
+from benchmarks.quality.jobs import ARC_VIEWS, TABLES, THINNED, JobGroup, TrainingJob, group_jobs, table_jobs
 from benchmarks.quality.results import read_results
 from benchmarks.quality.rows import GSPLAT, MEGABYTES, PEERS, ROWS, Row
 from benchmarks.quality.run import config_name, file_name, run_job
@@ -254,6 +254,17 @@ def test_validation_views_are_training_views(scene: Scene) -> None:
     for fold in folds:
         assert sorted(view.name for view in (*fold.test, *fold.train)) == names
     assert sorted(view.name for fold in folds for view in fold.test) == names
+
+
+def test_thinned_scenes_have_the_same_validation_views(scene: Scene) -> None:
+    """They train on every k-th of the others, and start from what these show."""
+    whole = inner_validation(scene)
+    for name, every in THINNED.items():
+        part = VARIANTS[name](scene)
+        assert [view.name for view in part.test] == [view.name for view in whole.test]
+        assert [view.name for view in part.train] == [view.name for view in whole.train][::every]
+        shown = {tuple(point) for view in part.train for point in present(view.points).tolist()}
+        assert {tuple(point) for point in part.points.tolist()} <= shown
 
 
 def test_an_arc_starts_from_what_its_training_views_show(scene: Scene) -> None:

@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 import nexwarp as nw
-from benchmarks.quality.jobs import PHOTOS, TrainingJob, config_of, group_jobs, training_photos
+from benchmarks.quality.jobs import PHOTOS, THINNED, TrainingJob, config_of, group_jobs, training_photos
 from benchmarks.quality.rows import DEFAULT, PAPER, Row
 from benchmarks.quality.run import config_name, run_job, trained_with
 from benchmarks.quality.scenes import scene_of
@@ -584,7 +584,7 @@ def test_the_benchmark_trains_teachers_first(
     assert [group.iterations for group in alone] == [0, 0], "stages share no first iterations"
 
 
-@pytest.mark.parametrize("variant", ["", "inner", "inner4", "arc"])
+@pytest.mark.parametrize("variant", ["", "inner", "inner4", "arc", *THINNED])
 def test_the_benchmark_counts_training_photos(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
     monkeypatch.setitem(PHOTOS, tiny_folder.name, 10)
     job = TrainingJob(tiny_folder.name, variant, "default", 60, 0, 20)

@@ -9,7 +9,8 @@
     python -m benchmarks.quality train --tables demo --seeds 0 --pictures DIR --out demo.jsonl
     python -m benchmarks.quality train --tables changes --variant inner --out inner.jsonl
 
-`--variant inner` holds out every 8th training photo in place of the test views, to choose settings by.
+`--variant inner` holds out every 8th training photo in place of the test views, to choose settings by; `half`, `third`
+and `fifth` do that, too, and train on a part of the other photos.
 `train` appends one JSON line per training and skips the trainings that the file already holds: it can be stopped and
 resumed, and run on several machines. Rows that differ only in K or in how a model is finished train alike until K
 takes effect (`more_hits_from`); until there they share one training. The table `demo` needs no data: it holds out

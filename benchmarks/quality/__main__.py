@@ -193,7 +193,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     add("--tables", help=f"comma-separated: {', '.join(TABLES)}; arc: a held-out arc of neighbouring views")
     add("--only", help="comma-separated rows of the tables; default: all of them")
     add("--row", action="append", help="NAME:PRESET:JSON settings, to try something out")
-    add("--variant", default="", choices=("", *VARIANTS), help="of the scenes; inner, inner1, ...: validation views")
+    add("--variant", default="", choices=("", *VARIANTS), help="of the scenes; inner, half, ...: validation views")
     add(
         "--scenes",
         default=",".join(SCENES),

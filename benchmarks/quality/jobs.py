@@ -30,6 +30,8 @@ SCENES = ("train", "fox", "saharov", "kitchen25")
 # Number of photos, to know without them whether a run has teachers.
 PHOTOS = {"train": 301, "fox": 50, "saharov": 32, "kitchen25": 25}
 ARC_VIEWS = 8  # held out by the variant "arc"
+# Variants with the validation views of "inner" that train on every 2nd, 3rd or 5th of its training photos.
+THINNED = {"half": 2, "third": 3, "fifth": 5}
 DEMO = "demo"  # the built-in scene
 TABLES = (
     "peers",
@@ -156,9 +158,12 @@ def training_photos(job: TrainingJob) -> int | None:
     if job.variant == "arc":
         return photos - ARC_VIEWS
     train = photos - len(range(0, photos, TEST_EVERY))
-    if not job.variant.startswith("inner"):
+    thinned = THINNED.get(job.variant)
+    if not job.variant.startswith("inner") and thinned is None:
         return train
-    return train - len(range(int(job.variant.removeprefix("inner") or 0), train, TEST_EVERY))
+    first = 0 if thinned else int(job.variant.removeprefix("inner") or 0)
+    left = train - len(range(first, train, TEST_EVERY))
+    return len(range(0, left, thinned or 1))
 
 
 def group_jobs(jobs: Iterable[TrainingJob], rows: Mapping[str, Row]) -> list[JobGroup]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.quality.jobs import ARC_VIEWS, DEMO, TrainingJob
+from benchmarks.quality.jobs import ARC_VIEWS, DEMO, THINNED, TrainingJob
 from nexwarp.camera import Camera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
@@ -55,6 +55,15 @@ def held_out_arc(scene: Scene) -> Scene:
     return of_training_views(dataclasses.replace(scene, train=train, test=test))
 
 
+def thinned(scene: Scene, every: int) -> Scene:
+    """Hold out the validation views of `inner_validation`, and train on one photo of `every` others.
+
+    The same views thus tell what a setting does with fewer photos.
+    """
+    part = inner_validation(scene)
+    return of_training_views(dataclasses.replace(part, train=part.train[::every]))
+
+
 def moved(scene: Scene, factor: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
     """Map world points x to factor x + shift."""
     offset = torch.tensor(shift, dtype=torch.float64)
@@ -90,6 +99,7 @@ VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "inner": inner_validation,
     # The other folds: with all eight, every training view is held out once.
     **{f"inner{first}": partial(inner_validation, first=first) for first in range(1, TEST_EVERY)},
+    **{name: partial(thinned, every=every) for name, every in THINNED.items()},
     "arc": held_out_arc,
     "near": with_near,
     "x100": lambda scene: moved(scene, factor=100.0),
