@@ -202,6 +202,11 @@ class StepGraphs:
         self.keeper = keeper
 
 
+def beside(graphs: StepGraphs | None, work: Callable[[], T]) -> T:
+    """Do work that is not part of a step; see `StepGraphs.beside`. Without graphs there is nothing to drop for it."""
+    return work() if graphs is None else graphs.beside(work)
+
+
 class _Stage:
     """Tensors that targets of one kind are copied into, and the graph that reads them."""
 

@@ -28,7 +28,7 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
-from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, can_capture, graph_key, updating
+from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.motion_blur import render_target
@@ -190,7 +190,8 @@ class Trainer:
                 unneeded = None
                 if self.densifier.relocates(self.iteration, len(self.surfels)):
                     cameras, share = self.views.refined_cameras(self.poses), self.config.densify.relocate
-                    unneeded = least_contributing(self.model(), cameras, share, self.ranks)
+                    find = partial(least_contributing, self.model(), cameras, share, self.ranks)
+                    unneeded = beside(self.graphs, find)
                 self.densifier.step(self.surfels, self.optimizer, self.generator, unneeded)
             report = (self.iteration, len(self.surfels), result.losses, result.image, target.photo)
             return StepReport(*report, self.views_a_step)
@@ -204,8 +205,7 @@ class Trainer:
         target = self.targets.make(index, self.iteration, upcoming)
         if self.teachers is None or not self.teachers.teaches(number):
             return target
-        teach = partial(self.teachers.target, target, number)
-        return teach() if self.graphs is None else self.graphs.beside(teach)
+        return beside(self.graphs, partial(self.teachers.target, target, number))
 
     def _initial_model(self, colors: torch.Tensor | None) -> tuple[Surfels, NeuralTexture]:
         surfels = initial_surfels(self.scene, self.config, self.generator, colors)
