@@ -193,9 +193,8 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
     config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
     asked, other = Trainer(scene, config, device), Trainer(scene, config, device)
-    replayed: list[
-        bool
-    ] = []  # at any one step there may be no graph: where lists turn out too short, the next step drops it
+    # At any one step there may be no graph: where lists turn out too short, the next step drops it.
+    replayed: list[bool] = []
 
     def observe(_: nw.StepReport) -> None:
         if asked.graphs is not None:

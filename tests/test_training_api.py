@@ -225,7 +225,8 @@ def test_own_losses_and_optimizers_are_captured_where_they_can_be(
         return 0.1 * (rendering.image - target.photo).square().mean()
 
     runs = []
-    replayed: list[bool] = []  # at any one step there may be no graph: where lists turn out too short, it is dropped
+    # At any one step there may be no graph: where lists turn out too short, the next step drops it.
+    replayed: list[bool] = []
 
     def observe(_: nw.StepReport) -> None:
         if trainer.graphs is not None:

@@ -127,7 +127,7 @@ def test_what_runs_is_listed(name: str, launched: set[tuple[str, int]], device: 
 
 
 def test_keys_of_kernels_do_not_depend_on_what_was_compiled_before() -> None:
-    """Constants that Warp finds only while it generates code are in a kernel's key, but not if a function has them."""
+    """Constants that depend on a loop are only known while code is generated, and a function's are not in the key."""
 
     def late(adjoint: Any) -> Iterator[str]:
         for function in adjoint.get_references()[2]:
