@@ -127,7 +127,10 @@ def test_what_runs_is_listed(name: str, launched: set[tuple[str, int]], device: 
 
 
 def test_keys_of_kernels_do_not_depend_on_what_was_compiled_before() -> None:
-    """Constants that depend on a loop are only known while code is generated, and a function's are not in the key."""
+    """Constants in a loop are known once code is generated; Warp does that before the key if the kernel has some.
+
+    If only a function has some, they are in the key where another kernel with it was compiled before, and not else.
+    """
 
     def late(adjoint: Any) -> Iterator[str]:
         for function in adjoint.get_references()[2]:
@@ -136,7 +139,9 @@ def test_keys_of_kernels_do_not_depend_on_what_was_compiled_before() -> None:
                     yield function.key
                 yield from late(function.adj)
 
-    kernels = [*all_kernels(), *all_kernels(storage=wp.float32, cpu=True)]
+    every = [*all_kernels(), *all_kernels(storage=wp.float32, cpu=True)]
+    kernels = [kernel for kernel in every if not kernel.adj.has_unresolved_static_expressions]
+    assert len(kernels) > 200
     assert not {kernel.key: found for kernel in kernels if (found := [*late(kernel.adj)])}
 
 

@@ -85,8 +85,8 @@ def lower_bands(real: type, degree: int) -> wp.Function:
 def higher_bands(real: type, degree: int, m: int) -> wp.Function:
     """Make the function that evaluates the basis functions of degrees 0 to 3, and of orders -m to m of those above.
 
-    Each order is a function of its own, so that Warp knows all constants when it declares it. With constants that
-    depend on a loop, the key of a kernel in Warp's cache would depend on what the process had compiled before.
+    Each order is a function of its own, so that Warp knows all constants when it declares it. Constants that depend on
+    a loop would be in a kernel's key in Warp's cache only if the process had compiled another kernel with them before.
     """
     vec3 = types(real).vec3
     lower = higher_bands(real, degree, m - 1) if m else lower_bands(real, degree)

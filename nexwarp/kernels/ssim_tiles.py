@@ -92,10 +92,6 @@ def ssim_tile_kernels() -> SimpleNamespace:
     def group_column(lane: wp.int32):
         return lane % 3 + (lane // 3) % wp.static(PIXELS // GROUP) * wp.static(3 * GROUP)
 
-    # Not wp.static(tap(i - o)): in a function that kernels share, what depends on a loop enters the key of a kernel in
-    # Warp's cache only if the process has compiled another one before, so that each process might compile it anew.
-    TAPS = wp.constant(wp.types.vector(length=WINDOW_SIZE, dtype=wp.float32)(*map(tap, range(WINDOW_SIZE))))
-
     @wp.func
     def blur(plane: wp.int32, lane: wp.int32):
         """Blur a thread's group of a plane along its row."""
@@ -104,8 +100,8 @@ def ssim_tile_kernels() -> SimpleNamespace:
         for i in range(wp.static(GROUP + 2 * REACH)):
             x = cell(False, start + 3 * i, 0.0)
             for o in range(wp.static(GROUP)):
-                if i >= o and i - o < wp.static(WINDOW_SIZE):  # known once the loops are unrolled
-                    sums[o] += x * TAPS[i - o]
+                if wp.static(tap(i - o) > 0.0):
+                    sums[o] += x * wp.static(wp.float32(tap(i - o)))
         return sums
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
