@@ -158,12 +158,11 @@ def training_photos(job: TrainingJob) -> int | None:
     if job.variant == "arc":
         return photos - ARC_VIEWS
     train = photos - len(range(0, photos, TEST_EVERY))
-    thinned = THINNED.get(job.variant)
-    if not job.variant.startswith("inner") and thinned is None:
+    fold, every = ("inner", THINNED[job.variant]) if job.variant in THINNED else (job.variant, 1)
+    if not fold.startswith("inner"):
         return train
-    first = 0 if thinned else int(job.variant.removeprefix("inner") or 0)
-    left = train - len(range(first, train, TEST_EVERY))
-    return len(range(0, left, thinned or 1))
+    left = train - len(range(int(fold.removeprefix("inner") or 0), train, TEST_EVERY))
+    return len(range(0, left, every))
 
 
 def group_jobs(jobs: Iterable[TrainingJob], rows: Mapping[str, Row]) -> list[JobGroup]:
