@@ -55,8 +55,8 @@ def same(one: Model, other: Model) -> bool:
     ("changes", "photos", "count"),
     [
         ({}, 21, 2),
-        ({}, 64, 2),
-        ({}, 65, 0),  # photos are many
+        ({}, 44, 2),
+        ({}, 45, 0),  # photos are many
         ({"max_surfels": 12_600}, 42, 2),
         ({"max_surfels": 12_600}, 43, 0),  # surfels are few for them
         ({"iterations": 60_000}, 21, 2),

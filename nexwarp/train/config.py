@@ -145,7 +145,7 @@ class Config:
     teachers: int | None = None
     """Number of teachers: models of other seeds that are trained first, in two fifths of the iterations, and from whose
     renderings the run then learns, too, for captures of few photos (docs/sparse.md). Each has four times `max_surfels`
-    but at most 40,000, and never fewer than `max_surfels`. None is 2 where there are at most 64 training photos, at
+    but at most 40,000, and never fewer than `max_surfels`. None is 2 where there are at most 44 training photos, at
     least 300 surfels of `max_surfels` for each of them and at least 30,000 iterations, and where poses stay as given;
     otherwise 0."""
     seed: int = 0
