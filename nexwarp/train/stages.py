@@ -24,7 +24,7 @@ from nexwarp.train.trainer import Trainer
 
 # Where a run decides, it has teachers if photos are few and surfels many for them. With 18 to 37 photos and 417 surfels
 # a photo or more no scene lost PSNR of validation views on the mean of its pairs; with 46, 77, 115 and 230 photos one
-# scene lost 0.04 to 0.5 dB, and 0.017 of SSIM or more. Fewer than 30,000 steps were not tried at full size.
+# scene lost 0.04 to 0.5 dB, and 0.011 of SSIM or more. Fewer than 30,000 steps were not tried at full size.
 TEACHERS = 2
 MOST_PHOTOS = 44
 SURFELS_A_PHOTO = 300
