@@ -148,15 +148,18 @@ def test_help_tells_of_debug(capsys):
     assert exited.value.code == 0 and "--debug" in capsys.readouterr().out
 
 
-def test_terminated_commands_end_in_order(tmp_path):
+@pytest.mark.parametrize("first", ["", "pycolmap_module()"])  # whose import takes the signal for itself
+def test_terminated_commands_end_in_order(tmp_path, first):
     """SIGTERM unwinds: what is half-written goes."""
     program = f"""
 import os, signal, sys
 from pathlib import Path
 from nexwarp.cli import main as cli
+from nexwarp.data.lens import pycolmap_module
 from nexwarp.io.files import written_aside
 
 def wait(*_):
+    {first}
     with written_aside(Path({str(tmp_path)!r}) / "file") as temporary:
         temporary.write_text("half")
         os.kill(os.getpid(), signal.SIGTERM)

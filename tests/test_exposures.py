@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import pickle
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,16 @@ def test_the_falloff_of_the_lens_is_found(lens):
     expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
     assert expected.min() < 0.85
     assert (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
+
+
+def test_exposures_can_be_pickled_and_loaded_into():
+    """As `torch.save` of a model and a process that is spawned do; a copy reads the falloff that it loads."""
+    cameras = [looking(0.0), looking(1.0)]
+    exposures = Exposures.of(torch.tensor([[0.1] * 3, [-0.1] * 3]), cameras, (-0.2, -0.1, 0.25))
+    copied = pickle.loads(pickle.dumps(exposures))
+    assert torch.equal(copied.gains(cameras[1]), exposures.gains(cameras[1]))
+    copied.load_state_dict(Exposures.of(torch.zeros(2, 3), cameras, (-0.3, -0.2, 0.4)).state_dict())
+    assert copied.lens == pytest.approx((-0.3, -0.2, 0.4))
 
 
 def test_the_falloff_is_the_angle_s():

@@ -221,7 +221,7 @@ def test_the_lowered_rate_is_kept_over_a_resume(scene, tmp_path):
     first.rate_factor = 0.5
     first.step()
     first.save(tmp_path)
-    second.restore(tmp_path)
+    second.restore(str(tmp_path))
     assert second.rate_factor == 0.5
     for one in (first, second):
         one.step()

@@ -11,6 +11,7 @@ from PIL import Image
 from nexwarp.data import load_scene
 from nexwarp.data.images import downscale_image, read_image
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.errors import MissingError, SceneError
 
 WIDTH, HEIGHT = 48, 36
 REAL = Path(__file__).parents[2] / "shared" / "data"
@@ -276,6 +277,7 @@ def test_bad_scenes_are_told_in_one_line(tmp_path, kind):
     make, message = BAD_SCENES[kind]
     with pytest.raises((ValueError, OSError), match=message) as caught:
         load_scene(make(tmp_path))
+    assert isinstance(caught.value, (SceneError, MissingError))
     text = str(caught.value)
     assert "\n" not in text and str(tmp_path) in text
 
@@ -283,7 +285,7 @@ def test_bad_scenes_are_told_in_one_line(tmp_path, kind):
 def test_absent_images_folder_lists_those_that_exist(tmp_path):
     path = make_scene(tmp_path)
     (path / "images_2").mkdir()
-    with pytest.raises(FileNotFoundError, match=r"images: no folder 'images_8' in .* which has images, images_2$"):
+    with pytest.raises(MissingError, match=r"images: no folder 'images_8' in .* which has images, images_2$"):
         load_scene(path, images="images_8")
 
 

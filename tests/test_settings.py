@@ -71,6 +71,10 @@ def test_unknown_settings_are_refused(name: str) -> None:
         ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
         ({"coarse": 1.5}, "coarse: expected at least 0 and at most 1, got 1.5"),
         ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
+        ({"texture.levels": 0}, "texture.levels: expected at least 1 and at most 64, got 0"),
+        ({"texture.features": -1}, "texture.features: expected 1, 2, 4 or 8, got -1"),
+        ({"texture.table_size": 1000}, "texture.table_size: expected a power of two, got 1000"),
+        ({"texture.sh_degree": 4}, "texture.sh_degree: expected at least 0 and at most 3, got 4"),
     ],
 )
 def test_values_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:

@@ -45,7 +45,13 @@ CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have
 
 
 class OutputConsole(Console):
-    """A console that raises BrokenPipeError when nobody reads its output any more; rich's own exits with 1."""
+    """A console that raises BrokenPipeError when nobody reads its output any more; rich's own exits with 1.
+
+    It takes brackets as they are, since paths may have them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(markup=False)
 
     def on_broken_pipe(self) -> NoReturn:
         """Raise the error that is being handled."""

@@ -1,13 +1,15 @@
 """The content of a scene's files without pixels: photos with their cameras, and points."""
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
 from nexwarp.data.lens import Lens
+from nexwarp.errors import MissingError, NexwarpError, SceneError
 
 MAX_PART, MAX_PATH = 240, 1024  # bytes of a part of a file's path, and of the path
 MOST_NAMED = 100  # missing photos in a message
@@ -80,6 +82,19 @@ class Capture:
     cloud: Cloud | None
     test: frozenset[str] | None = None
     background: tuple[float, float, float] | None = None
+
+
+@contextmanager
+def scene_errors() -> Iterator[None]:
+    """Turn what the readers of a scene raise into the package's errors, which are of the same built-in kinds."""
+    try:
+        yield
+    except NexwarpError:
+        raise
+    except FileNotFoundError as error:
+        raise MissingError(str(error)) from error
+    except ValueError as error:
+        raise SceneError(str(error)) from error
 
 
 def safe_name(where: str, name: str, folder: str) -> str:

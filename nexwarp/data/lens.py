@@ -4,6 +4,8 @@ Pixel centres are at +0.5. A photo is resampled once by bicubic interpolation, a
 """
 
 import math
+import signal
+import sys
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -39,11 +41,16 @@ FACES = {
 def pycolmap_module() -> ModuleType:
     """Import pycolmap when it is needed, since it delays the start, and after numpy and PIL.
 
-    If version 4.2.1 is imported before them, it sometimes corrupts the heap.
+    If version 4.2.1 is imported before them, it sometimes corrupts the heap. It also takes SIGTERM for a crash of its
+    own, prints a stack trace and dies: the handler from before the import is put back.
     """
     import PIL.Image  # noqa: F401
+
+    first, handler = "pycolmap" not in sys.modules, signal.getsignal(signal.SIGTERM)
     import pycolmap
 
+    if first and handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
     return pycolmap
 
 

@@ -15,7 +15,7 @@ import torch
 from nexwarp.camera import Camera
 from nexwarp.data.background import parse_color
 from nexwarp.data.cache import PhotoCache, cache_folder
-from nexwarp.data.capture import Capture, Cloud, Photo, report_missing
+from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, scene_errors
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import Array, make_cloud, split_views
@@ -160,18 +160,20 @@ def load_scene(
 
     Raises:
         NotADirectoryError: a file, not a folder.
-        FileNotFoundError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
+        MissingError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
             scene names are absent.
-        TypeError, ValueError: an argument of the wrong type or out of range, more than one kind of scene, damaged or
-            malformed files, cameras that are not usable, a photo or mask whose shape is not its camera's, names that
-            leave the folder, fewer than 2 photos, a COLMAP model without points, photos too many for the memory.
+        TypeError, ValueError: an argument of the wrong type or out of range.
+        SceneError: no such `format`, more than one kind of scene, damaged or malformed files, cameras that are not
+            usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than 2 photos,
+            a COLMAP model without points, photos too many for the memory.
     """
     _check_paths(path, images, masks, points)
     _check_downscale(downscale)
-    path = _scene_folder(path)
+    with scene_errors():
+        path = _scene_folder(path)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
-    with quiet_pillow():
+    with quiet_pillow(), scene_errors():
         kind = find_format(path, format)
         capture = _read_capture(path, images, kind, follow_links, skip_missing)
         scene = _load(path, kind, capture, images, downscale, masks, color, points, progress)

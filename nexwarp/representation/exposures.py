@@ -82,7 +82,7 @@ class Exposures(nn.Module):
         for name, (tensor, _) in shapes.items():
             self.register_buffer(name, tensor)
         self._read_falloff()
-        self.register_load_state_dict_post_hook(lambda module, _: module._read_falloff())
+        self.register_load_state_dict_post_hook(_read_falloff_again)  # no lambda: models can be pickled
 
     def _read_falloff(self) -> None:
         """Copy the falloff to Python numbers, so that renderings do not wait for the GPU."""
@@ -176,6 +176,10 @@ class Exposures(nn.Module):
                 self._falloffs.clear()
             falloff = self._falloffs[key] = (t * (a + b * t)).exp()[..., None]
         return falloff
+
+
+def _read_falloff_again(exposures: Exposures, _: object) -> None:
+    exposures._read_falloff()
 
 
 def matern_kernel(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:

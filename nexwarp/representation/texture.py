@@ -86,7 +86,7 @@ class NeuralTexture(nn.Module):
             TypeError, ValueError: the message names the argument.
         """
         super().__init__()
-        _check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
+        check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
         _check_resolutions(min_resolution, max_resolution)
         for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
             if not isinstance(flag, bool):
@@ -257,7 +257,7 @@ def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float32)
 
 
-def _check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
+def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
     """Raise TypeError or ValueError unless each size is an int in its range."""
     for name, value, low, high in (
         ("levels", levels, 1, 64),

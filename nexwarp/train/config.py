@@ -10,6 +10,7 @@ from nexwarp.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE
 from nexwarp.ops.tiles import check_order
 from nexwarp.render import MAX_JITTER
+from nexwarp.representation.texture import check_sizes
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import LossWeights
 
@@ -78,6 +79,11 @@ class TextureConfig:
     """Add the texture's colours to the plain ones instead of replacing them."""
     down_weighting: bool = True
     """Fade levels whose cells are smaller than a pixel (paper Eq. 4)."""
+
+    def __post_init__(self) -> None:
+        entries = 1 if self.table_size is None else self.table_size
+        degree = 0 if self.sh_degree is None else self.sh_degree
+        check_sizes(self.levels, entries, self.features, self.width, self.hidden_layers, degree)
 
 
 @dataclass(frozen=True)

@@ -331,7 +331,7 @@ class Trainer:
     def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
         return Snapshot(*load_checkpoint(run, warn))
 
-    def restore(self, run: Path, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
+    def restore(self, run: Path | str, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
 
         Args:
@@ -343,7 +343,7 @@ class Trainer:
             FileNotFoundError: there is none.
             ValueError: they are damaged, or scene, settings, optimizer or teachers differ.
         """
-        snapshot = self._read(run, warn)
+        snapshot = self._read(Path(run), warn)
         try:
             origin = self.views.fingerprint(), self._scene_digest, self._teachers_digest
             check_origin(snapshot, self.config, *origin, extend=extend)

@@ -185,6 +185,16 @@ def test_an_empty_folder_may_become_a_run(scene, tmp_path):
     assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "1"]) == 0
 
 
+def test_paths_may_have_brackets(scene, tmp_path, monkeypatch, capsys):
+    """They are no markup: what is printed is the path."""
+    monkeypatch.chdir(tmp_path)
+    run = "my [old] run [/b]"
+    train = ["train", str(scene), "--run", run, *FLAGS, "--iterations", "1"]
+    for arguments in (train, ["info", run], ["export", run], ["render", run]):
+        assert cli.main(arguments) == 0, arguments
+        assert run in capsys.readouterr().out, arguments
+
+
 @pytest.mark.parametrize("command", ["eval", "render", "info"])
 def test_no_run_there(command, tmp_path, capsys):
     refused(capsys, [command, str(tmp_path / "no")], str(tmp_path / "no"), "a run folder")
