@@ -247,6 +247,9 @@ def test_the_command_learns_from_runs(
     Path("c/model.safetensors").unlink()
     assert train("c", "--resume") == 0
     assert Path("c/model.safetensors").read_bytes() == model
+    shutil.move("b", "moved")
+    assert train("c", "--resume", "--teacher", "a", "--teacher", "moved") == train("c", "--resume") == 0
+    shutil.move("moved", "b")
     capsys.readouterr()
     for options, message in (
         (["--teacher", "none"], "none: expected a model file, or a run folder"),

@@ -37,6 +37,7 @@ from nexwarp.run.folder import (
     read_own_teachers,
     read_run,
     read_teachers,
+    record_places,
 )
 from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
@@ -168,6 +169,7 @@ class Train:
             if ranks.first:
                 if resume:
                     extend_run(run, config, console)
+                    record_places(run, source, self.teachers)
                 else:
                     check_teachers_place(run, own.count)
             if self.resume and not resume:

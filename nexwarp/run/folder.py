@@ -167,14 +167,9 @@ def create_run(
     Returns:
         Names of the files and folders that nexwarp did not write; they stay.
     """
-    scene = dataclasses.asdict(source)
-    if source.path != DEMO:
-        scene["path"] = str(Path(source.path).resolve())
-    if source.points is not None:
-        scene["points"] = str(Path(source.points).resolve())
-    data = {"scene": scene, "device": device, "config": config.as_dict()} | ({"launch": launch} if launch else {})
-    if teachers:
-        data["teachers"] = [str(path.resolve()) for path in teachers]
+    places = _places(source, teachers)
+    data = {"scene": places.pop("scene"), "device": device, "config": config.as_dict()}
+    data |= ({"launch": launch} if launch else {}) | places
     if own.count:
         data["own_teachers"] = dataclasses.asdict(own)
     with written_aside(run / CONFIG_FILE) as temporary:
@@ -183,6 +178,30 @@ def create_run(
         foreign = delete_files(run, keep=(CONFIG_FILE, LOCK_FILE, temporary.name))
         sync(run)
     return foreign
+
+
+def _places(source: SceneSource, teachers: Sequence[Path]) -> dict[str, Json]:
+    """Return the entries of a run's config that hold paths, which are absolute there."""
+    scene = dataclasses.asdict(source)
+    if source.path != DEMO:
+        scene["path"] = str(Path(source.path).resolve())
+    if source.points is not None:
+        scene["points"] = str(Path(source.points).resolve())
+    return {"scene": scene} | ({"teachers": [str(path.resolve()) for path in teachers]} if teachers else {})
+
+
+def record_places(run: Path, source: SceneSource, teachers: Sequence[Path] = ()) -> None:
+    """Write where a run's scene and teachers lie into its config and those of its own teachers, if they have moved.
+
+    Args:
+        run: a run that goes on.
+        source: its scene.
+        teachers: folders or files of the models that it also learns from.
+    """
+    for folder, others in ((run, teachers), *((each, ()) for each in teacher_folders(run) if is_run(each))):
+        data = read_run(folder)[2]
+        if (now := data | _places(source, others)) != data:
+            write_json(folder / CONFIG_FILE, now)
 
 
 def check_teachers_place(run: Path, count: int) -> None:

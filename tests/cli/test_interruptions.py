@@ -213,6 +213,13 @@ def test_a_run_whose_overwriting_was_killed_is_a_run_still(finished, scene, monk
     assert cli.main([*command, "--resume"]) == 0
 
 
+def test_a_resumed_run_knows_where_its_scene_lies_now(finished, scene, tmp_path):
+    moved = Path(shutil.copytree(scene, tmp_path / "moved"))
+    before = read(finished, "config.json")
+    assert cli.main(["train", str(moved), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
+    assert read(finished, "config.json") == before | {"scene": before["scene"] | {"path": str(moved)}}
+
+
 @pytest.mark.parametrize("change", ["photo", "points"])
 def test_a_scene_that_changed_is_not_resumed(finished, scene, tmp_path, capsys, change):
     moved = Path(shutil.copytree(scene, tmp_path / "scene"))
