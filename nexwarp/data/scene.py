@@ -160,8 +160,7 @@ def load_scene(
 
     Raises:
         NotADirectoryError: a file, not a folder.
-        MissingError: no such folder, no scene in it, no images folder, or a photo, a mask or points that the
-            scene names are absent.
+        MissingError: no such folder, no scene in it, no images folder, or an absent photo, mask or file of points.
         TypeError, ValueError: an argument of the wrong type or out of range.
         SceneError: no such `format`, more than one kind of scene, damaged or malformed files, cameras that are not
             usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than 2 photos,
@@ -169,11 +168,10 @@ def load_scene(
     """
     _check_paths(path, images, masks, points)
     _check_downscale(downscale)
-    with scene_errors():
-        path = _scene_folder(path)
     random = isinstance(background, str) and background == RANDOM
     color = parse_color("white" if random else background)
     with quiet_pillow(), scene_errors():
+        path = _scene_folder(path)
         kind = find_format(path, format)
         capture = _read_capture(path, images, kind, follow_links, skip_missing)
         scene = _load(path, kind, capture, images, downscale, masks, color, points, progress)
