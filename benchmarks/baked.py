@@ -15,10 +15,10 @@ import torch
 import tyro
 
 import nexwarp as nw
-from nexwarp.bake.fit import bake
 from nexwarp.data import demo_folder
+from nexwarp.export.bake.fit import bake
+from nexwarp.export.web.atlas import as_stored, encode_baked
 from nexwarp.run.metrics import psnr
-from nexwarp.web.atlas import as_stored, encode_baked
 
 
 def main(run: Annotated[Path, tyro.conf.Positional], scene: str, downscale: int = 1) -> int:

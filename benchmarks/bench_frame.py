@@ -19,8 +19,8 @@ from benchmarks.gpu_time import gpu_time
 from benchmarks.scenes import SurfelScene, texture, workload
 from benchmarks.suite import Options
 from benchmarks.timing import MIB, Measurement, figure, process_memory, synchronize
-from nexwarp.finish.detail_limits import measure_detail_limits
-from nexwarp.representation.exposures import Exposures
+from nexwarp.model.exposures import Exposures
+from nexwarp.train.finish.detail_limits import measure_detail_limits
 
 STEADY_FRAMES = 50
 # The shape that `nexwarp train` gives a texture by default.

@@ -21,16 +21,16 @@ import tyro
 
 import nexwarp as nw
 from benchmarks.timing import git_commit
-from nexwarp.camera import resized
+from nexwarp.cameras.camera import resized
 from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.export.web.renderer import Renderer
+from nexwarp.export.web.scene_data import SceneData
+from nexwarp.export.web.scene_file import encode_scene
+from nexwarp.export.web.scene_reader import decode_scene
+from nexwarp.export.web.sections import matrix_shapes
 from nexwarp.model.model import Model
-from nexwarp.representation.texture import TextureShape
+from nexwarp.model.texture import TextureShape
 from nexwarp.train.presets import preset
-from nexwarp.web.renderer import Renderer
-from nexwarp.web.scene_data import SceneData
-from nexwarp.web.scene_file import encode_scene
-from nexwarp.web.scene_reader import decode_scene
-from nexwarp.web.sections import matrix_shapes
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import tyro
 import warp as wp
 
 from benchmarks.timing import git_commit
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.model.model import Model
 from nexwarp.train.blocks import CONTEXT, BlockTrainer, block_scene, merge_blocks, split_space

@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from nexwarp.buffers import render_buffers
 from nexwarp.data.views import View
 from nexwarp.io.files import written_aside
 from nexwarp.io.pictures import side_by_side, to_uint8
+from nexwarp.model.buffers import render_buffers
 from nexwarp.model.model import Model
 from nexwarp.run.folder import read_run
 from nexwarp.run.opened import open_model

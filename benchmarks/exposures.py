@@ -19,7 +19,7 @@ import tyro
 from benchmarks.timing import ROOT
 from nexwarp.data import View, load_scene
 from nexwarp.data.demo import demo_folder
-from nexwarp.representation.exposures import Exposures
+from nexwarp.model.exposures import Exposures
 from nexwarp.train.exposure_calibration import held_out_errors, observations, photo_gains
 
 

@@ -21,17 +21,17 @@ from benchmarks.exposures import gains_of
 from benchmarks.quality.metrics import RenderImage, smaller
 from benchmarks.quality.scenes import held_out_arc
 from benchmarks.timing import ROOT
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, load_scene
 from nexwarp.data.images import downscale_image
-from nexwarp.finish.auto_exposure import with_auto_exposure
-from nexwarp.finish.detail_limits import measure_detail_limits
-from nexwarp.finish.sh_smoothing import smooth_sh
 from nexwarp.io.pictures import save_png, side_by_side, to_uint8
-from nexwarp.representation.detail_limits import NEVER, DetailLimits
-from nexwarp.representation.exposures import Exposures
+from nexwarp.model.detail_limits import NEVER, DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.run.metrics import flip, psnr, ssim
 from nexwarp.train.config import Config
+from nexwarp.train.finish.auto_exposure import with_auto_exposure
+from nexwarp.train.finish.detail_limits import measure_detail_limits
+from nexwarp.train.finish.sh_smoothing import smooth_sh
 
 FACTORS = (1, 2, 4, 8)
 

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 

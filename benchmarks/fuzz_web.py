@@ -4,8 +4,8 @@ from pathlib import Path
 
 from benchmarks.fuzz_inputs import Files
 from benchmarks.fuzz_models import some_cameras, some_model
-from nexwarp.web.scene_file import SCENE_FILE, encode_scene
-from nexwarp.web.scene_reader import load_scene_file
+from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
+from nexwarp.export.web.scene_reader import load_scene_file
 
 
 def make_scene_files(folder: Path) -> list[Files]:

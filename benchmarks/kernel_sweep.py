@@ -16,7 +16,6 @@ import torch
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.determinism import deterministic
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.catalogue import all_kernels, fused_kernel_builds, ssim_tile_builds
 from nexwarp.kernels.rays import collect_rays_kernel, ray_list_kernels
@@ -24,6 +23,7 @@ from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.tsdf import fuse_kernel
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE, types
 from nexwarp.kernels.walk import BLOCK_DIM
+from nexwarp.machine import deterministic
 from nexwarp.ops._interop import array, launch
 from nexwarp.ops.expose import expose
 from nexwarp.ops.photometric import photometric_terms

@@ -28,7 +28,7 @@ PIXELS = 3  # every third pixel of the demo's cameras sees a point
 
 
 def read_mesh(path: Path) -> dict[str, np.ndarray]:
-    """Read what `nexwarp.run.mesh.save_mesh` writes: vertices, normals, colors and triangles."""
+    """Read what `nexwarp.export.mesh.save_mesh` writes: vertices, normals, colors and triangles."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     counts = [int(line.split()[2]) for line in data[:end].decode().splitlines() if line.startswith("element")]

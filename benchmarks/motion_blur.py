@@ -18,7 +18,7 @@ from nexwarp.data import demo_folder
 from nexwarp.data.demo import HEIGHT, VIEWS, WIDTH, demo_cameras
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.raytrace import render
-from nexwarp.representation.poses import PoseCorrections
+from nexwarp.model.poses import PoseCorrections
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.initial import initial_poses
 from nexwarp.train.motion_blur import decoded, encoded, moments

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
-from nexwarp.checks import check_range
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
+from nexwarp.errors import check_range
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.compact import decode, encode
-from nexwarp.representation.exposures import Exposures
+from nexwarp.model.exposures import Exposures
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
 from nexwarp.train.initial import starting_points

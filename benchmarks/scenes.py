@@ -12,7 +12,7 @@ from benchmarks.suite import Options
 from nexwarp import ops
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.paths import look_at
-from nexwarp.representation.surfels import Activated
+from nexwarp.model.surfels import Activated
 
 SH_DC = 0.28209479177387814
 GARDEN_WIDTH = 648  # of the images that garden_points.npz's intrinsics are for

@@ -20,9 +20,9 @@ import tyro
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.buffers import render_buffers
 from nexwarp.data import Scene, write_demo
-from nexwarp.memory import keep_freed_memory
+from nexwarp.machine import keep_freed_memory
+from nexwarp.model.buffers import render_buffers
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.report import StepReport

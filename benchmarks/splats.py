@@ -17,8 +17,8 @@ import tyro
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.export.surfels_ply import save_splats_ply
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model.surfels_ply import save_splats_ply
 from nexwarp.run.metrics import psnr
 
 UNIT_GAMMA = -40.0  # raw: gamma = 1 + exp(raw)

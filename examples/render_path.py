@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 import nexwarp as nw
-from nexwarp.camera import resized
+from nexwarp.cameras.camera import resized
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.paths import ellipse
 from nexwarp.io.pictures import save_png, to_uint8

@@ -11,19 +11,19 @@ if "RANK" in os.environ:
     # Of several ranks: torch's warnings of closed connections would bury the line that says which rank has ended.
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.cli.version import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.options import RenderOptions
-from nexwarp.render import Rendering, render
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.render import Rendering, render
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.api import train
 from nexwarp.train.config import Config
 from nexwarp.train.presets import preset

@@ -17,9 +17,9 @@ import torch
 
 import nexwarp as nw
 from nexwarp.data import Scene, write_demo
-from nexwarp.finish import auto_exposure
 from nexwarp.kernels import launch
 from nexwarp.train import presets
+from nexwarp.train.finish import auto_exposure
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
 

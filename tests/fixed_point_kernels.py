@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_point_add
+from nexwarp.native.fixed_point import fixed_point_add
 
 
 @wp.kernel(module="unique", enable_backward=False)

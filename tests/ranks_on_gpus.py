@@ -1,4 +1,4 @@
-"""A rank of `tests/test_ranks_on_gpus.py`: trains in every way that a step has, and prints a line of JSON for each.
+"""A rank of `test_ranks_on_gpus.py`: trains in every way that a step has, and prints a line of JSON for each.
 
     python -m torch.distributed.run --nproc-per-node=2 -m tests.ranks_on_gpus SCENE BACKEND ITERATIONS SURFELS
 
@@ -14,10 +14,10 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.data import Scene
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.ranks.ranks import Ranks
 from tests.ranks_support import digest
 
 

@@ -17,12 +17,12 @@ import torch
 from torch import nn
 
 from nexwarp.data import Scene
-from nexwarp.distributed.ranks import Ranks
-from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.kernels.launch import set_num_threads
 from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.trainer import Trainer
 from tests.trainer_support import state_of
 

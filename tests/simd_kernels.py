@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.native.simd import simd_functions
-from nexwarp.kernels.native.simd.slots import slot_functions
+from nexwarp.native.simd import simd_functions
+from nexwarp.native.simd.slots import slot_functions
 
 WIDTH = 8
 

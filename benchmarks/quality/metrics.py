@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.data.images import downscale_image, downscale_mask
 from nexwarp.io.pictures import to_uint8

@@ -22,7 +22,7 @@ from benchmarks.quality.results import METRICS
 from benchmarks.quality.rows import Row
 from benchmarks.quality.scenes import scene_of
 from benchmarks.timing import ROOT
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model

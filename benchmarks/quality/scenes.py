@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.quality.jobs import ARC_VIEWS, DEMO, THINNED, TrainingJob
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.scene import TEST_EVERY

@@ -28,7 +28,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File.generated(config, name, content=path.read_text(encoding="utf-8")))
-    for path in sorted([*ROOT.glob("nexwarp/web/page/*"), *ROOT.glob("nexwarp/web/shaders/*.wgsl")]):
+    for path in sorted([*ROOT.glob("nexwarp/export/web/page/*"), *ROOT.glob("nexwarp/export/web/shaders/*.wgsl")]):
         folder = DEMO_FOLDER if path.parent.name == "page" else f"{DEMO_FOLDER}/shaders"
         text = path.read_text(encoding="utf-8").replace("__TITLE__", DEMO_TITLE)
         files.append(File.generated(config, f"{folder}/{path.name}", content=text))

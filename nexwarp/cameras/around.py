@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
 
 WIDTH, HEIGHT = 1280, 720  # pixels

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import camera_poses, with_pose
 
 NEIGHBORS = 4  # nearest cameras of a similar direction, from which the neighbour is drawn

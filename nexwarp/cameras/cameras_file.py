@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 
-from nexwarp.camera import MAX_CAMERAS, Camera
-from nexwarp.checks import check_range, check_version
-from nexwarp.errors import FormatError, MissingError
+from nexwarp.cameras.camera import MAX_CAMERAS, Camera
+from nexwarp.errors import FormatError, MissingError, check_range, check_version
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import READ_ERRORS, read_json, write_json
 

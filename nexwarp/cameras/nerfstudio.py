@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import MAX_CAMERAS, Camera
+from nexwarp.cameras.camera import MAX_CAMERAS, Camera
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import Json, JsonObject, read_object

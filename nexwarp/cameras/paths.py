@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
-from nexwarp.checks import check_range
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import check_range
 
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
 ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral

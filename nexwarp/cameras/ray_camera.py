@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from nexwarp.camera import LARGEST_DISTANCE, Camera
-from nexwarp.checks import check_finite, check_range, check_tensors
+from nexwarp.cameras.camera import LARGEST_DISTANCE, Camera
+from nexwarp.errors import check_finite, check_range, check_tensors
 
 MAX_SIDE = 32768  # pixels
 MAX_PARAMETER = 1e3  # of a fisheye lens
@@ -82,7 +82,7 @@ class RayCamera:
 
     @classmethod
     def pinhole(cls, camera: Camera) -> "RayCamera":
-        """Return a pinhole camera as rays (x, y, 1); `nexwarp.render` renders the camera itself faster."""
+        """Return a pinhole camera as rays (x, y, 1); `nexwarp.model.render` renders the camera itself faster."""
         x, y = _pixel_centers(camera.width, camera.height)
         rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
         return cls(camera.viewmat.detach(), rays.to(camera.viewmat), camera.near, camera.focal, radial=False)

@@ -14,9 +14,10 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.data.sfm import SfmOptions, reconstruct
 from nexwarp.errors import SettingError
+from nexwarp.export.surfels_ply import MAX_EXTENT
 from nexwarp.model.detail import check_detail
-from nexwarp.model.surfels_ply import MAX_EXTENT
 from nexwarp.run import warmup
 from nexwarp.run.contents import EXPORT_FOLDER, RENDERS_FOLDER
 from nexwarp.run.export import export_mesh, export_run
@@ -24,7 +25,6 @@ from nexwarp.run.folder import read_metrics
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.run.optics import Kind, Optics
 from nexwarp.run.render_job import RenderOrder
-from nexwarp.sfm import SfmOptions, reconstruct
 from nexwarp.train.presets import preset
 
 

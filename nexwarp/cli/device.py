@@ -6,11 +6,11 @@ from contextlib import contextmanager
 import torch
 import warp as wp
 
-from nexwarp.distributed.join import Place, code_digest, is_rank
-from nexwarp.distributed.launch import check_count
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
+from nexwarp.train.ranks.join import Place, code_digest, is_rank
+from nexwarp.train.ranks.launch import check_count
+from nexwarp.train.ranks.ranks import Ranks
 
 
 def pick_device(name: str | None) -> torch.device:

@@ -13,7 +13,6 @@ from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Run_, option
 from nexwarp.data import Scene
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
@@ -24,6 +23,7 @@ from nexwarp.run.folder import SceneSource, read_metrics
 from nexwarp.run.lock import locked_run
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.train.config import MASK_MODES
+from nexwarp.train.ranks.ranks import Ranks
 
 
 @dataclass

@@ -22,10 +22,10 @@ from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.version import __version__
 from nexwarp.cli.view import ViewCommand
-from nexwarp.distributed.launch import launch
-from nexwarp.distributed.liveness import end_process, may_speak
 from nexwarp.errors import NexwarpError
-from nexwarp.memory import needed_memory
+from nexwarp.machine import needed_memory
+from nexwarp.train.ranks.launch import launch
+from nexwarp.train.ranks.liveness import end_process, may_speak
 
 PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {

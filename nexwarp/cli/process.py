@@ -10,12 +10,12 @@ from rich.console import Console
 
 from nexwarp.cli import display
 from nexwarp.cli.options import option
+from nexwarp.data.sfm import SfmOptions, process
+from nexwarp.data.sfm.photos import FILMS
+from nexwarp.data.sfm.pipeline import REPORT_FILE
+from nexwarp.data.sfm.process import FRAMES, video_identity
 from nexwarp.errors import RunError
 from nexwarp.io.json_files import READ_ERRORS, read_object
-from nexwarp.sfm import SfmOptions, process
-from nexwarp.sfm.photos import FILMS
-from nexwarp.sfm.pipeline import REPORT_FILE
-from nexwarp.sfm.process import FRAMES, video_identity
 
 SCENES = Path("scenes")
 

@@ -9,7 +9,6 @@ from rich.console import Console
 
 from nexwarp.cli.training_session import Stage, TrainingSession, shared_model
 from nexwarp.data import Scene
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import RunError
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
@@ -19,6 +18,7 @@ from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import CalibrateOnce
 from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.stages import OwnTeachers, divide, training_teacher
 from nexwarp.train.trainer import Trainer
 

@@ -18,10 +18,6 @@ from nexwarp.cli.process import SCENES, is_video, scene_of_video
 from nexwarp.cli.staged_session import StagedSession, extend_run
 from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
-from nexwarp.data.shared import shared_scene
-from nexwarp.distributed.join import is_rank
-from nexwarp.distributed.launch import check_count
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
 from nexwarp.model.model_file import load
@@ -42,6 +38,10 @@ from nexwarp.run.folder import (
 from nexwarp.run.log_sinks import PACKAGES, check_package
 from nexwarp.train.config import Config
 from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
+from nexwarp.train.ranks.join import is_rank
+from nexwarp.train.ranks.launch import check_count
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.ranks.shared import shared_scene
 from nexwarp.train.settings import parse_settings, setting, with_settings
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, plan_teachers
 

@@ -15,10 +15,9 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.eval import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import DivergedError, OutOfMemoryError, StorageError
 from nexwarp.io.json_files import Json, write_json
-from nexwarp.memory import needed_memory
+from nexwarp.machine import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
 from nexwarp.run.contents import (
@@ -36,6 +35,7 @@ from nexwarp.run.log import TrainingLog
 from nexwarp.run.log_sinks import PACKAGES
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.config import Config
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 

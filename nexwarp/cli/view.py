@@ -10,11 +10,11 @@ from rich.console import Console
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Host_, Port_, Run_, option
 from nexwarp.errors import FormatError
+from nexwarp.export.web.export import web_page
 from nexwarp.model.detail import check_detail
 from nexwarp.model.model_file import load
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.opened import OpenedModel, near_depth, open_model
-from nexwarp.web.export import web_page
 
 if TYPE_CHECKING:
     from nexwarp.viewer import GradualModel, Viewer

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nexwarp.checks import check_range
 from nexwarp.data.cache import cache_folder
 from nexwarp.data.demo_points import Rig, SparsePoint, sparse_points
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.raytrace import render
+from nexwarp.errors import check_range
 
 VERSION = 1  # of the scene's content; raise it when the output of `write_demo` changes
 WIDTH, HEIGHT, VIEWS, POINTS = 192, 144, 40, 4000

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, safe_name
 from nexwarp.data.views import View
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from nexwarp.memory import available_memory
+from nexwarp.machine import available_memory
 
 GIB = 2**30
 SHARE = 0.9  # largest share of the free memory for photos

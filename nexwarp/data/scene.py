@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data.background import parse_color
 from nexwarp.data.cache import PhotoCache, cache_folder
 from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, scene_errors

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 
-from nexwarp.camera import in_image
+from nexwarp.cameras.camera import in_image
 from nexwarp.data.points import InitialPoints
 from nexwarp.data.views import View
 

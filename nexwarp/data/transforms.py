@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from nexwarp.camera import MAX_CAMERAS
+from nexwarp.cameras.camera import MAX_CAMERAS
 from nexwarp.data.capture import (
     Capture,
     Cloud,

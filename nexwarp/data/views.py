@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data.cache import PhotoCache
 from nexwarp.data.capture import Photo
 from nexwarp.data.images import (

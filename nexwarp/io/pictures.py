@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nexwarp.checks import check_finite, check_range
-from nexwarp.errors import FormatError, MissingError, StorageError
+from nexwarp.errors import FormatError, MissingError, StorageError, check_finite, check_range
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import parse_json
 

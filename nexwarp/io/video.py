@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from nexwarp.checks import check_range
-from nexwarp.errors import FormatError, SettingError
+from nexwarp.errors import FormatError, SettingError, check_range
 from nexwarp.io.files import one_line, written_aside
 
 if TYPE_CHECKING:

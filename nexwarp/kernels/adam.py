@@ -10,7 +10,7 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.warp import lane_index, warp_size, warp_sum
+from nexwarp.native.warp import lane_index, warp_size, warp_sum
 
 VALUES, CPU_VALUES = 4, 1024  # of a thread
 

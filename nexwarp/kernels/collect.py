@@ -18,11 +18,11 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
+from nexwarp.native.vector_loads import record_row_function
+from nexwarp.native.warp import any_in_warp, lane_index, warp_size
 
 
 @functools.cache

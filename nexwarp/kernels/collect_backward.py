@@ -27,8 +27,11 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_point_add, fixed_point_record_sum
-from nexwarp.kernels.native.warp import (
+from nexwarp.kernels.surfel import hit_functions
+from nexwarp.kernels.types import types
+from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
+from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
+from nexwarp.native.warp import (
     any_in_warp,
     lane_index,
     warp_max,
@@ -36,9 +39,6 @@ from nexwarp.kernels.native.warp import (
     warp_size,
     warp_sum,
 )
-from nexwarp.kernels.surfel import hit_functions
-from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
 
 
 @functools.cache

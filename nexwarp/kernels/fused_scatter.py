@@ -24,7 +24,7 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.mma import PRELUDE
+from nexwarp.native.mma import PRELUDE
 
 # Lanes of a group after each step: x, y, x, x in the 8 x 2 pixels of a warp, whose lowest bit is the side of the cell.
 _BITS = (2, 16, 4, 8)

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.fused_texture import WARPS, backward_text, forward_text
+from nexwarp.native.fused_texture import WARPS, backward_text, forward_text
 
 FORWARD_THREADS, BACKWARD_THREADS = 256, 32 * WARPS  # of a block
 # Blocks that a multiprocessor holds at least, for which the compiler limits registers.

@@ -21,11 +21,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_point_units
-from nexwarp.kernels.native.simd import simd_functions
-from nexwarp.kernels.native.simd.slots import slot_functions
-from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.types import types
+from nexwarp.native.fixed_point import fixed_point_units
+from nexwarp.native.simd import simd_functions
+from nexwarp.native.simd.slots import slot_functions
+from nexwarp.native.vector_loads import load_function
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
 PRIME_Z = wp.constant(wp.uint32(805459861))

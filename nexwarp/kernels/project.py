@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import record_row_function, store_record_row_function
 from nexwarp.kernels.surfel import frame_functions
 from nexwarp.kernels.types import LIMIT_MARGIN, types
+from nexwarp.native.vector_loads import record_row_function, store_record_row_function
 
 # Nobody sees a surfel as small: its inverse is finite, and so are products with what a scene has else.
 SMALLEST_SCALE = 1e-20

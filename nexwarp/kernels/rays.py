@@ -17,10 +17,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import buffer_types
+from nexwarp.native.vector_loads import load_function
 
 # Relative to the lengths of the vectors: what rounding may change in the sums that decide whether a tile is culled.
 SLACK = 1e-5

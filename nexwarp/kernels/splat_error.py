@@ -12,12 +12,12 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_point_add
-from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import any_in_warp, lane_index, warp_sum
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import overflowed, surfel_at, walk, walk_functions
+from nexwarp.native.fixed_point import fixed_point_add
+from nexwarp.native.vector_loads import record_row_function
+from nexwarp.native.warp import any_in_warp, lane_index, warp_sum
 
 
 @functools.cache

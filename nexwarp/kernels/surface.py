@@ -19,11 +19,11 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 from nexwarp.kernels.surfel import hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import overflowed, walk, walk_functions
+from nexwarp.native.vector_loads import record_row_function
+from nexwarp.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 
 
 @functools.cache

@@ -21,9 +21,12 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.fixed_point import fixed_point_add, fixed_point_record_sum
-from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import (
+from nexwarp.kernels.surfel import hit_functions
+from nexwarp.kernels.types import types
+from nexwarp.kernels.walk import overflowed, walk, walk_functions
+from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
+from nexwarp.native.vector_loads import record_row_function
+from nexwarp.native.warp import (
     any_in_warp,
     ballot,
     from_lane,
@@ -34,9 +37,6 @@ from nexwarp.kernels.native.warp import (
     warp_size,
     warp_sum,
 )
-from nexwarp.kernels.surfel import hit_functions
-from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import overflowed, walk, walk_functions
 
 
 @functools.cache

@@ -17,8 +17,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.simd import simd_functions
 from nexwarp.kernels.types import types
+from nexwarp.native.simd import simd_functions
 
 # Relative to the terms of the sums that decide whether a block of pixels is culled: float32 has a tenth of it.
 BLOCK_SLACK = 1e-6

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.warp import from_lane, lane_index, owner_lane, warp_running_sum, warp_size
 from nexwarp.kernels.tiles import LARGEST_INT, span_function
 from nexwarp.kernels.types import types
+from nexwarp.native.warp import from_lane, lane_index, owner_lane, warp_running_sum, warp_size
 
 # A typed constant: a bare literal of this size would be an int32.
 SIGN = wp.constant(wp.uint32(2147483648))

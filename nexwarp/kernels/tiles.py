@@ -13,9 +13,9 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.native.vector_loads import load_function
 from nexwarp.kernels.surfel import frame_functions
 from nexwarp.kernels.types import types
+from nexwarp.native.vector_loads import load_function
 
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01

@@ -14,11 +14,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.staging import staging_functions
-from nexwarp.kernels.native.vector_loads import record_row_function
-from nexwarp.kernels.native.warp import ballot, lanes_below, population, sync_warp, warp_size
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
+from nexwarp.native.staging import staging_functions
+from nexwarp.native.vector_loads import record_row_function
+from nexwarp.native.warp import ballot, lanes_below, population, sync_warp, warp_size
 
 # Threads of a CUDA block.
 BLOCK_DIM = 128

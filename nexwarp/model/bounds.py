@@ -4,11 +4,11 @@ from collections.abc import Iterator, Mapping
 
 import torch
 
-from nexwarp.camera import LARGEST_DISTANCE
-from nexwarp.checks import check_values
+from nexwarp.cameras.camera import LARGEST_DISTANCE
+from nexwarp.errors import check_values
 from nexwarp.kernels.activate import SHORTEST
-from nexwarp.representation.detail_limits import NEVER
-from nexwarp.representation.texture import LARGEST_RESOLUTION
+from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.texture import LARGEST_RESOLUTION
 
 LARGEST_HALF = 65504.0
 ROUNDING = 1 + 1e-6  # of the texture's resolutions

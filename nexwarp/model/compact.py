@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import torch
 
-from nexwarp.checks import check_tensors
-from nexwarp.representation.detail_limits import NEVER
+from nexwarp.errors import check_tensors
+from nexwarp.model.detail_limits import NEVER
 
 CODE = ".code"  # end of the name of a tensor that decodes another
 # Names of the coded tensors of each kind. `DTYPES` has their types in the file; the others are as in full files.

@@ -5,12 +5,12 @@ import math
 
 import torch
 
-from nexwarp.checks import check_range
+from nexwarp.errors import check_range
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.model import Model
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture, TextureShape
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture, TextureShape
 
 ORDERED = "ordered"  # entry of `Model.meta`: surfels are ordered by their share of the pictures, largest first
 LEAST = 1e-4  # of a detail

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
+from nexwarp.model.background import Color
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import RenderOptions
-from nexwarp.render import Rendering
-from nexwarp.representation.background import Color
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.render import Rendering
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 
 
 class Parts(NamedTuple):

@@ -28,15 +28,15 @@ import torch
 from torch import nn
 
 from nexwarp import ops
-from nexwarp.camera import Camera, StagedCamera
+from nexwarp.cameras.camera import Camera, StagedCamera
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.memory import needed_memory
+from nexwarp.machine import needed_memory
+from nexwarp.model.background import Color, background_numbers
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.frame_request import FrameRequest
-from nexwarp.render import Rendering
-from nexwarp.representation.background import Color, background_numbers
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.surfels import Surfels
+from nexwarp.model.merged_texture import MergedTexture
+from nexwarp.model.render import Rendering
+from nexwarp.model.surfels import Surfels
 
 log = logging.getLogger(__name__)
 

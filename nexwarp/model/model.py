@@ -9,20 +9,20 @@ import torch
 from torch import nn
 from typing_extensions import Unpack
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
 from nexwarp.model import frames
+from nexwarp.model.background import Color, color_tensor
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.frame_request import FrameRequest, Parts
 from nexwarp.model.options import RenderChanges, RenderOptions
+from nexwarp.model.render import Rendering, render
 from nexwarp.model.render_rays import RayRendering, render_rays
-from nexwarp.render import Rendering, render
-from nexwarp.representation.background import Color, color_tensor
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 
 
 class Model(nn.Module):
@@ -144,8 +144,8 @@ class Model(nn.Module):
         Args:
             camera: one camera, or several, which may differ in size. Cameras are moved to the model's device. What a
                 `RayCamera` renders is not differentiable.
-            background: see `nexwarp.render`; None takes that of the options.
-            depth_jitter: see `nexwarp.render`; for training.
+            background: see `nexwarp.model.render`; None takes that of the options.
+            depth_jitter: see `nexwarp.model.render`; for training.
             generator: random generator of the jitter.
             changes: fields of `RenderOptions` to change for this rendering, such as `exposure="mean"`.
 

@@ -10,8 +10,7 @@ from typing import cast
 
 import torch
 
-from nexwarp.checks import check_range, check_tensors, check_version
-from nexwarp.errors import FormatError, MissingError
+from nexwarp.errors import FormatError, MissingError, check_range, check_tensors, check_version
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.io.safetensors_files import check_tensors_header
@@ -19,13 +18,13 @@ from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
 from nexwarp.model.compact import STORED, code_names, decode, encode
 from nexwarp.model.detail import ORDERED, check_detail, coarse_shape, surfel_count, texture_levels
+from nexwarp.model.detail_limits import NEVER, DetailLimits
+from nexwarp.model.exposures import BUFFERS, Exposures
+from nexwarp.model.merged_texture import MergedTexture, make_texture
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
-from nexwarp.representation.detail_limits import NEVER, DetailLimits
-from nexwarp.representation.exposures import BUFFERS, Exposures
-from nexwarp.representation.merged_texture import MergedTexture, make_texture
-from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture, TextureShape
+from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.texture import NeuralTexture, TextureShape
 
 FORMAT_VERSION = 1
 COMPACT_VERSION = 2  # of compact files, which older readers cannot read

@@ -7,7 +7,7 @@ from typing import Literal, TypedDict, get_args
 
 from typing_extensions import Unpack
 
-from nexwarp.checks import check_range
+from nexwarp.errors import check_range
 from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.ops.tiles import Order, check_order

@@ -1,19 +1,19 @@
-"""Rendering for cameras that are no pinholes: the stages of `nexwarp.render`, with rays instead of an image plane."""
+"""Rendering for cameras that are no pinholes: the stages of `render`, with rays instead of an image plane."""
 
 from dataclasses import dataclass
 
 import torch
 
 from nexwarp import ops
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
+from nexwarp.model.detail_limits import DetailLimits, limited_depths
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.surfels import Activated, Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records, reaches_of
-from nexwarp.representation.detail_limits import DetailLimits, limited_depths
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import Activated, Surfels
-from nexwarp.representation.texture import NeuralTexture
 
 # Parallel rays see plain colours as a camera does at this many times the scene's extent.
 FAR_AWAY = 1e4

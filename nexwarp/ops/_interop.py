@@ -10,8 +10,8 @@ import torch
 import warp as wp
 
 from nexwarp.kernels import launch as launching
-from nexwarp.kernels.native.fixed_point import HIGH, LOW
 from nexwarp.kernels.tiles import LARGEST_INT
+from nexwarp.native.fixed_point import HIGH, LOW
 from nexwarp.ops.startup import start_warp
 
 # What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.

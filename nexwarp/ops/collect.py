@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel, strip_width

@@ -20,7 +20,8 @@ from nexwarp.kernels.fused_texture import (
     order_gradients,
     pack_matrices,
 )
-from nexwarp.kernels.native.fused_texture import (
+from nexwarp.kernels.tiles import LARGEST_INT
+from nexwarp.native.fused_texture import (
     FEATURES,
     GRADIENTS,
     MATRICES,
@@ -30,7 +31,6 @@ from nexwarp.kernels.native.fused_texture import (
     logical_feature,
     logical_output,
 )
-from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.ops._interop import Context, array, device_of, graph_is_kept, launch
 from nexwarp.ops.half_gradients import HALF_GRADIENT
 

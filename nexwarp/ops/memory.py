@@ -4,7 +4,7 @@ import torch
 
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.kernels.tiles import LARGEST_INT
-from nexwarp.memory import available_memory
+from nexwarp.machine import available_memory
 
 GIB = 2**30
 # Fewer bytes are not compared with the free memory: asking for it takes up to a millisecond.

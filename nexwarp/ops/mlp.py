@@ -12,8 +12,8 @@ import warp as wp
 
 from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
 from nexwarp.kernels.launch import chunks
-from nexwarp.kernels.native.simd.mlp import BLOCKS, MOST_KEPT, MOST_ROWS, points_of
 from nexwarp.kernels.types import types
+from nexwarp.native.simd.mlp import BLOCKS, MOST_KEPT, MOST_ROWS, points_of
 from nexwarp.ops._interop import Argument, array, launch, real_of, uses_simd
 from nexwarp.ops.columns import parts_of, share_columns
 

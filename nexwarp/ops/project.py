@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Argument, Context, array, launch, real_of

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.rays import UNBOUNDED, collect_rays_kernel, ray_list_kernels
 from nexwarp.kernels.tiles import check_entries
 from nexwarp.kernels.types import types

@@ -3,7 +3,7 @@
 import torch
 from torch.autograd.function import once_differentiable
 
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Context, array, launch, real_of, uses_simd

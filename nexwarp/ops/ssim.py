@@ -4,7 +4,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.checks import check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.ssim import PAD, SIMD_WIDTH, rows_a_thread, ssim_kernels
 from nexwarp.kernels.ssim_tiles import THREADS, blocks_of, ssim_tile_kernels
 from nexwarp.ops._interop import Argument, Context, array, launch, real_of, uses_simd

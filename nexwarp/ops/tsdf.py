@@ -3,8 +3,8 @@
 import torch
 import warp as wp
 
-from nexwarp.camera import Camera
-from nexwarp.checks import check_tensors
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.tsdf import BLOCK_SIDE, fuse_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import array, launch

@@ -8,11 +8,11 @@ from typing import TypedDict, cast
 import torch
 
 from nexwarp.data import View
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.contents import COMPARE, TEST, picture_name
 from nexwarp.run.metrics import CONVENTION, check_available, flip, lpips_vgg, psnr, ssim
+from nexwarp.train.ranks.ranks import Ranks
 
 
 class Evaluation(TypedDict, total=False):

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.bake.fit import bake
-from nexwarp.bake.glb import check_package, save_glb
-from nexwarp.camera import Camera, resized
+from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.errors import RunError, SettingError
+from nexwarp.export.bake.fit import bake
+from nexwarp.export.bake.glb import check_package, save_glb
+from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
+from nexwarp.export.splats_spz import save_splats_spz
+from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.model.model_file import save_model
-from nexwarp.model.splats_spz import save_splats_spz
-from nexwarp.model.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.run.contents import (
     CAMERA_PATH_FILE,
     COMPACT_FILE,
@@ -28,7 +29,6 @@ from nexwarp.run.contents import (
     WEB_FILE,
 )
 from nexwarp.run.folder import SceneSource
-from nexwarp.run.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.run.opened import OpenedModel
 
 FORMATS = ("ply", "mesh", "compact", "cameras", "web", "glb", "spz")
@@ -50,7 +50,7 @@ def export_run(
             (transforms.json, camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
         folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
             in .html is one file with everything; None is `export/scene.html`.
-        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.model.surfels_ply.save_splats_ply`.
+        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.export.surfels_ply.save_splats_ply`.
         quality: "quantised" or "full", of a web page.
         device: renders what the texture is baked from, of "web" and "glb".
 
@@ -65,7 +65,7 @@ def export_run(
     if kind not in FORMATS:
         raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
     if kind == "web":
-        from nexwarp.web.export import export_web
+        from nexwarp.export.web.export import export_web
 
         out = folder or opened.folder / EXPORT_FOLDER / WEB_FILE
         title, cameras = run_title(opened), _all_cameras(opened)
@@ -105,7 +105,7 @@ def export_mesh(
         opened: the run, or a model with training cameras beside it.
         folder: output folder, created if it does not exist.
         device: where to render.
-        voxel: resolution of the mesh, see `nexwarp.run.mesh.extract_mesh`.
+        voxel: resolution of the mesh, see `nexwarp.export.mesh.extract_mesh`.
         far: farthest depth of the mesh, likewise.
         observe: progress, likewise.
 

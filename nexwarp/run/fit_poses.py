@@ -11,11 +11,11 @@ from contextlib import contextmanager
 
 import torch
 
-from nexwarp.camera import Camera
-from nexwarp.checks import check_range
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
+from nexwarp.errors import check_range
 from nexwarp.model.model import Model
-from nexwarp.representation.poses import corrected, pose_differences
+from nexwarp.model.poses import corrected, pose_differences
 
 STEPS = 80  # of each view; the first half sees the photo at half its size
 RATE = 5e-3  # Adam's first learning rate: radians, and shifts in scene scales

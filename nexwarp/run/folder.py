@@ -12,9 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nexwarp.checks import check_version
 from nexwarp.data import Scene, demo_folder, load_scene
-from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError
+from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
 from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.run.contents import (

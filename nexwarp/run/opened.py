@@ -6,17 +6,17 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import Camera
 from nexwarp.cameras.around import surrounding
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.finish.order import ordered
 from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.contents import CONFIG_FILE
 from nexwarp.run.folder import SceneSource, read_run
 from nexwarp.train.config import Config
+from nexwarp.train.finish.order import ordered
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Literal, cast, get_args
 import torch
 from typing_extensions import Unpack
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import camera_poses, with_pose
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.errors import SettingError

@@ -10,14 +10,14 @@ from typing import cast, get_args
 
 import torch
 
-from nexwarp.buffers import render_buffers, save_buffers
-from nexwarp.camera import Camera, resized
+from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS
 from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
+from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.kernels.catalogue import fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.adam import Moments, adam_step
-from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.losses import LossWeights
 
 

@@ -10,15 +10,15 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from nexwarp.camera import visible_points
+from nexwarp.cameras.camera import visible_points
 from nexwarp.data import Scene
 from nexwarp.errors import SceneError
 from nexwarp.model.detail import ORDERED
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.model import Model
-from nexwarp.representation.detail_limits import DetailLimits
-from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.graphs import Gradients
 from nexwarp.train.schedules import OptimizerMaker

@@ -9,8 +9,7 @@ from typing import Any
 
 import torch
 
-from nexwarp.checks import check_version
-from nexwarp.errors import CheckpointError, MissingError
+from nexwarp.errors import CheckpointError, MissingError, check_version
 from nexwarp.io.files import is_temporary, sync, temporary_name, write_atomically
 from nexwarp.io.json_files import READ_ERRORS, read_json
 from nexwarp.io.safetensors_files import check_tensors_header

@@ -5,13 +5,13 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from nexwarp.checks import check_range
-from nexwarp.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
+from nexwarp.errors import check_range
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE
+from nexwarp.model.render import MAX_JITTER
+from nexwarp.model.texture import check_sizes
 from nexwarp.ops.tiles import check_order
-from nexwarp.render import MAX_JITTER
-from nexwarp.representation.texture import check_sizes
 from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH
 from nexwarp.train.losses import LossWeights
 
 # Schedules are given for runs of this length and stretch with `iterations`.

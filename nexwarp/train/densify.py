@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from nexwarp.checks import check_range
-from nexwarp.representation.surfels import PARAMETERS, Surfels
+from nexwarp.errors import check_range
+from nexwarp.model.surfels import PARAMETERS, Surfels
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera, in_image
+from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.data import Scene
-from nexwarp.representation.exposures import (
+from nexwarp.model.exposures import (
     DECIMALS,
     EVEN,
     Exposures,

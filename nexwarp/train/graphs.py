@@ -9,9 +9,9 @@ from typing import NamedTuple, TypeVar
 import torch
 
 from nexwarp import ops
-from nexwarp.camera import StagedCamera
+from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.memory import needed_memory
+from nexwarp.machine import needed_memory
 from nexwarp.model.frames import release_graphs
 from nexwarp.model.options import RenderOptions
 from nexwarp.train.target import Target

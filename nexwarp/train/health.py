@@ -7,7 +7,7 @@ from typing import Protocol
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.errors import DivergedError
 from nexwarp.train.config import Config
 from nexwarp.train.report import StepReport

@@ -9,9 +9,9 @@ from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
-from nexwarp.representation.poses import PoseCorrections
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import TextureShape
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import TextureShape
 from nexwarp.train.config import Config
 
 INITIAL_OPACITY = 0.1

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from nexwarp.checks import check_range, check_tensors
+from nexwarp.errors import check_range, check_tensors
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim

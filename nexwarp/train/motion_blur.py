@@ -11,8 +11,8 @@ import torch
 
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.model.model import Model
-from nexwarp.render import Rendering
-from nexwarp.representation.poses import PoseCorrections
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.render import Rendering
 from nexwarp.train.step_losses import as_taken, clipped, exposed
 from nexwarp.train.target import Target
 

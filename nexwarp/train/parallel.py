@@ -14,19 +14,18 @@ import torch
 from torch import nn
 
 from nexwarp.data import Scene
-from nexwarp.determinism import derived_seed
-from nexwarp.distributed.ranks import Ranks
-from nexwarp.distributed.reducer import GradientReducer
 from nexwarp.errors import DivergedError, RankError, SceneError
-from nexwarp.memory import needed_memory
+from nexwarp.machine import derived_seed, needed_memory
 from nexwarp.model.frames import capturing
 from nexwarp.model.model import Model
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
 from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
 from nexwarp.train.step_losses import OwnLoss

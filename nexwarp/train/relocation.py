@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import torch
 
-from nexwarp.camera import Camera, reduced
-from nexwarp.distributed.ranks import Ranks
+from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.model.model import Model
+from nexwarp.train.ranks.ranks import Ranks
 
 
 @torch.no_grad()

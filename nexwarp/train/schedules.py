@@ -7,12 +7,12 @@ from typing import Any, cast
 
 import torch
 
+from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.tiles import Order
-from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.poses import PoseCorrections
-from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.densify import DensifyConfig

@@ -9,14 +9,14 @@ import dataclasses
 
 import torch
 
-from nexwarp.camera import Camera, visible_points
+from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.data import Scene, View
 from nexwarp.errors import SceneError
+from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
-from nexwarp.representation.merged_texture import MergedTexture
-from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.blocks import LEAST_SEEN
 from nexwarp.train.config import Config
 from nexwarp.train.graphs import Gradients

@@ -12,8 +12,8 @@ from functools import partial
 import torch
 
 from nexwarp.data import Scene
-from nexwarp.determinism import derived_seed
 from nexwarp.errors import OutOfMemoryError, SettingError
+from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.exposure_calibration import CalibrateOnce

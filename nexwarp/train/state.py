@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from nexwarp.checks import check_finite
 from nexwarp.data import Scene
+from nexwarp.errors import check_finite
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
-from nexwarp.representation.poses import PoseCorrections
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
 from nexwarp.train.presets import config_from_dict

@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping
 
 import torch
 
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.render import Rendering
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import expose
-from nexwarp.render import Rendering
-from nexwarp.representation.poses import PoseCorrections
-from nexwarp.representation.surfels import Surfels
-from nexwarp.representation.texture import NeuralTexture
 from nexwarp.train.config import Config
 from nexwarp.train.losses import depth_loss, training_losses
 from nexwarp.train.surface_losses import distortion_loss, normal_loss

@@ -3,7 +3,7 @@
 import torch
 
 from nexwarp import ops
-from nexwarp.render import Rendering
+from nexwarp.model.render import Rendering
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 
 # Iterations, of a run of 30,000, from which the losses count: those of 2DGS.

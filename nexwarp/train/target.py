@@ -6,11 +6,11 @@ from functools import cached_property
 
 import torch
 
-from nexwarp.camera import Camera, visible_points
+from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.data import Scene
-from nexwarp.render import jitter_factors
-from nexwarp.representation.background import Color
-from nexwarp.representation.poses import PoseCorrections
+from nexwarp.model.background import Color
+from nexwarp.model.poses import PoseCorrections
+from nexwarp.model.render import jitter_factors
 from nexwarp.train.config import Config
 from nexwarp.train.surface_losses import surface_factors
 from nexwarp.train.views import TrainingViews
@@ -29,7 +29,7 @@ class Target:
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
-        depth_jitter: as `nexwarp.render` takes it.
+        depth_jitter: as `nexwarp.model.render` takes it.
         view: (1,) int64, index of the training view; None where neither poses nor motions are learned.
         surface: factors of the normal and the distortion loss in this step.
     """

@@ -12,10 +12,10 @@ from contextlib import nullcontext
 
 import torch
 
-from nexwarp.camera import Camera
 from nexwarp.cameras.between import between
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
-from nexwarp.determinism import derived_seed
+from nexwarp.machine import derived_seed
 from nexwarp.model.frames import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
 from nexwarp.train.config import Config

@@ -8,30 +8,29 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene, View
-from nexwarp.determinism import deterministic, seed_everything, torch_threads
-from nexwarp.distributed.ranks import Ranks
 from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
-from nexwarp.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.io.files import one_line
-from nexwarp.memory import needed_memory
+from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.representation.exposures import Exposures
-from nexwarp.representation.surfels import PARAMETERS, Surfels
-from nexwarp.representation.texture import NeuralTexture
+from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
+from nexwarp.train.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.motion_blur import render_target
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates

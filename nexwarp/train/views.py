@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
-from nexwarp.representation.exposures import DECIMALS, Exposures
-from nexwarp.representation.poses import PoseCorrections
+from nexwarp.model.exposures import DECIMALS, Exposures
+from nexwarp.model.poses import PoseCorrections
 from nexwarp.train.exposure_calibration import ExposureCalibration
 
 # Photos stay on the GPU when they take less than this share of its free memory.

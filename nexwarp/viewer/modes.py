@@ -7,12 +7,12 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
-from nexwarp.render import Rendering
-from nexwarp.representation.surfels import Surfels
+from nexwarp.model.render import Rendering
+from nexwarp.model.surfels import Surfels
 
 MODES = {
     "image": "The picture: plain + textured + background.",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.viewer.camera_path import Keyframe, interpolate, path_json
 from nexwarp.viewer.modes import Settings
 from nexwarp.viewer.panel import Panel, set_value

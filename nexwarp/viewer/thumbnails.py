@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.model.model import Model
 from nexwarp.viewer.modes import Settings, draw
 from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing, thumbnails

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from nexwarp.camera import Camera
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import focus
 from nexwarp.viewer.pacing import MOST_SIDE
 

@@ -13,8 +13,8 @@ import torch
 
 from nexwarp.cli import main as cli
 from tests.cli.support import refused
+from tests.data.test_scene import make_scene
 from tests.subprocesses import python_path
-from tests.test_scene import make_scene
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

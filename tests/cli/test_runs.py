@@ -19,7 +19,7 @@ from nexwarp.run.metrics import CONVENTION, psnr
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
-from tests.test_scene import make_scene
+from tests.data.test_scene import make_scene
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

@@ -12,7 +12,7 @@ from tests.reference.sh import evaluate, plain_colors
 
 @dataclass(frozen=True)
 class Rendering:
-    """The buffers that nexwarp.render returns, by the same names."""
+    """The buffers that nexwarp.model.render returns, by the same names."""
 
     image: torch.Tensor
     plain: torch.Tensor

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.simd import simd_functions
-from nexwarp.kernels.native.simd.slots import slot_functions
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import overflowed, surfel_at, walk
+from nexwarp.native.simd import simd_functions
+from nexwarp.native.simd.slots import slot_functions
 
 
 def strip_width(tile_size: int) -> int:

@@ -14,8 +14,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.hashgrid import interpolation_functions
-from nexwarp.kernels.native.simd import simd_functions
 from nexwarp.kernels.types import types
+from nexwarp.native.simd import simd_functions
 
 WIDTH = 8
 

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.native.simd.mlp import backward_text, forward_text
 from nexwarp.kernels.types import types
+from nexwarp.native.simd.mlp import backward_text, forward_text
 
 
 @functools.cache

@@ -9,10 +9,10 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.cpu.collect import strip_functions, strip_width
-from nexwarp.kernels.native.simd import simd_functions
 from nexwarp.kernels.surfel import frame_functions, hit_functions
 from nexwarp.kernels.types import types
 from nexwarp.kernels.walk import overflowed, surfel_at, walk
+from nexwarp.native.simd import simd_functions
 
 
 @functools.cache

@@ -1,0 +1,276 @@
+"""Pinhole cameras, with OpenCV axes as in COLMAP: x right, y down, z forward."""
+
+from dataclasses import InitVar, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from nexwarp.errors import check_range
+
+ROTATION_TOLERANCE = 1e-3
+MAX_CAMERAS = 30_000  # of a file
+LARGEST_DISTANCE = 1e16  # of a camera from the origin, world units: its square is finite in single precision
+SMALLEST_FOCAL = 1e-16  # pixels
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). The ray through pixel coordinates (x, y) has the
+    camera-frame direction ((x - cx) / fx, (y - cy) / fy, 1): distances along it, in units of that vector, are z-depths.
+
+    Attributes:
+        viewmat: (4, 4) float, world to camera, a rigid motion. Rendering is differentiable with respect to it. A NumPy
+            array or nested lists become a float32 tensor on the CPU.
+        K: (3, 3) float, intrinsics in pixels, without skew; the principal point may lie outside the image. Arrays and
+            lists become a tensor as above, on the device of `viewmat`.
+        width: image width in pixels.
+        height: image height in pixels.
+        near: hits with a z-depth of at most this are ignored, world units.
+        fx, fy, cx, cy: focal lengths and principal point in pixels, the numbers in `K`.
+
+    Args:
+        checked: fx, fy, cx and cy of matrices that have been checked before: these are not checked again, which would
+            wait for a GPU. None checks `viewmat` and `K` and takes the numbers from `K`.
+
+    Raises:
+        TypeError: `viewmat` or `K` is neither a floating tensor nor numbers, or a number has the wrong type.
+        ValueError: a shape or device is wrong; a value is not finite; the translation of `viewmat` is beyond 1e16; its
+            rotation is a reflection, or differs from orthonormal by more than 1e-3; `K` has skew or a focal length
+            below 1e-16; a size is < 1; `near` is < 0 or beyond 1e16.
+    """
+
+    viewmat: torch.Tensor
+    K: torch.Tensor
+    width: int
+    height: int
+    near: float = 0.01
+    checked: InitVar[tuple[float, float, float, float] | None] = field(default=None, kw_only=True)
+    fx: float = field(init=False)
+    fy: float = field(init=False)
+    cx: float = field(init=False)
+    cy: float = field(init=False)
+
+    def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
+        if checked is None:
+            object.__setattr__(self, "viewmat", _as_tensor("viewmat", self.viewmat, None))
+            object.__setattr__(self, "K", _as_tensor("K", self.K, self.viewmat.device))
+        numbers = self._check() if checked is None else checked
+        for name, value in zip(("fx", "fy", "cx", "cy"), numbers, strict=True):
+            object.__setattr__(self, name, value)
+
+    def _check(self) -> tuple[float, float, float, float]:
+        """Return fx, fy, cx and cy; raise TypeError or ValueError where a field does not fit."""
+        viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
+        if self.K.device != self.viewmat.device:
+            raise ValueError(f"K: expected a tensor on {self.viewmat.device} as viewmat is, got one on {self.K.device}")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+        if isinstance(self.near, bool) or not isinstance(self.near, (int, float)):
+            raise TypeError(f"near: expected a number, got {type(self.near).__name__}")
+        check_range("near", self.near, 0, LARGEST_DISTANCE)
+        _check_rigid(viewmat)
+        _check_intrinsics(intrinsics)
+        (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+        return fx, fy, cx, cy
+
+    @property
+    def focal(self) -> float:
+        """Geometric mean of the focal lengths, in pixels (f of paper Eq. 4)."""
+        return (self.fx * self.fy) ** 0.5
+
+    @property
+    def pixel_focal(self) -> float:
+        """Focal length of the image's pixels: `focal` may be lower, to limit the detail of the texture."""
+        return (self.fx * self.fy) ** 0.5
+
+    @property
+    def device(self) -> torch.device:
+        """Device of `viewmat`."""
+        return self.viewmat.device
+
+    @property
+    def position(self) -> torch.Tensor:
+        """(3,) centre of projection in the world frame, differentiable with respect to `viewmat`."""
+        # Not a product: cuBLAS keeps 32 MiB for each stream, in a CUDA graph's memory too.
+        return -(self.viewmat[:3, :3] * self.viewmat[:3, 3:]).sum(0)
+
+    def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), of those behind the camera too."""
+        x = (points[:, None] * self.viewmat[:3, :3]).sum(-1) + self.viewmat[:3, 3]  # not a product: see `position`
+        depths = x[:, 2]
+        columns, rows = self.fx * x[:, 0] / depths + self.cx, self.fy * x[:, 1] / depths + self.cy
+        return torch.stack([columns, rows], dim=-1), depths
+
+    def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """Return the camera of a window of this image, in pixels; the window may extend beyond the image."""
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        checked = (self.fx, self.fy, self.cx - left, self.cy - top)
+        return replace(self, K=K, width=width, height=height, checked=checked)
+
+    def to(self, *args: Any, **kwargs: Any) -> "Camera":
+        """Return a copy with `viewmat` and `K` moved or converted; arguments as of `torch.Tensor.to`."""
+        return Camera(self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near)
+
+
+@dataclass(frozen=True)
+class StagedCamera(Camera):
+    """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
+
+    Attributes:
+        focals: (2,) `Camera.focal` and `Camera.pixel_focal` of the camera that was copied last, on the device of
+            `viewmat`; `fx` to `cy` are those of the first one.
+        falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
+    """
+
+    focals: torch.Tensor = field(kw_only=True)
+    falloff: torch.Tensor | None = field(default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, camera: Camera) -> "StagedCamera":
+        """Copy a camera into tensors of its own."""
+        return cls(
+            camera.viewmat.clone(),
+            camera.K.clone(),
+            camera.width,
+            camera.height,
+            camera.near,
+            checked=(camera.fx, camera.fy, camera.cx, camera.cy),
+            focals=camera.viewmat.new_tensor([camera.focal, camera.pixel_focal]),
+        )
+
+    @property
+    def focal(self) -> torch.Tensor:  # type: ignore[override]  # a graph reads the number from the device
+        """(1,) focal length in pixels, on the device."""
+        return self.focals[:1]
+
+    @property
+    def pixel_focal(self) -> torch.Tensor:  # type: ignore[override]
+        """(1,) focal length of the image's pixels, on the device."""
+        return self.focals[1:]
+
+    def copy_(self, camera: Camera) -> None:
+        """Overwrite the tensors but the falloff with those of another camera of the same size and near depth."""
+        self.viewmat.copy_(camera.viewmat)
+        self.K.copy_(camera.K)
+        # From pageable memory, which is read before the call returns.
+        focals = torch.tensor([camera.focal, camera.pixel_focal], dtype=torch.float64)
+        self.focals.copy_(focals.to(self.focals.dtype), non_blocking=True)
+
+
+def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.Tensor:
+    """Return a tensor as it is; an array or lists of numbers as a new float32 tensor on a device."""
+    if isinstance(value, torch.Tensor):
+        return value
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.ndim != 2:
+        raise TypeError(f"{name}: expected a torch.Tensor, an array or lists of numbers, got {type(value).__name__}")
+    return torch.tensor(numbers, dtype=torch.float32, device=device)
+
+
+def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
+    """Check a finite floating (size, size) tensor and return it as float64 on the CPU."""
+    if not tensor.is_floating_point():
+        raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
+    if tensor.shape != (size, size):
+        raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
+    if tensor.is_meta:
+        raise ValueError(f"{name}: expected a tensor with values, got one on the device meta")
+    matrix = tensor.detach().double().cpu()
+    if not bool(torch.isfinite(matrix).all()):
+        raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
+    return matrix
+
+
+def _check_rigid(viewmat: torch.Tensor) -> None:
+    rotation = viewmat[:3, :3]
+    error = (rotation.T @ rotation - torch.eye(3, dtype=viewmat.dtype)).abs().max().item()
+    if error > ROTATION_TOLERANCE:
+        raise ValueError(
+            f"viewmat: expected an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g}), got {error:.3g}"
+        )
+    if torch.linalg.det(rotation) < 0:
+        raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
+    if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
+        raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
+    if viewmat[:3, 3].abs().max() > LARGEST_DISTANCE:
+        moved = tuple(viewmat[:3, 3].tolist())
+        raise ValueError(f"viewmat: expected a translation of at most {LARGEST_DISTANCE:g}, got {moved}")
+
+
+def _check_intrinsics(intrinsics: torch.Tensor) -> None:
+    (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
+    if fx <= 0 or fy <= 0:
+        raise ValueError(f"K: expected focal lengths > 0, got fx={fx:g}, fy={fy:g}")
+    if min(fx, fy) < SMALLEST_FOCAL:
+        raise ValueError(f"K: expected focal lengths of at least {SMALLEST_FOCAL:g}, got fx={fx:g}, fy={fy:g}")
+    if skew != 0 or shear != 0:
+        raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
+    if last != [0.0, 0.0, 1.0]:
+        raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")
+
+
+def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """Return (M,) bool: which points project into an image; the arguments are those of `visible_points`."""
+    size = torch.tensor([width, height], device=pixels.device)
+    return (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+
+
+def visible_points(
+    pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Select the points that project into an image.
+
+    Args:
+        pixels: (M, 2) pixel coordinates of the points, x and y; may be infinite or NaN behind the camera.
+        depths: (M,) z-depths of the points; <= 0 is behind the camera.
+        width: image width in pixels.
+        height: image height in pixels.
+        mask: (H, W) bool, True for included pixels; None includes all.
+
+    Returns:
+        Indices (P,) int64 of the points' pixels, row-major, and z-depths (P,); None if there are no such points.
+    """
+    inside = in_image(pixels, depths, width, height)
+    column, row = pixels[inside].long().unbind(-1)
+    places, expected = row * width + column, depths[inside]
+    if mask is not None:
+        included = mask.flatten()[places]
+        places, expected = places[included], expected[included]
+    return (places, expected) if len(places) else None
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera with another image size in pixels and the same vertical field of view.
+
+    Pixels keep their aspect ratio: another aspect ratio of the image shows more or less at the sides. The principal
+    point keeps its offset from the centre, relative to the height.
+    """
+    check_range("width", width, 1)
+    check_range("height", height, 1)
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    scale = height / camera.height
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = camera.fx * scale, camera.fy * scale
+    K[0, 2] = (camera.cx - camera.width / 2) * scale + width / 2
+    K[1, 2] = camera.cy * scale
+    return replace(camera, K=K, width=width, height=height)
+
+
+def reduced(camera: Camera, height: int) -> Camera:
+    """Return the camera with an image at most `height` pixels tall, in the same aspect ratio."""
+    if camera.height <= height:
+        return camera
+    return resized(camera, max(round(camera.width * height / camera.height), 1), height)

@@ -1,0 +1,88 @@
+"""The baked scene: surfels, and an image of what the texture adds to their colours."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from nexwarp import ops
+from nexwarp.cameras.camera import Camera
+from nexwarp.export.bake.layout import Layout
+from nexwarp.export.bake.observe import Observations, hits_of, untextured
+from nexwarp.model.model import Model
+from nexwarp.model.surfels import Surfels
+
+
+@dataclass(frozen=True)
+class Baked:
+    """Surfels whose colour at a point is their plain colour plus a texel of the atlas, for all hits of a pixel.
+
+    Attributes:
+        model: the model that was baked.
+        surfels: its surfels, with SH that take over the texture's dependence on the direction.
+        seen: what the views see of the surfels.
+        layout: the surfels' texels in the atlas.
+        atlas: (height, width, 3) float32, added to the plain colours, sRGB.
+    """
+
+    model: Model
+    surfels: Surfels
+    seen: Observations
+    layout: Layout
+    atlas: torch.Tensor
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> torch.Tensor:
+        """Return the image (H, W, 3) of a camera at the mean exposure.
+
+        Of each pixel, the 8 heaviest hits have their texels; further hits have their plain colours.
+        """
+        hits = hits_of(untextured(self.model, self.surfels), camera)
+        plain = hits.plain_colors()
+        return hits.rendering.image + hits.blended(torch.maximum(self.added(hits.ids, hits.local), -plain))
+
+    def added(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
+        """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
+        return sample(self.atlas, self.layout.texels(ids, local))
+
+    def colors_from_mean_direction(self) -> torch.Tensor:
+        """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
+        return mean_colors(self.surfels, self.seen, self.model.options.sh_degree)
+
+    def quantised(self) -> "Baked":
+        """Return the scene with an atlas as an image of 8 bits holds it."""
+        codes, scale = encode_atlas(self.atlas)
+        return replace(self, atlas=decode_atlas(codes, scale))
+
+
+def mean_colors(surfels: Surfels, seen: Observations, sh_degree: int) -> torch.Tensor:
+    """Return the plain colours (N, 3) of surfels from the mean directions that the views see them in."""
+    return ops.plain_colors((surfels.sh0, surfels.shN), seen.directions, surfels.means.new_zeros(3), sh_degree)
+
+
+def encode_atlas(atlas: torch.Tensor) -> tuple[torch.Tensor, float]:
+    """Quantise an atlas.
+
+    Returns:
+        uint8 codes of the atlas' shape, 128 for 0; and the value that 127 steps stand for.
+    """
+    scale = max(float(atlas.abs().amax().clamp(max=1.0)), 1e-3) if atlas.numel() else 1.0
+    return (atlas / scale * 127).round().clamp(-127, 127).add(128).to(torch.uint8), scale
+
+
+def decode_atlas(codes: torch.Tensor, scale: float) -> torch.Tensor:
+    """Return the float32 atlas of codes."""
+    return (codes.float() - 128) * (scale / 127)
+
+
+def sample(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Interpolate the atlas (height, width, C) bilinearly at places (..., 2), column and row; differentiable.
+
+    Returns:
+        (..., C).
+    """
+    size = atlas.new_tensor([atlas.shape[1], atlas.shape[0]])
+    grid = (2 * places + 1) / size - 1
+    found = torch.nn.functional.grid_sample(
+        atlas.permute(2, 0, 1)[None], grid.reshape(1, -1, 1, 2), align_corners=False, padding_mode="border"
+    )
+    return found[0, :, :, 0].T.reshape(*places.shape[:-1], atlas.shape[2])

@@ -1,0 +1,138 @@
+"""The baked scene as a glTF file: one textured quad a surfel, for Blender, three.js and other programs."""
+
+import importlib.util
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import FormatError, SettingError
+from nexwarp.export.bake.baked import Baked
+from nexwarp.export.bake.layout import Layout, lay_out_boxes
+from nexwarp.export.bake.observe import axes
+from nexwarp.io.files import write_atomically
+from nexwarp.io.pictures import to_uint8
+from nexwarp.kernels.types import ALPHA_MAX
+
+# Programs draw where the texture's alpha is at least this, and nothing elsewhere: they need not sort the quads.
+CUTOFF = 0.3
+# The quads end where alpha falls to this: bilinear sampling needs what lies beyond the cut-off.
+LEAST_ALPHA = 0.5 * CUTOFF
+FEWEST = 8  # texels along an axis: alpha varies over every quad
+
+
+@torch.no_grad()
+def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camera], side: int = 4096) -> None:
+    """Write a baked scene as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
+
+    Colours are those at the mean exposure from the direction in which the views see each surfel. The mean of the
+    cameras' upward directions becomes +y.
+
+    Args:
+        path: file to write.
+        baked: the scene.
+        cameras: cameras of its views.
+        side: largest width and height of the texture.
+
+    Raises:
+        SettingError: trimesh, of the extra `glb`, is not installed.
+        FormatError: no surfel is opaque enough to be seen.
+        OSError: `path` cannot be written.
+    """
+    check_package()
+    import trimesh
+    from PIL import Image
+    from trimesh.exchange.gltf import export_glb
+
+    layout, pixels = _texture(baked, side)
+    if not len(layout.textured()):
+        raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
+    corners, places, faces = _quads(baked, layout)
+    mesh = trimesh.Trimesh(
+        vertices=corners @ upright(cameras).T,
+        faces=faces,
+        visual=trimesh.visual.TextureVisuals(
+            uv=places,
+            material=trimesh.visual.material.PBRMaterial(
+                name="surfels",
+                baseColorTexture=Image.fromarray(pixels, "RGBA"),
+                metallicFactor=0.0,
+                roughnessFactor=1.0,
+                alphaMode="MASK",
+                alphaCutoff=CUTOFF,
+                doubleSided=True,
+            ),
+        ),
+        process=False,
+    )
+    content = export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit)
+    write_atomically(Path(path), content)
+
+
+def check_package() -> None:
+    """Raise SettingError unless trimesh is installed."""
+    if importlib.util.find_spec("trimesh") is None:
+        raise SettingError("--format glb: needs the package trimesh, found none; pip install 'nexwarp[glb]'")
+
+
+def upright(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the rotation (3, 3) of the world that turns the mean of the cameras' upward directions to +y."""
+    ups = [-camera.viewmat[1, :3].detach().double().cpu().numpy() for camera in cameras]
+    up = np.sum(ups, axis=0) if ups else np.array([0.0, -1.0, 0.0])
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, -1.0, 0.0])
+    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    side /= np.linalg.norm(side)
+    return np.stack([side, up, np.cross(side, up)])
+
+
+def _texture(baked: Baked, side: int) -> tuple[Layout, np.ndarray]:
+    """Return a layout of the surfels' visible parts, and its texels (height, width, 4) uint8, RGBA."""
+    surfels = baked.surfels
+    opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
+    visible = opacities > CUTOFF
+    # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
+    reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
+    boxes = torch.cat([-reach, reach], dim=1)
+    layout = lay_out_boxes(boxes, visible, baked.seen.pixels, texel=1.0, side=side, fewest=FEWEST)
+    places, ids, local = layout.centres()
+    plain = baked.colors_from_mean_direction()
+    colors = plain[ids] + baked.added(ids, local)
+    exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
+    alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
+    pixels = np.zeros((layout.height, layout.width, 4), np.uint8)
+    columns, rows = places.cpu().numpy().T
+    pixels[rows, columns] = to_uint8(torch.cat([colors, alphas[:, None]], dim=1)).cpu().numpy()
+    return layout, pixels
+
+
+def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return corners (4 M, 3) in the world, their texture coordinates (4 M, 2) from the bottom left, faces (2 M, 3)."""
+    surfels = baked.surfels
+    ids = layout.textured()
+    boxes, rects = layout.boxes[ids], layout.rects[ids].double()
+    sides = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], device=boxes.device)
+    local = boxes[:, None, :2] + sides * (boxes[:, None, 2:] - boxes[:, None, :2])
+    offsets = local * surfels.scales.detach()[ids, None]
+    corners = surfels.means.detach()[ids, None] + sum(
+        offsets[..., i : i + 1] * axis[ids, None] for i, axis in enumerate(axes(surfels))
+    )
+    size = torch.tensor([layout.width, layout.height], device=boxes.device)
+    places = (rects[:, None, :2] + 0.5 + sides * (rects[:, None, 2:] - 1)) / size
+    places[..., 1] = 1 - places[..., 1]
+    first = 4 * np.arange(len(ids))[:, None]
+    faces = np.concatenate([first + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])
+    return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
+
+
+def _unlit(tree: dict[str, list[object]]) -> None:
+    """Make the material show its texture as it is, without light and without coarser levels of the texture."""
+    for material in tree["materials"]:
+        cast("dict[str, object]", material)["extensions"] = {"KHR_materials_unlit": {}}
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
+    for texture in tree["textures"]:
+        cast("dict[str, object]", texture)["sampler"] = 0

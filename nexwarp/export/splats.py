@@ -1,0 +1,145 @@
+"""Surfels as Gaussians for renderers of 3D Gaussian splatting, which linearise the projection at each centre.
+
+The linearisation is accurate for Gaussians that are small compared with their distance. A large surfel therefore
+becomes a grid of smaller, overlapping Gaussians in its plane, whose blended alpha approximates the surfel's.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+
+from nexwarp.cameras.camera import Camera
+
+# Distance between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %.
+SPACING = 1.4
+
+# Largest number of pieces on either side of a surfel's centre, along one axis.
+MOST_STEPS = 16
+
+# Number of opacities that grids are fitted for; other opacities scale the nearest grid.
+LEVELS = 128
+
+LARGEST_ALPHA, LEAST_ALPHA = 0.99, 1.0 / 255.0  # of a surfel's hit
+
+FITTING_STEPS = 40
+# Candidate widths of a row of pieces, in standard deviations of the surfel.
+WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """M Gaussians: whole surfels first, then pieces of split surfels.
+
+    Attributes:
+        ids: (M,) int64, indices of the surfels.
+        offsets: (M, 2) offsets of the centres along the surfel's two axes, world units.
+        scales: (M, 2) standard deviations along the two axes, world units.
+        opacities: (M,) opacities.
+        whole: number of whole surfels.
+    """
+
+    ids: torch.Tensor
+    offsets: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    whole: int
+
+
+@torch.no_grad()
+def split_large(
+    means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, cameras: Sequence[Camera], max_extent: float
+) -> Pieces:
+    """Split surfels that are large compared with their distance to the nearest camera. Gamma is taken as 1.
+
+    Args:
+        means: (N, 3) centres, world frame.
+        scales: (N, 2) standard deviations, world units.
+        opacities: (N,) in [0, 1].
+        cameras: cameras to render accurately from; without any, nothing is split.
+        max_extent: largest standard deviation, as a fraction of the distance; > 0, infinity splits nothing.
+
+    Returns:
+        The surfels that are small enough, in order, then the pieces of the others.
+    """
+    limit = means.new_full((len(means),), math.inf)
+    for camera in cameras:
+        position = camera.position.to(means)
+        limit = torch.minimum(limit, max_extent * (means - position).norm(dim=1))
+    peak = opacities.clamp(max=LARGEST_ALPHA)
+    level = (peak * LEVELS).round().clamp(1, LEVELS - 1)
+    reach = _reach(level / LEVELS)
+    steps = (reach[:, None] * scales / (SPACING * limit[:, None])).ceil().clamp(0, MOST_STEPS)
+    steps = torch.where(scales > limit[:, None], steps.clamp(min=1), torch.zeros_like(steps)).long()
+    whole = (steps == 0).all(dim=1) | (peak < LEAST_ALPHA)
+    ids = [whole.nonzero()[:, 0]]
+    offsets, sizes, alphas = [means.new_zeros(len(ids[0]), 2)], [scales[whole]], [opacities[whole]]
+    large = (~whole).nonzero()[:, 0]
+    kinds, kind = torch.unique(torch.cat([steps[large], level[large, None].long()], dim=1), dim=0, return_inverse=True)
+    for index, (across, along, grade) in enumerate(kinds.tolist()):
+        members = large[kind == index]
+        grid, size, alpha = (x.to(means) for x in _grid(across, along, grade))
+        ids.append(members.repeat_interleave(len(grid)))
+        offsets.append((scales[members, None] * grid).flatten(0, 1))
+        sizes.append((scales[members, None] * size).expand(-1, len(grid), 2).flatten(0, 1))
+        alphas.append((peak[members, None] * LEVELS / grade * alpha).clamp(max=LARGEST_ALPHA).flatten())
+    return Pieces(torch.cat(ids), torch.cat(offsets), torch.cat(sizes), torch.cat(alphas), len(ids[0]))
+
+
+def _reach(peak: torch.Tensor) -> torch.Tensor:
+    """Return the distance from the centre, in standard deviations, at which a hit's alpha falls to 1/255."""
+    return (2 * (peak / LEAST_ALPHA).log().clamp(min=0)).sqrt()
+
+
+@lru_cache(4096)
+def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Fit the pieces of a surfel of one opacity.
+
+    Blending adds optical depths -log(1 - alpha). Those of the pieces are scaled until their sum at each piece's centre
+    is the surfel's.
+
+    Args:
+        across: number of pieces on either side of the centre, along x.
+        along: likewise along y.
+        level: opacity of the surfel times `LEVELS`.
+
+    Returns:
+        Centres (P, 2) and standard deviations (2,), in standard deviations of the surfel, and opacities (P,).
+    """
+    peak = torch.tensor(level / LEVELS, dtype=torch.float64)
+    reach = float(_reach(peak))
+    spacing = [reach / n if n else 0.0 for n in (across, along)]
+    steps = [torch.arange(-n, n + 1, dtype=torch.float64) for n in (across, along)]
+    grid = torch.cartesian_prod(*steps) * torch.tensor(spacing, dtype=torch.float64)
+    grid = grid[_falloff(grid) * peak >= LEAST_ALPHA / 2]
+    side = torch.linspace(-reach, reach, 41, dtype=torch.float64)
+    places = torch.cartesian_prod(side, side)
+    wanted = peak * _falloff(places)
+    best = math.inf
+    # Opaque pieces of a row blend to a profile that is wider than each of them: try narrower pieces.
+    for narrower in WIDTHS if 0.0 in spacing else (1.0,):
+        candidate = torch.tensor([step / SPACING if step else narrower for step in spacing], dtype=torch.float64)
+        fitted = _fitted(grid, candidate, peak)
+        falloff = _falloff((places[:, None] - grid) / candidate)
+        error = float((1 - (1 - fitted * falloff).prod(1) - wanted).square().mean())
+        if error < best:
+            best, size, alpha = error, candidate, fitted
+    kept = alpha >= LEAST_ALPHA
+    return grid[kept], size, alpha[kept]
+
+
+def _falloff(offsets: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-0.5 * offsets.square().sum(-1))
+
+
+def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
+    """Return the opacities (P,) of pieces whose optical depths add up to the surfel's at each piece's centre."""
+    wanted = -torch.log1p(-peak * _falloff(grid))
+    falloff = _falloff((grid[:, None] - grid) / size)
+    depths = wanted / falloff.sum(1)
+    for _ in range(FITTING_STEPS):
+        total = -torch.log1p(torch.expm1(-depths) * falloff).sum(1)
+        depths = depths * (wanted / total).clamp(0.25, 4.0)
+    return -torch.expm1(-depths)

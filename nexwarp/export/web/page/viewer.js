@@ -1,0 +1,381 @@
+// The page: chooses a renderer, shows loading, and connects camera, controls and settings.
+
+import {BAKED_FILE, BakedRenderer} from "nexwarp/baked.js";
+import {FOV, Pose, basisOf} from "nexwarp/cameras/camera.js";
+import {Controls} from "nexwarp/controls.js";
+import {Pacing} from "nexwarp/pacing.js";
+import {Renderer} from "nexwarp/renderer.js";
+import {SceneError} from "nexwarp/scene.js";
+
+const SCENE_FILE = "scene.nxw";
+const MODES = {
+    image: "image",
+    plain: "without texture",
+    textured: "texture alone",
+    ids: "surfels",
+    depth: "depth",
+    weights: "weight of the heaviest",
+    normals: "normals",
+    alpha: "opacity",
+};
+const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU: the baked scene is faster there
+const FLIGHT_MILLISECONDS = 700; // from one camera to another
+const LINK_MILLISECONDS = 400; // after the last change, before the address follows
+const LARGEST_RATIO = 2; // canvas pixels to CSS pixels
+
+const element = id => document.getElementById(id);
+const query = new URLSearchParams(location.search);
+
+class Viewer {
+    #pose = null;
+
+    constructor() {
+        this.canvas = element("view");
+        this.pacing = new Pacing();
+        this.mode = "image";
+        this.flying = false;
+        this.exposure = "photos";
+        this.flight = null;
+        this.frames = 0;
+        this.index = 0;
+        this.state = "loading"; // "loading", "preview", "ready" or "failed": for tests
+    }
+
+    get pose() {
+        return this.#pose;
+    }
+
+    set pose(pose) {
+        this.#pose = pose;
+        this.flight = null;
+        this.#changed();
+    }
+
+    #changed() {
+        this.dirty = true;
+        this.pacing.touch();
+        clearTimeout(this.linking);
+        this.linking = setTimeout(() => this.#writeLink(), LINK_MILLISECONDS);
+    }
+
+    async start() {
+        try {
+            await this.#load(query.get("renderer"));
+        } catch (error) {
+            this.#fail(error);
+        }
+    }
+
+    // The exact renderer where there is a GPU for WebGPU; else, or where it fails, the baked scene.
+    async #load(wanted) {
+        const events = {
+            onProgress: progress => this.#progress(progress),
+            onStage: stage => this.#stage(stage),
+            onLost: reason => this.#lost(reason),
+        };
+        let failure = null, software = false;
+        if (wanted !== "baked") {
+            try {
+                const renderer = await Renderer.create(this.canvas, events);
+                this.renderer = renderer;
+                software = wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter);
+                if (software) throw new SceneError("WebGPU runs on the CPU here.");
+                await renderer.load(SCENE_FILE);
+            } catch (error) {
+                if (wanted === "webgpu" || this.running) throw error;
+                failure = error;
+            }
+        }
+        if (failure || wanted === "baked") {
+            this.renderer?.destroy();
+            this.renderer = null;
+            this.#freshCanvas();
+            try {
+                const renderer = await BakedRenderer.create(this.canvas, events);
+                this.renderer = renderer;
+                await renderer.load(BAKED_FILE);
+            } catch (error) {
+                if (!failure || !error.missing) throw error;
+                if (!software) throw failure;
+                this.#freshCanvas();
+                await this.#load("webgpu");
+                return;
+            }
+        }
+        this.#firstPicture();
+        this.state = "ready";
+        this.dirty = true;
+        element("loading").hidden = true;
+        this.#announce("The scene is loaded.");
+    }
+
+    // A canvas that has given a WebGPU context gives no other.
+    #freshCanvas() {
+        const fresh = this.canvas.cloneNode(true);
+        this.canvas.replaceWith(fresh);
+        this.canvas = fresh;
+    }
+
+    #stage(stage) {
+        if (stage === "header") this.#showPoster();
+        if (stage === "geometry") this.#firstPicture();
+        this.dirty = true;
+        this.refined = null;
+    }
+
+    #progress({bytes, total}) {
+        if (!bytes || this.state === "failed") return;
+        const size = x => (x / 1e6).toFixed(1);
+        element("progress").textContent = total ? `Loading ${size(bytes)} of ${size(total)} MB` : `Loading ${size(bytes)} MB`;
+        if (total) element("filled").style.width = `${(100 * bytes) / total}%`;
+    }
+
+    #showPoster() {
+        const blob = this.renderer?.poster, poster = element("poster");
+        if (!blob || this.running) return;
+        poster.src = URL.createObjectURL(blob);
+        poster.hidden = false;
+    }
+
+    // Set the camera and the controls up, once there is something to draw.
+    #firstPicture() {
+        if (this.running) return;
+        this.running = true;
+        this.state = "preview";
+        const {header} = this.renderer;
+        this.cameras = header.cameras;
+        this.basis = basisOf(header.up);
+        const camera = this.cameras[header.start] ?? null;
+        this.start_ = camera ? Pose.of(this.basis, camera, header.center) : this.#overview(header);
+        this.near = camera?.near ?? header.near;
+        this.index = header.start;
+        this.#pose = this.start_;
+        this.#readLink();
+        this.controls = new Controls(this.canvas, this);
+        this.#settings(header);
+        addEventListener("hashchange", () => this.#readLink());
+        new ResizeObserver(() => this.#resize()).observe(this.canvas);
+        this.#resize();
+        this.#run();
+    }
+
+    // Without cameras: the scene's bounds from the side.
+    #overview({bounds: [low, high], center, up}) {
+        const size = Math.hypot(...low.map((x, i) => high[i] - x)) || 1;
+        const pose = new Pose(basisOf(up), {eye: center, yaw: 0, pitch: -0.3, fov: 50, distance: size});
+        return pose.moved(0, 0, -1);
+    }
+
+    #settings({exposures}) {
+        const mode = element("mode"), camera = element("camera");
+        const modes = this.renderer.modes ?? Object.keys(MODES);
+        mode.replaceChildren(...modes.map(name => new Option(MODES[name] ?? name, name)));
+        mode.value = this.mode;
+        mode.onchange = () => this.setMode(mode.value);
+        const options = this.cameras.map(({name}, i) => new Option(name, String(i)));
+        camera.replaceChildren(...options);
+        camera.onchange = () => this.goTo(Number(camera.value));
+        for (const id of ["previous", "next"]) element(id).hidden = this.cameras.length < 2;
+        const fov = element("fov");
+        fov.oninput = () => (this.pose = this.pose.with({fov: Number(fov.value)}));
+        element("exposure-label").hidden = !exposures;
+        element("exposure").onchange = event => {
+            this.exposure = event.target.checked ? "photos" : "mean";
+            this.#changed();
+        };
+        element("quality").onchange = event => {
+            this.pacing.fixed = event.target.value === "auto" ? null : Number(event.target.value);
+            this.#changed();
+        };
+        const buttons = {previous: "[", next: "]", home: "Home", fly: "v", link: "l", full: "f", more: ",", help: "?"};
+        for (const [id, key] of Object.entries(buttons)) element(id).onclick = () => this.act(key);
+        element("full").hidden = !document.fullscreenEnabled;
+    }
+
+    // What a key or a button does; false for a key without meaning.
+    act(key) {
+        const actions = {
+            "[": () => this.goTo(this.index - 1),
+            "]": () => this.goTo(this.index + 1),
+            Home: () => this.#flyTo(this.start_, "Back at the start."),
+            v: () => this.#setFlying(!this.flying),
+            l: () => this.#copyLink(),
+            f: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
+            ",": () => this.#toggleSettings(),
+            m: () => this.#nextMode(),
+            "?": () => element("help-dialog").showModal(),
+        };
+        if (!Object.hasOwn(actions, key)) return false;
+        actions[key]();
+        return true;
+    }
+
+    goTo(index) {
+        const count = this.cameras.length;
+        if (!count) return;
+        this.index = ((index % count) + count) % count;
+        element("camera").value = String(this.index);
+        const camera = this.cameras[this.index];
+        this.#flyTo(Pose.of(this.basis, camera, this.renderer.header.center), `Camera ${camera.name}.`);
+    }
+
+    setMode(mode) {
+        this.mode = mode;
+        element("mode").value = mode;
+        this.#announce(`Showing ${MODES[mode] ?? mode}.`);
+        this.#changed();
+    }
+
+    #nextMode() {
+        const modes = [...element("mode").options].map(option => option.value);
+        this.setMode(modes[(modes.indexOf(this.mode) + 1) % modes.length]);
+    }
+
+    #setFlying(flying) {
+        this.flying = flying;
+        element("fly").setAttribute("aria-pressed", String(flying));
+        this.#announce(flying ? "Flying: drag to look around." : "Orbiting: drag to turn the scene.");
+    }
+
+    #toggleSettings() {
+        const settings = element("settings");
+        settings.hidden = !settings.hidden;
+        element("more").setAttribute("aria-expanded", String(!settings.hidden));
+    }
+
+    async pickTarget(x, y) {
+        const box = this.canvas.getBoundingClientRect(), {width, height} = this.canvas;
+        const hit = await this.renderer.pick(((x - box.left) / box.width) * width, ((y - box.top) / box.height) * height);
+        if (hit) this.#flyTo(this.pose.lookingAt(hit.position));
+    }
+
+    #flyTo(pose, text) {
+        if (text) this.#announce(text);
+        if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+            this.pose = pose;
+            return;
+        }
+        this.flight = {from: this.#pose, to: pose, since: performance.now()};
+        this.#changed();
+    }
+
+    async #copyLink() {
+        this.#writeLink();
+        try {
+            await navigator.clipboard.writeText(location.href);
+            this.#announce("The link is copied.", true);
+        } catch {
+            this.#announce("The address of this page is the link.", true);
+        }
+    }
+
+    #writeLink() {
+        const mode = this.mode === "image" ? "" : `&mode=${this.mode}`;
+        try {
+            history.replaceState(null, "", `#${this.#pose.toFragment()}${mode}`);
+        } catch {
+            // Some browsers limit how often, or forbid it for files.
+        }
+    }
+
+    #readLink() {
+        const text = location.hash.slice(1), pose = this.#pose.fromFragment(text);
+        const mode = new URLSearchParams(text).get("mode") ?? "image";
+        if (!pose) return;
+        this.pose = pose;
+        const modes = this.renderer.modes ?? Object.keys(MODES);
+        const offered = modes.includes(mode) ? mode : "image";
+        if (offered !== this.mode) {
+            this.mode = offered;
+            if (element("mode").options.length) element("mode").value = offered;
+        }
+    }
+
+    #resize() {
+        const ratio = Math.min(devicePixelRatio || 1, LARGEST_RATIO);
+        const width = Math.max(Math.round(this.canvas.clientWidth * ratio), 1);
+        const height = Math.max(Math.round(this.canvas.clientHeight * ratio), 1);
+        if (width === this.canvas.width && height === this.canvas.height && this.sized) return;
+        this.sized = true;
+        this.renderer.resize(width, height);
+        this.#changed();
+    }
+
+    // One frame after another, never two at once; nothing is drawn while nothing changes.
+    async #run() {
+        let before = performance.now();
+        while (this.state !== "failed") {
+            const now = await new Promise(done => requestAnimationFrame(done));
+            const seconds = Math.min((now - before) / 1000, 0.1);
+            before = now;
+            this.controls.advance(seconds);
+            this.#advanceFlight();
+            const refine = this.refined !== "full" && !this.pacing.moving;
+            if (!this.dirty && !refine) continue;
+            this.dirty = false;
+            const options = this.pacing.options;
+            this.refined = options.resolutionScale === 1 || this.pacing.fixed !== null ? "full" : "coarse";
+            this.drawing = true;
+            try {
+                await this.#draw(options);
+                this.drawing = false;
+            } catch (error) {
+                this.#fail(error);
+            }
+        }
+    }
+
+    async #draw(options) {
+        const camera = this.#pose.camera(this.canvas.width, this.canvas.height, this.near);
+        const {mode, exposure} = this;
+        const {milliseconds} = await this.renderer.render(camera, {...options, mode, exposure});
+        if (++this.frames === 1) {
+            element("poster").classList.add("gone");
+            performance.mark("first picture");
+        }
+        this.pacing.took(milliseconds, options);
+        this.#showStatus(options);
+    }
+
+    #advanceFlight() {
+        if (!this.flight) return;
+        const {from, to, since} = this.flight;
+        const t = Math.min((performance.now() - since) / FLIGHT_MILLISECONDS, 1);
+        this.#pose = t < 1 ? from.mixed(to, t * t * (3 - 2 * t)) : to;
+        if (t >= 1) this.flight = null;
+        this.#changed();
+    }
+
+    #showStatus({resolutionScale}) {
+        const {width, height} = this.canvas, {surfels} = this.renderer.info;
+        const size = `${Math.round(width * resolutionScale)} × ${Math.round(height * resolutionScale)}`;
+        const kind = this.renderer instanceof BakedRenderer ? "baked, WebGL" : "exact, WebGPU";
+        const time = this.pacing.milliseconds.toFixed(0);
+        element("status").textContent = `${surfels.toLocaleString("en")} surfels · ${size} · ${time} ms · ${kind}`;
+        const fov = Math.round(Math.min(Math.max(this.#pose.fov, FOV[0]), FOV[1]));
+        if (document.activeElement !== element("fov")) element("fov").value = String(fov);
+    }
+
+    #announce(text, visible = false) {
+        element("announce").textContent = text;
+        if (visible) element("status").textContent = text;
+    }
+
+    #lost(reason) {
+        this.#fail(new SceneError(`The picture stopped. ${reason?.message ?? reason} Reload the page to go on.`));
+    }
+
+    #fail(error) {
+        if (this.state === "failed") return;
+        this.state = "failed";
+        element("loading").hidden = true;
+        const message = element("message");
+        message.hidden = false;
+        const known = error instanceof SceneError;
+        message.textContent = known ? error.message : `The scene cannot be shown: ${error?.message ?? error}`;
+    }
+}
+
+const viewer = new Viewer();
+globalThis.nexwarp = viewer; // for tests and for the console
+viewer.start();

@@ -1,0 +1,154 @@
+"""Quantisation of the arrays of a scene file; docs/web.md describes it.
+
+Surfels are sorted along a Morton curve, and each chunk of 256 neighbours has ranges of its own, so that a surfel far
+away costs the others no precision.
+"""
+
+import numpy as np
+
+from nexwarp.model.detail_limits import NEVER
+
+CHUNK = 256
+MORTON_BITS = 10
+LOG_RANGE = (-60.0, 80.0)  # natural logarithms of scales and detail limits
+SMALLEST = 1e-26
+HALF_WIDTH = 1 / np.sqrt(2)  # largest magnitude of x and y of a rotation whose w is the largest component
+TURN = np.sin(np.pi / 8)  # likewise of z, as quarter turns about z are free too
+QUAT_BITS = (11, 11, 10)
+
+
+def morton_order(means: np.ndarray) -> np.ndarray:
+    """Return the indices (N,) of surfels along a Morton curve through the ranks of their coordinates."""
+    count = len(means)
+    code = np.zeros(count, np.int64)
+    for axis in range(3):
+        ranks = np.empty(count, np.int64)
+        ranks[np.argsort(means[:, axis], kind="stable")] = np.arange(count)
+        cells = ranks * 2**MORTON_BITS // max(count, 1)
+        for bit in range(MORTON_BITS):
+            code |= ((cells >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def chunk_count(count: int) -> int:
+    """Return the number of chunks of N surfels."""
+    return -(-count // CHUNK)
+
+
+def encode_chunks(values: np.ndarray, dtype: type) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise (N, C) values.
+
+    Returns:
+        (N, C) codes, and (chunks, C, 2) float32: value of code 0 and difference between codes.
+    """
+    starts = np.arange(0, len(values), CHUNK)
+    largest = np.iinfo(dtype).max
+    if len(values) == 0:
+        return np.zeros(values.shape, dtype), np.zeros((0, values.shape[1], 2), np.float32)
+    low = np.minimum.reduceat(values, starts).astype(np.float32)
+    high = np.maximum.reduceat(values, starts).astype(np.float32)
+    steps = ((high.astype(np.float64) - low) / largest).astype(np.float32)
+    ranges = np.stack([low, steps], axis=-1)
+    first, step = (np.repeat(x, CHUNK, axis=0)[: len(values)].astype(np.float64) for x in (low, steps))
+    codes = np.rint((values - first) / np.where(step > 0, step, 1.0))
+    return np.clip(codes, 0, largest).astype(dtype), ranges
+
+
+def decode_chunks(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Return the (N, C) float32 values of codes."""
+    whole = np.repeat(ranges, CHUNK, axis=0)[: len(codes)]
+    return whole[..., 0] + whole[..., 1] * codes.astype(np.float32)
+
+
+def _half_turns(
+    w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], ...]:
+    """Return a quaternion's products with 1, i, j, k."""
+    return (w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)
+
+
+def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise unit quaternions (N, 4), wxyz, of surfels.
+
+    A surfel looks the same after half turns about its axes, and after a quarter turn about z that swaps its axes. So
+    w can be the largest component, and |z| at most sin(22.5 degrees): fewer values, finer steps.
+
+    Returns:
+        (N,) uint32 codes of x, y (11 bits each) and z (10 bits); and (N,) bool: whether the axes were swapped.
+    """
+    w, x, y, z = quats.astype(np.float64).T
+    c = np.sqrt(0.5)
+    quarter = (c * (w - z), c * (x + y), c * (y - x), c * (z + w))
+    # The surfel's eight rotations: q, and q times a quarter turn, each times 1, i, j, k.
+    turned = np.stack([np.stack(one) for start in ((w, x, y, z), quarter) for one in _half_turns(*start)])
+    best = np.argmax(np.abs(turned[:, 0]), axis=0)
+    swapped = best >= 4
+    w, x, y, z = np.take_along_axis(turned, best[None, None], axis=0)[0]
+    flip = np.where(w < 0, -1.0, 1.0)
+    code = np.zeros(len(quats), np.uint32)
+    shift = 0
+    for value, bits, limit in zip((x, y, z), QUAT_BITS, (HALF_WIDTH, HALF_WIDTH, TURN), strict=True):
+        largest = 2**bits - 1
+        steps = np.rint((value * flip / limit + 1) / 2 * largest)
+        code |= np.clip(steps, 0, largest).astype(np.uint32) << np.uint32(shift)
+        shift += bits
+    return code, swapped
+
+
+def decode_quats(code: np.ndarray) -> np.ndarray:
+    """Return (N, 4) float32 unit quaternions, wxyz."""
+    parts, shift = [], 0
+    for bits, limit in zip(QUAT_BITS, (HALF_WIDTH, HALF_WIDTH, TURN), strict=True):
+        largest = 2**bits - 1
+        steps = (code >> np.uint32(shift)) & np.uint32(largest)
+        parts.append((steps / largest * 2 - 1) * limit)
+        shift += bits
+    xyz = np.stack(parts, axis=1)
+    w = np.sqrt(np.maximum(1 - (xyz**2).sum(1, keepdims=True), 0.0))
+    quats = np.concatenate([w, xyz], axis=1)
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def log_of(values: np.ndarray) -> np.ndarray:
+    """Return natural logarithms, within the range of the file."""
+    return np.log(np.maximum(values.astype(np.float64), SMALLEST)).clip(*LOG_RANGE)
+
+
+def encode_limits(limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise detail limits (N, 2) logarithmically.
+
+    Returns:
+        (N, 2) uint16 codes, 0 for 0 and 65535 for NEVER; and (2,) float32, logarithm of code 1 and step of the others.
+    """
+    known = (limits > 0) & (limits < NEVER)
+    logs = log_of(limits)
+    low, high = (logs[known].min(), logs[known].max()) if known.any() else (0.0, 0.0)
+    scale = np.array([low, (high - low) / 65533], np.float32)
+    codes = np.clip(np.rint((logs - scale[0]) / (scale[1] or 1.0)) + 1, 1, 65534)
+    return np.where(limits >= NEVER, 65535, np.where(limits > 0, codes, 0)).astype(np.uint16), scale
+
+
+def decode_limits(codes: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return (N, 2) float32 detail limits."""
+    values = np.exp(scale[0] + scale[1] * (codes.astype(np.float32) - 1))
+    return np.where(codes == 65535, np.float32(NEVER), np.where(codes == 0, 0, values)).astype(np.float32)
+
+
+def encode_levels(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise a hash grid (L, T, F), a range for each level.
+
+    Returns:
+        (L, T, F) uint8 codes, and (L, 2) float32: value of code 0 and difference between codes.
+    """
+    flat = grid.reshape(len(grid), -1).astype(np.float64)
+    low = flat.min(1)
+    ranges = np.stack([low, (flat.max(1) - low) / 255], 1).astype(np.float32)
+    steps = np.where(ranges[:, 1:] > 0, ranges[:, 1:], 1.0)
+    codes = np.clip(np.rint((flat - ranges[:, :1]) / steps), 0, 255)
+    return codes.astype(np.uint8).reshape(grid.shape), ranges
+
+
+def decode_levels(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Return a (L, T, F) float16 grid."""
+    values = ranges[:, 0, None, None] + ranges[:, 1, None, None] * codes.astype(np.float32)
+    return values.astype(np.float16)

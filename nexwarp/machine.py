@@ -1,0 +1,153 @@
+"""The machine's memory, and what makes runs repeatable on it."""
+
+import ctypes
+import functools
+import hashlib
+import os
+import random
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol, cast
+
+import numpy as np
+import torch
+
+from nexwarp.errors import UNKNOWN, OutOfMemoryError
+
+ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
+
+# Of CUDA's own calls, and of its libraries, which do not say how much they wanted.
+EXHAUSTED = re.compile(
+    r"CUDA (driver )?error:? .*out of memory|_ALLOC_FAILED|cudaErrorMemoryAllocation|bad_alloc", re.I
+)
+
+
+# Parameters of glibc's mallopt.
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
+
+
+@functools.cache
+def keep_freed_memory() -> None:
+    """Let glibc keep freed memory for reuse, up to 2 GiB, for work on a CPU; the first call counts.
+
+    Each rendering allocates the same blocks again. glibc would get those of over 32 MiB from the system each time,
+    page by page, which takes a third of a frame's time. NEXWARP_KEEP_MEMORY=0 in the environment leaves glibc as it
+    is. No effect with other C libraries.
+    """
+    if not sys.platform.startswith("linux") or os.environ.get("NEXWARP_KEEP_MEMORY") == "0":
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 64 * 2**20)):
+        mallopt(parameter, value)
+
+
+def available_memory() -> int:
+    """Free memory for this process in bytes: that of the machine or of its control group, whichever is smaller."""
+    import psutil
+
+    free = int(psutil.virtual_memory().available)
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            used = int((group / "memory.current").read_text())
+            stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            free = min(free, int(limit) - used + int(stat.get("inactive_file", 0)))
+    except (OSError, ValueError):  # no control groups of version 2
+        pass
+    return max(free, 0)
+
+
+def needed_memory(error: BaseException) -> str | None:
+    """Return what an error of torch or Warp says of the memory that it did not get; None for other errors."""
+    if not isinstance(error, (MemoryError, RuntimeError)):
+        return None
+    if isinstance(error, OutOfMemoryError):
+        return error.needed
+    match = ALLOCATION.search(str(error))
+    if match is not None:
+        return _readable(match[1])
+    exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
+    return UNKNOWN if exhausted else None
+
+
+def _readable(amount: str) -> str:
+    match = re.fullmatch(r"(\d+) ?bytes", amount, re.I)
+    if match is None:
+        return amount
+    size = int(match[1])
+    return f"{size / 2**30:.2f} GiB" if size >= 2**30 else f"{size / 2**20:.2f} MiB"
+
+
+class _DeterministicModule(Protocol):
+    """The part of `torch.utils.deterministic` that is used here."""
+
+    fill_uninitialized_memory: bool
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs.
+
+    A thread that first uses torch inside the context keeps this number.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: how threads split a sum changes its rounding, and files must be reproducible."""
+    with torch_threads(1):
+        yield
+
+
+@contextmanager
+def deterministic(wanted: bool) -> Iterator[None]:
+    """Make the results of torch's operations and of nexwarp's kernels independent of the order of threads.
+
+    Args:
+        wanted: False changes nothing.
+    """
+    if not wanted or torch.are_deterministic_algorithms_enabled():
+        yield
+        return
+    # The module replaces its own class to make this a property, which torch's stubs do not declare.
+    memory = cast(_DeterministicModule, torch.utils.deterministic)
+    fill = memory.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    memory.fill_uninitialized_memory = False  # every buffer is written before it is read
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
+        memory.fill_uninitialized_memory = fill
+
+
+def seed_everything(seed: int) -> None:
+    """Seed the global generators of Python, numpy and torch."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+    torch.manual_seed(seed)
+
+
+def derived_seed(seed: int, number: int, stream: int) -> int:
+    """Return a seed of its own for each of many series of random numbers, for `torch.Generator.manual_seed`.
+
+    Args:
+        seed: of the training.
+        number: of what they are for, such as a view among all that the training sees.
+        stream: number of the series.
+    """
+    digest = hashlib.blake2b(f"{seed} {number} {stream}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 1  # manual_seed takes 63 bits

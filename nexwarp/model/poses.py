@@ -1,0 +1,225 @@
+"""Rigid corrections of the training cameras and their motions during exposures, learned with the scene.
+
+Neither is in the paper.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import check_range, check_tensors
+from nexwarp.machine import one_thread
+
+# Terms of the series of sin(x) / x and the like: exact in double precision for angles of up to pi.
+TERMS = 14
+# Directions of the gauge that are this much smaller than the largest do not exist, as the scale of a single camera.
+LEAST_SINGULAR = 1e-6
+
+
+def rigid_motion(twist: torch.Tensor) -> torch.Tensor:
+    """Return exp(twist), the rigid motion of a twist; differentiable everywhere, at 0 too.
+
+    Args:
+        twist: (..., 6) rotation vector in radians, of at most pi in length, and velocity in world units. The motion
+            turns about the rotation vector while it moves with the velocity, for a unit of time.
+
+    Returns:
+        (..., 4, 4) matrices of determinant 1.
+    """
+    w, v = twist[..., :3], twist[..., 3:]
+    square = (w * w).sum(-1)[..., None, None]
+    # sin(x) / x, (1 - cos x) / x^2 and (x - sin x) / x^3 are series in x^2, so that nothing is divided by 0.
+    first, second, third = (_series(square, lowest) for lowest in (1, 2, 3))
+    zero = torch.zeros_like(w[..., 0])
+    x, y, z = w.unbind(-1)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    twice, eye = skew @ skew, torch.eye(3, dtype=twist.dtype, device=twist.device)
+    rotation = eye + first * skew + second * twice
+    shift = (eye + second * skew + third * twice) @ v[..., None]
+    return nn.functional.pad(torch.cat([rotation, shift], dim=-1), (0, 0, 0, 1)) + _last_row(twist)
+
+
+def _series(square: torch.Tensor, lowest: int) -> torch.Tensor:
+    """Sum over k of (-square)^k / (2 k + lowest)!."""
+    total = torch.zeros_like(square)
+    for k in reversed(range(TERMS)):
+        total = total * -square + 1 / math.factorial(2 * k + lowest)
+    return total
+
+
+def _last_row(like: torch.Tensor) -> torch.Tensor:
+    # Assigning a number would copy it from the CPU, which a CUDA graph cannot capture.
+    return nn.functional.pad(torch.ones(1, 1, dtype=like.dtype, device=like.device), (3, 0, 3, 0))
+
+
+def corrected(viewmat: torch.Tensor, twist: torch.Tensor, pivot: torch.Tensor) -> torch.Tensor:
+    """Return a viewmat (4, 4) after a small motion (6,) about a point on its optical axis; differentiable.
+
+    About a point of the scene, a turn and a shift change an image in different ways. About the camera's own centre both
+    move the image sideways, which gradient descent cannot tell apart.
+
+    Args:
+        viewmat: (4, 4) world to camera.
+        twist: (6,) radians, and a shift in world units.
+        pivot: () z-depth of the point, world units.
+    """
+    motion = rigid_motion(twist)
+    ahead = torch.cat([torch.zeros_like(twist[:2]), pivot[None]])
+    shift = motion[:3, 3] + ahead - motion[:3, :3] @ ahead
+    return torch.cat([torch.cat([motion[:3, :3], shift[:, None]], 1), motion[3:]]) @ viewmat
+
+
+class PoseCorrections(nn.Module):
+    """Rigid corrections of V cameras, about points of the scene that they see; see `corrected`.
+
+    The photos determine poses up to a similarity of the world: a common rotation, shift and scale of all cameras and
+    surfels changes no rendering (the gauge). `keep_gauge` removes from the corrections what is such a common motion, to
+    first order, so that the corrected cameras stay where the given ones are, and with them the test cameras.
+
+    A camera that moves while its photo is exposed has also a motion, a twist from the start to the end of the exposure
+    about the same point; the corrected pose is that in the middle. A photo cannot tell a motion from its reverse.
+
+    Attributes:
+        corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`. It takes
+            no gradient where only motions are learned.
+        motions: (V, 6) parameter, pixels that the turn moves the picture, and pixels that the shift moves the point
+            about which it turns; None where cameras stand still.
+        scale: world units.
+
+    Buffers, not saved:
+        gauge: (6 V, G) orthonormal directions that change no rendering, G <= 7.
+        pivots: (V,) z-depths of the points about which the corrections turn, world units.
+        pixels: (V,) angles of a pixel, radians.
+    """
+
+    gauge: torch.Tensor
+    pivots: torch.Tensor
+    pixels: torch.Tensor
+
+    motions: nn.Parameter | None
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        scale: float,
+        depths: Sequence[float] | None = None,
+        *,
+        refine: bool = True,
+        motions: torch.Tensor | None = None,
+    ) -> None:
+        """Start with no correction.
+
+        Args:
+            cameras: the V given cameras.
+            scale: of the scene, world units > 0.
+            depths: V typical z-depths of what the cameras see, world units > 0; None is `scale`.
+            refine: whether corrections are learned.
+            motions: (V, 6) pixels, to start with; None lets the cameras stand still.
+        """
+        super().__init__()
+        check_range("scale", scale, 1e-30, 1e30)
+        self.scale = scale
+        self.corrections = nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=refine)
+        self.motions = None if motions is None else nn.Parameter(motions.clone())
+        viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
+        pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
+        self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float().contiguous(), persistent=False)
+        self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
+        self.register_buffer("pixels", torch.tensor([1 / camera.focal for camera in cameras]), persistent=False)
+
+    def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
+        """Return the corrected viewmat (4, 4) of a view; differentiable.
+
+        Args:
+            given: (4, 4) the given viewmat.
+            view: index of the camera, a number or a (1,) int64 tensor.
+        """
+        twist = _row(self.corrections, view)
+        return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), _row(self.pivots, view))
+
+    def moment(self, middle: Camera, view: int | torch.Tensor, time: float) -> Camera:
+        """Return the camera of a view at a moment of its exposure; differentiable.
+
+        Args:
+            middle: the camera in the middle of the exposure, corrected.
+            view: index of the camera, a number or a (1,) int64 tensor.
+            time: from -0.5, the start of the exposure, to 0.5, its end.
+        """
+        if self.motions is None:
+            return middle
+        twist, pivot = _row(self.motions, view) * _row(self.pixels, view), _row(self.pivots, view)
+        viewmat = corrected(middle.viewmat, time * torch.cat([twist[:3], pivot * twist[3:]]), pivot)
+        checked = (middle.fx, middle.fy, middle.cx, middle.cy)
+        return dataclasses.replace(middle, viewmat=viewmat, checked=checked)
+
+    def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
+        """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
+        checked = (given.fx, given.fy, given.cx, given.cy)
+        return dataclasses.replace(given, viewmat=self.viewmat(given.viewmat, view), checked=checked)
+
+    @torch.no_grad()
+    def cameras(self, given: Sequence[Camera]) -> list[Camera]:
+        """Return the corrected cameras of all views, without a gradient."""
+        return [self.camera(camera, index) for index, camera in enumerate(given)]
+
+    def prior(self, view: torch.Tensor) -> torch.Tensor:
+        """Return the squared length of a view's correction and motion, a scalar: what keeps both small."""
+        prior = self.corrections.index_select(0, view).square().sum()
+        if self.motions is None:
+            return prior
+        return prior + (self.motions.index_select(0, view) * self.pixels.index_select(0, view)).square().sum()
+
+    @torch.no_grad()
+    def keep_gauge(self) -> None:
+        """Remove from the corrections, in place, what moves all cameras as one."""
+        flat = self.corrections.view(-1)
+        flat -= self.gauge @ (self.gauge.T @ flat)
+
+    def load(self, corrections: torch.Tensor, motions: torch.Tensor | None = None) -> None:
+        """Overwrite corrections and motions, in place; ValueError where a shape is another, or motions lack."""
+        check_tensors({"corrections": (corrections, tuple(self.corrections.shape))})
+        self.corrections.data.copy_(corrections)
+        if self.motions is not None:
+            if motions is None:
+                raise ValueError("motions: expected those of the exposures, got None")
+            check_tensors({"motions": (motions, tuple(self.motions.shape))})
+            self.motions.data.copy_(motions)
+
+
+def _row(values: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
+    """Return the values of a view, whose index is a number or a (1,) tensor."""
+    return values[view] if isinstance(view, int) else values.index_select(0, view)[0]
+
+
+def _gauge_directions(viewmats: torch.Tensor, pivots: torch.Tensor, scale: float) -> torch.Tensor:
+    """Orthonormal basis (6 V, G) of the corrections that a similarity of the world makes, to first order."""
+    rotations, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    centers = -(rotations.mT @ shifts[..., None])[..., 0]
+    offsets = centers - centers.mean(0)  # about the cameras' middle: turns and shifts are then of like size
+    forward = torch.tensor([[0.0, 0.0, 1.0]], dtype=viewmats.dtype)
+    columns = []
+    for axis in torch.eye(3, dtype=viewmats.dtype):
+        turned = rotations @ axis
+        moved = (rotations @ torch.linalg.cross(axis.expand_as(offsets), offsets)[..., None])[..., 0]
+        # The same motion, written about the pivots instead of the cameras' centres.
+        moved = moved - torch.linalg.cross(pivots[:, None] * forward, turned)
+        columns += [torch.cat([turned, moved / scale], -1), torch.cat([torch.zeros_like(turned), turned], -1)]
+    outward = -(rotations @ offsets[..., None])[..., 0] / scale
+    columns.append(torch.cat([torch.zeros_like(outward), outward], -1))
+    with one_thread():  # the same bits whatever the number of cores
+        basis, sizes, _ = torch.linalg.svd(torch.stack(columns, -1).flatten(0, 1), full_matrices=False)
+    return basis[:, sizes > LEAST_SINGULAR * sizes[0]]
+
+
+def pose_differences(one: torch.Tensor, other: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the angles (V,) in degrees and distances of the centres (V,) in world units of viewmats (V, 4, 4)."""
+    first, second = one.double(), other.double()
+    turn = first[:, :3, :3] @ second[:, :3, :3].mT
+    # From the chord, which is exact for small angles, where the cosine is not.
+    chord = torch.linalg.matrix_norm(turn - torch.eye(3, dtype=turn.dtype, device=turn.device)) / 8**0.5
+    centers = [-(x[:, :3, :3].mT @ x[:, :3, 3:])[..., 0] for x in (first, second)]
+    return torch.rad2deg(2 * torch.asin(chord.clamp(max=1.0))), (centers[0] - centers[1]).norm(dim=-1)

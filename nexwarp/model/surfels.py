@@ -1,0 +1,183 @@
+"""The surfels: geometry and plain (non-textured) appearance (paper Sec. 4.1)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from nexwarp import ops
+from nexwarp.errors import check_finite, check_tensors
+from nexwarp.kernels.types import MAX_SH_DEGREE
+
+COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 6
+# Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
+END = 1e-6
+
+PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
+
+
+class Activated(NamedTuple):
+    """Activated geometry of N surfels, as the kernels take it; differentiable.
+
+    Attributes:
+        means: (N, 3) centres, world units.
+        quats: (N, 4) unit rotations surfel to world, wxyz.
+        scales: (N, 2) along the surfel's x and y axes, world units.
+        opacities: (N,) in (0, 1).
+        gammas: (N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    gammas: torch.Tensor
+
+
+class Surfels(nn.Module):
+    """N surfels. The parameters are raw values, the properties are activated ones.
+
+    Parameters (raw): `means` (N, 3) world units; `raw_quats` (N, 4) wxyz, any length but zero; `log_scales` (N, 2);
+    `logit_opacities` (N,); `raw_gammas` (N, 2), gamma = 1 + exp(raw); `sh0` (N, 1, 3); `shN` (N, C - 1, 3).
+
+    Properties (activated), differentiable: `quats` (N, 4) wxyz unit, surfel to world; `normals` (N, 3), the z axes;
+    `scales` (N, 2) world units; `opacities` (N,) in (0, 1); `gammas` (N, 2) >= 1; `sh` (N, C, 3).
+    """
+
+    means: nn.Parameter
+    raw_quats: nn.Parameter
+    log_scales: nn.Parameter
+    logit_opacities: nn.Parameter
+    raw_gammas: nn.Parameter
+    sh0: nn.Parameter
+    shN: nn.Parameter
+
+    def __init__(self, raw: dict[str, torch.Tensor]) -> None:
+        """Take the raw values by parameter name, as `state_dict` returns them."""
+        super().__init__()
+        shapes = {
+            "means": ("N", 3),
+            "raw_quats": ("N", 4),
+            "log_scales": ("N", 2),
+            "logit_opacities": ("N",),
+            "raw_gammas": ("N", 2),
+            "sh0": ("N", 1, 3),
+            "shN": ("N", "C - 1", 3),
+        }
+        if raw.keys() != shapes.keys():
+            raise ValueError(f"raw: expected the keys {sorted(shapes)}, got {sorted(raw)}")
+        check_tensors({name: (raw[name], shape) for name, shape in shapes.items()})
+        check_coefficients("shN", raw["shN"].shape[1] + 1)
+        for name in shapes:
+            self.register_parameter(name, nn.Parameter(raw[name]))
+
+    @classmethod
+    def from_activated(
+        cls,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        gammas: torch.Tensor,
+        sh: torch.Tensor,
+    ) -> "Surfels":
+        """Make surfels with new leaf parameters from activated values.
+
+        Args:
+            means: (N, 3) centres, world units.
+            quats: (N, 4) rotations surfel to world, wxyz, of any length > 0.
+            scales: (N, 2) > 0, world units along the surfel's x and y axes.
+            opacities: (N,) in [0, 1].
+            gammas: (N, 2) >= 1; 1 is a Gaussian, large values a hard-edged quad.
+            sh: (N, C, 3) spherical harmonics of the plain colour, DC first; C = (d + 1)^2, d of 0 to 6.
+
+        Raises:
+            TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
+        """
+        arguments = {
+            "means": (means, ("N", 3)),
+            "quats": (quats, ("N", 4)),
+            "scales": (scales, ("N", 2)),
+            "opacities": (opacities, ("N",)),
+            "gammas": (gammas, ("N", 2)),
+            "sh": (sh, ("N", "C", 3)),
+        }
+        check_tensors(arguments)
+        if means.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"means: expected float32 or float64, got {means.dtype}")
+        check_coefficients("sh", sh.shape[1])
+        for name, (tensor, _) in arguments.items():
+            check_finite(name, tensor)
+        largest = quats.abs().amax(dim=-1, keepdim=True)
+        _check_each("quats", largest[..., 0] > 0, quats, "a length > 0")
+        _check_each("scales", scales > 0, scales, "values > 0")
+        _check_each("opacities", (opacities >= 0) & (opacities <= 1), opacities, "values in [0, 1]")
+        _check_each("gammas", gammas >= 1, gammas, "values >= 1")
+        raw = {
+            "means": means,
+            "raw_quats": nn.functional.normalize(quats / largest, dim=-1),
+            "log_scales": scales.log(),
+            "logit_opacities": torch.logit(opacities, eps=END),
+            "raw_gammas": (gammas - 1).clamp_min(END).log(),
+            "sh0": sh[:, :1],
+            "shN": sh[:, 1:],
+        }
+        return cls({name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in raw.items()})
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.means.device
+
+    def activated(self) -> Activated:
+        """Return the activated geometry from one kernel; up to rounding, the values of the properties."""
+        raw = (self.raw_quats, self.log_scales, self.logit_opacities, self.raw_gammas)
+        return Activated(self.means, *ops.activate(*raw))
+
+    @property
+    def quats(self) -> torch.Tensor:
+        """(N, 4) unit rotations surfel to world, wxyz."""
+        return nn.functional.normalize(self.raw_quats, dim=-1)
+
+    @property
+    def normals(self) -> torch.Tensor:
+        """(N, 3) unit normals, world frame: the surfel's z axis. Either side may face the camera."""
+        w, x, y, z = self.quats.unbind(-1)
+        return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """(N, 2) scales along the surfel's x and y axes, world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """(N,) opacities in (0, 1)."""
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def gammas(self) -> torch.Tensor:
+        """(N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1."""
+        return 1 + self.raw_gammas.exp()
+
+    @property
+    def sh(self) -> torch.Tensor:
+        """(N, C, 3) spherical harmonics of the plain colour, DC first."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+
+def check_coefficients(name: str, count: int) -> None:
+    """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 6."""
+    if count not in COEFFICIENTS:
+        *most, last = COEFFICIENTS
+        told = f"{', '.join(map(str, most))} or {last}"
+        raise ValueError(f"{name}: expected {told} spherical harmonics coefficients, got {count}")
+
+
+def _check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:
+    if not bool(good.all()):
+        where = tuple(torch.nonzero(~good)[0].tolist())
+        raise ValueError(f"{name}: expected {expected}, got {tensor[where].tolist()} at index {where}")

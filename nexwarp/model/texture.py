@@ -1,0 +1,286 @@
+"""The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
+
+import itertools
+import math
+from collections.abc import Hashable
+from typing import TypedDict
+
+import torch
+from torch import nn
+
+from nexwarp import ops
+from nexwarp.errors import check_range, check_tensors
+from nexwarp.kernels.types import MAX_TEXTURE_SH_DEGREE
+from nexwarp.ops import fused_texture, mlp
+
+GRID_INIT = 0.01
+
+# Cells have int32 indices: in finer grids these overflow.
+LARGEST_RESOLUTION = 1e9
+
+# Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
+FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
+
+
+class TextureShape(TypedDict):
+    """Arguments of `NeuralTexture`, as a model file keeps them."""
+
+    levels: int
+    table_size: int
+    features: int
+    min_resolution: float
+    max_resolution: float
+    width: int
+    hidden_layers: int
+    sh_degree: int
+    residual: bool
+    down_weighting: bool
+
+
+class NeuralTexture(nn.Module):
+    """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5).
+
+    H are hash-grid features (paper Eq. 2), Delta the down-weighting (paper Eq. 4).
+
+    Parameters: `grid` (levels, table_size, features), float32; `mlp`, a torch module without biases whose
+    `hidden_layers + 1` matrices are (out, in). Buffer: `resolutions` (levels,), cells per world unit, a geometric
+    series.
+
+    On CUDA, lookup and MLP use half-precision copies of the float32 parameters, made for each call; gradients are
+    summed in float32. Set `half_precision` to False to compute in float32. `torch.autocast` changes neither.
+    """
+
+    resolutions: torch.Tensor
+    # The grid in half precision, and which grid it was: address and version.
+    _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
+
+    def __init__(
+        self,
+        levels: int = 16,
+        table_size: int = 2**20,
+        features: int = 2,
+        min_resolution: float = 16.0,
+        max_resolution: float = 256.0,
+        width: int = 64,
+        hidden_layers: int = 2,
+        sh_degree: int = 3,
+        residual: bool = False,
+        down_weighting: bool = True,
+    ) -> None:
+        """Make a field with initial values.
+
+        Args:
+            levels: L, number of resolution levels.
+            table_size: T, entries per level, a power of two.
+            features: F, features per entry: 1, 2, 4 or 8.
+            min_resolution: resolution of the coarsest level, cells per world unit.
+            max_resolution: resolution of the finest level, cells per world unit.
+            width: width of the hidden layers.
+            hidden_layers: number of hidden layers.
+            sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
+            residual: add the texture's colours to the surfels' plain colours instead of replacing them. Where no photo
+                trained the field it is 0, and the plain colours remain.
+            down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
+
+        Raises:
+            TypeError, ValueError: the message names the argument.
+        """
+        super().__init__()
+        check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
+        _check_resolutions(min_resolution, max_resolution)
+        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected True or False, got {flag!r}")
+        self.config: TextureShape = {
+            "levels": levels,
+            "table_size": table_size,
+            "features": features,
+            "min_resolution": float(min_resolution),
+            "max_resolution": float(max_resolution),
+            "width": width,
+            "hidden_layers": hidden_layers,
+            "sh_degree": sh_degree,
+            "residual": residual,
+            "down_weighting": down_weighting,
+        }
+        self.sh_degree = sh_degree
+        self.residual, self.down_weighting = residual, down_weighting
+        self.half_precision = True
+        self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
+        self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
+        sizes = [levels * features, *[width] * hidden_layers, 3 * (sh_degree + 1) ** 2]
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in itertools.pairwise(sizes):
+            # torch.nn.Linear's own initialisation, U(+-1/sqrt(fan_in)), is the method's.
+            layers += [nn.Linear(fan_in, fan_out, bias=False), nn.ReLU()]
+        self.mlp = nn.Sequential(*layers[:-1])
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.grid.device
+
+    def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
+        """Return how many values an evaluation keeps for each point, at least, and their dtype.
+
+        Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone.
+        Without gradients, those on CUDA keep nothing.
+
+        Args:
+            sh_degree: SH degree of the evaluation.
+        """
+        *hidden, last = self.mlp.parameters()
+        features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
+        kept = torch.is_grad_enabled()
+        matrices = [*hidden, last[:outputs]]
+        if self._in_half() and fused_texture.fits(self.grid, matrices, 0):
+            return features * kept, torch.float16
+        if mlp.takes_simd(self.grid, self.grid, matrices):
+            return features, self.grid.dtype
+        dtype = torch.float16 if self._in_half() else self.grid.dtype
+        return features + outputs + sum(map(len, hidden)) * kept, dtype
+
+    def _in_half(self) -> bool:
+        return self.half_precision and self.grid.is_cuda and self.grid.dtype == torch.float32
+
+    def half_copy(self) -> torch.Tensor:
+        """Return a half-precision copy (L, T, F) of the grid, which evaluations use from now on.
+
+        Torch's own changes of the grid are noticed. Whoever writes to the grid past torch, as a kernel or through
+        `grid.data` does, writes to the copy too, or calls `drop_half_copy`.
+        """
+        key = (self.grid.data_ptr(), self.grid._version)
+        if self._half_copy is None or self._half_copy[0].device != self.grid.device:
+            self._half_copy = (self.grid.detach().half(), key)
+        elif self._half_copy[1] != key:
+            self._half_copy[0].copy_(self.grid.detach())
+            self._half_copy = (self._half_copy[0], key)
+        return self._half_copy[0]
+
+    def drop_half_copy(self) -> None:
+        """Make each evaluation in half precision convert the grid again."""
+        self._half_copy = None
+
+    def half_copy_key(self) -> Hashable | None:
+        """Return what changes when `half_copy` would be made anew; None without a copy."""
+        return None if self._half_copy is None else (self._half_copy[0].data_ptr(), *self._half_copy[1])
+
+    def forward(self, positions: torch.Tensor, depths: torch.Tensor, focal: float | torch.Tensor) -> torch.Tensor:
+        """Return the field's SH coefficients.
+
+        Args:
+            positions: (..., 3) points, world frame.
+            depths: (...) their z-depths in the camera, world units; 0 marks a point to skip.
+            focal: focal length in pixels, a number or a tensor of one element.
+
+        Returns:
+            (..., (sh_degree + 1)^2, 3) coefficients, differentiable in positions, depths and the parameters.
+        """
+        if not isinstance(depths, torch.Tensor):
+            raise TypeError(f"depths: expected a torch.Tensor, got {type(depths).__name__}")
+        expected = {"depths": (depths, tuple(depths.shape)), "positions": (positions, (*depths.shape, 3))}
+        check_tensors(expected, dtype=self.grid.dtype, device=self.grid.device)
+        out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)
+        return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
+
+    def colors(
+        self,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        directions: torch.Tensor,
+        focal: float | torch.Tensor,
+        *,
+        sh_degree: int = 3,
+        clamp: bool = False,
+    ) -> torch.Tensor:
+        """Return the textured colours of hits: 0.5 + SH(direction), or SH(direction) if `residual`.
+
+        Args:
+            positions: (..., K, 3) hit points, world frame.
+            depths: (..., K) their z-depths, 0 in empty slots.
+            directions: (..., 3) unit ray directions, world frame.
+            focal: focal length in pixels, a number or a tensor of one element.
+            sh_degree: largest SH degree to evaluate.
+            clamp: clamp colours to >= 0.
+
+        Returns:
+            (..., K, 3) colours.
+        """
+        degree = min(sh_degree, self.sh_degree)
+        flat = directions.reshape(-1, 3)
+        image = (directions.shape[0], directions.shape[1]) if directions.ndim == 3 else None
+        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp, image)
+        return colors.view(positions.shape)
+
+    def _evaluate(
+        self,
+        positions: torch.Tensor,
+        depths: torch.Tensor,
+        focal: float | torch.Tensor,
+        degree: int,
+        directions: torch.Tensor | None = None,
+        clamp: bool = False,
+        image: tuple[int, int] | None = None,
+    ) -> torch.Tensor:
+        *hidden, last = self.mlp.parameters()
+        if not self.down_weighting:
+            focal = FOCAL_WITHOUT_DOWN_WEIGHTING
+        if isinstance(focal, torch.Tensor):
+            if focal.numel() != 1:
+                raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
+            focal = focal.detach().to(self.grid).reshape(1)
+        elif isinstance(focal, bool) or not isinstance(focal, (int, float)):
+            raise TypeError(f"focal: expected a number or a tensor, got {type(focal).__name__}")
+        else:
+            focal = self.grid.new_full((1,), float(focal))
+        return ops.texture(
+            positions,
+            depths,
+            self.grid,
+            [*hidden, last[: 3 * (degree + 1) ** 2]],
+            self.resolutions.to(self.grid.dtype),
+            focal,
+            directions=directions,
+            offset=0.0 if self.residual else 0.5,
+            clamp=clamp,
+            half=self._in_half(),
+            table=self.half_copy() if self._in_half() and self._half_copy is not None else None,
+            image=image,
+        )
+
+
+def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
+    """Return (count,) float32, computed in float64."""
+    # Not by torch: on the device "meta", where files are checked, a logarithm imports its compiler, 1.2 s.
+    low, high = math.log(first), math.log(last)
+    values = [math.exp(low + (high - low) * i / max(count - 1, 1)) for i in range(count)]
+    return torch.tensor(values, dtype=torch.float32)
+
+
+def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
+    """Raise TypeError or ValueError unless each size is an int in its range."""
+    for name, value, low, high in (
+        ("levels", levels, 1, 64),
+        ("table_size", table_size, 1, 2**30),
+        ("width", width, 1, 4096),
+        ("hidden_layers", hidden_layers, 0, 64),
+        ("sh_degree", sh_degree, 0, MAX_TEXTURE_SH_DEGREE),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, low, high)
+    if table_size & (table_size - 1):
+        raise ValueError(f"table_size: expected a power of two, got {table_size}")
+    if isinstance(features, bool) or not isinstance(features, int):
+        raise TypeError(f"features: expected an int, got {type(features).__name__}")
+    if features not in (1, 2, 4, 8):
+        raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
+
+
+def _check_resolutions(min_resolution: float, max_resolution: float) -> None:
+    """Raise TypeError or ValueError unless the resolutions are numbers in their ranges."""
+    for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+    check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)

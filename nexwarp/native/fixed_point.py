@@ -1,0 +1,127 @@
+"""Sums of floats that do not depend on the order of their terms: fixed-point numbers, added up as integers by atomics.
+
+A float is a pair of 64-bit integers, its multiples of 2^-20 and what is left in multiples of 2^-60: magnitudes below
+2^23, 10^-18 apart, millions of terms. Larger ones and those that are not finite raise a flag instead, which makes the
+sums NaN. A hash grid would take too much memory so: its terms share one scale, see `hashgrid`.
+"""
+
+import functools
+
+import warp as wp
+
+from nexwarp.native.warp import EXCHANGES, GATHER_RECORD
+
+HIGH, LOW = 2.0**20, 2.0**60
+
+LARGEST = 2.0**23
+
+# One term that is scaled already may have at most this many units.
+MOST_UNITS = 2.0**52
+
+_ADD = """
+#if defined(__CUDA_ARCH__)
+    auto add = [](wp::int64* sum, long long term) {
+        atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(term));
+    };
+    auto raise = [&]() { atomicOr(&wp::index(bad, 0), 1); };
+#else
+    auto add = [](wp::int64* sum, long long term) { *sum += term; };
+    auto raise = [&]() { wp::index(bad, 0) = 1; };
+#endif
+    auto nearest = [](double x) { return static_cast<long long>(x + (x < 0.0 ? -0.5 : 0.5)); };
+"""
+
+_PUT = (
+    _ADD
+    + f"""
+    auto put = [&](wp::int64* sums, double x) {{
+        if (!(x < {LARGEST!r} && x > -{LARGEST!r})) {{
+            raise();
+            return;
+        }}
+        const long long high = nearest(x * {HIGH!r});
+        add(sums, high);
+        add(sums + 1, nearest((x - high * {1 / HIGH!r}) * {LOW!r}));
+    }};
+"""
+)
+
+_RECORD = f"""
+    {GATHER_RECORD}
+    {_PUT}
+    wp::int64* target = &wp::index(records, slot, 0);
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31;
+    EXCHANGES
+    v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
+    if (!(lane & 1)) put(target + 2 * (lane >> 1), v[0]);
+#else
+    for (int k = 0; k < 16; ++k) put(target + 2 * k, v[k]);
+#endif
+"""
+
+_VECTOR = f"""
+    {_PUT}
+    wp::int64* target = &wp::index(sums, slot, 0);
+    for (int k = 0; k < LENGTH; ++k) put(target + 2 * k, VALUE);
+"""
+
+_UNITS = f"""
+    {_ADD}
+    const double units = double(value) * scale;
+    if (!(units < {MOST_UNITS!r} && units > -{MOST_UNITS!r})) {{
+        raise();
+        return;
+    }}
+    const long long whole = nearest(units);
+    if (whole != 0) add(&wp::index(sums, row, column), whole);
+"""
+
+
+@functools.cache
+def fixed_point_record_sum(real: type) -> wp.Function:
+    """Make a function that adds the sum over all lanes of four vec4 to the 16 pairs of records[slot]."""
+    vec4 = wp.types.vector(length=4, dtype=real)
+    name = "float" if real is wp.float32 else "double"
+
+    @wp.func_native(_RECORD.replace("EXCHANGES", EXCHANGES).replace("REAL", name))
+    def add_record(
+        records: wp.array2d(dtype=wp.int64),
+        slot: wp.int32,
+        a: vec4,
+        b: vec4,
+        c: vec4,
+        d: vec4,
+        bad: wp.array(dtype=wp.int32),
+    ): ...
+
+    return add_record
+
+
+@functools.cache
+def fixed_point_add(dtype: type) -> wp.Function:
+    """Make a function that adds a scalar or a vector to the pairs of sums[slot]."""
+    length = 0 if dtype in (wp.float32, wp.float64) else dtype._length_
+    text = _VECTOR.replace("LENGTH", str(max(length, 1))).replace("VALUE", "x.c[k]" if length else "x")
+
+    @wp.func_native(text)
+    def add_value(sums: wp.array2d(dtype=wp.int64), slot: wp.int32, x: dtype, bad: wp.array(dtype=wp.int32)): ...
+
+    return add_value
+
+
+@functools.cache
+def fixed_point_units(real: type) -> wp.Function:
+    """Make a function that adds a scalar times a scale, rounded, to sums[row, column]."""
+
+    @wp.func_native(_UNITS)
+    def add_units(
+        sums: wp.array2d(dtype=wp.int64),
+        row: wp.int32,
+        column: wp.int32,
+        value: real,
+        scale: wp.float64,
+        bad: wp.array(dtype=wp.int32),
+    ): ...
+
+    return add_units

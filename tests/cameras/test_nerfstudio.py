@@ -1,0 +1,192 @@
+"""Cameras as nerfstudio's JSON: round trips, its conventions, and one line for what is wrong."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path, save_transforms
+from nexwarp.cameras.paths import look_at
+from tests.scenes import intrinsics, rigid
+
+FAR = 1e-6
+
+
+def cameras(count: int = 6, centred: bool = False, dtype: torch.dtype = torch.float32) -> list[Camera]:
+    out = []
+    for i in range(count):
+        quat = tuple(torch.randn(4, dtype=torch.float64).tolist())
+        viewmat = rigid(quat, tuple((5 * torch.randn(3, dtype=torch.float64)).tolist()))
+        K = intrinsics(50.0 + i, 50.0 + i, 32, 24) if centred else intrinsics(50.0 + i, 61.5, 20.25 + i, 30.0)
+        out.append(Camera(viewmat.to(dtype), K.to(dtype), 64, 48, near=0.1))
+    return out
+
+
+def assert_same(mine: Camera, theirs: Camera) -> None:
+    assert (mine.viewmat - theirs.viewmat).abs().max() <= FAR
+    assert (mine.K - theirs.K).abs().max() <= FAR * 64
+    assert (mine.width, mine.height, mine.near) == (theirs.width, theirs.height, theirs.near)
+
+
+def test_transforms_come_back(tmp_path: Path) -> None:
+    before = {f"images/{i}.png": each for i, each in enumerate(cameras())}
+    before["images/large.png"] = Camera(torch.eye(4), intrinsics(700, 690, 401.5, 299).float(), 800, 600, near=0.1)
+    names = list(before)
+    save_transforms(tmp_path / "new" / "transforms.json", before, train=names[1:], test=names[:1])
+    after = load_transforms(tmp_path / "new" / "transforms.json", near=0.1)
+    assert list(after) == names
+    for name in names:
+        assert_same(after[name], before[name])
+    data = json.loads((tmp_path / "new" / "transforms.json").read_text())
+    assert data["train_filenames"] == names[1:] and data["val_filenames"] == data["test_filenames"] == names[:1]
+    for path_camera, name in zip(
+        load_camera_path(tmp_path / "new" / "transforms.json", 0.1).cameras, names, strict=True
+    ):
+        assert_same(path_camera, before[name])
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_camera_path_comes_back(tmp_path: Path, centred: bool) -> None:
+    before = cameras(centred=centred)
+    save_camera_path(tmp_path / "path.json", before, fps=24)
+    after = load_camera_path(tmp_path / "path.json", near=0.1)
+    assert after.fps == 24
+    for mine, theirs in zip(after.cameras, before, strict=True):
+        assert_same(mine, theirs)
+    data = json.loads((tmp_path / "path.json").read_text())
+    assert (data["render_width"], data["render_height"], data["seconds"]) == (64, 48, 0.25)
+    # nerfstudio's entries hold no more than these, and cannot say more.
+    extra = set() if centred else {"fl_x", "fl_y", "cx", "cy"}
+    assert set(data["camera_path"][0]) == {"camera_to_world", "fov", "aspect"} | extra
+
+
+def test_matrices_are_opengl_camera_to_world(tmp_path: Path) -> None:
+    """A camera at (1, 2, 3) that looks along +y with z up: its backward axis is -y, its up axis z."""
+    position, up = torch.tensor([1.0, 2.0, 3.0]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+    viewmat = look_at(position, position + torch.tensor([0.0, 1.0, 0.0]).double(), up)
+    one = Camera(viewmat, intrinsics(24, 24, 32, 24), 64, 48)
+    save_camera_path(tmp_path / "path.json", [one])
+    save_transforms(tmp_path / "transforms.json", {"a": one})
+    expected = torch.tensor([[1.0, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]]).double()
+    path = json.loads((tmp_path / "path.json").read_text())["camera_path"][0]
+    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    assert torch.allclose(torch.tensor(path["camera_to_world"]).double().view(4, 4), expected)
+    assert torch.allclose(torch.tensor(frame["transform_matrix"]).double(), expected)
+    assert path["fov"] == pytest.approx(90.0) and path["aspect"] == pytest.approx(4 / 3)
+
+
+def written(tmp_path: Path, data: Any) -> Path:
+    path = tmp_path / "in.json"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return path
+
+
+EYE = torch.eye(4).tolist()
+FLAT = torch.eye(4).flatten().tolist()
+ENTRY = {"camera_to_world": FLAT, "fov": 60.0, "aspect": 2.0}
+PATH = {"render_width": 200, "render_height": 100, "fps": 30, "seconds": 1, "camera_path": [ENTRY, ENTRY]}
+FRAME = {"file_path": "a.png", "transform_matrix": EYE}
+SCENE = {"fl_x": 50.0, "w": 64, "h": 48, "frames": [FRAME]}
+
+
+def test_a_file_of_nerfstudios_viewer(tmp_path: Path) -> None:
+    """Keys that it writes and we have no use for are no obstacle; the field of view is the vertical one."""
+    more = {"keyframes": [{"matrix": "[]"}], "camera_type": "perspective", "crop": None, "is_cycle": False}
+    path = load_camera_path(written(tmp_path, PATH | more), near=0.5)
+    assert path.fps == 30 and len(path.cameras) == 2
+    one = path.cameras[0]
+    assert (one.width, one.height, one.near, one.cx, one.cy) == (200, 100, 0.5, 100.0, 50.0)
+    assert one.fx == one.fy == pytest.approx(50 / math.tan(math.radians(30)))
+    assert one.viewmat.equal(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+
+
+def test_intrinsics_stand_in_the_file_or_the_frame(tmp_path: Path) -> None:
+    frames = [FRAME, FRAME | {"file_path": "b.png", "fl_x": 70.0, "fl_y": 71.0, "cx": 3.5, "w": 100}]
+    a, b = load_transforms(written(tmp_path, SCENE | {"frames": frames})).values()
+    assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == (50, 50, 32, 24, 64, 48)
+    assert (b.fx, b.fy, b.cx, b.cy, b.width, b.height) == (70, 71, 3.5, 24, 100, 48)
+    blender = {"camera_angle_x": math.pi / 2, "w": 64, "h": 48, "frames": [FRAME]}
+    (c,) = load_transforms(written(tmp_path, blender)).values()
+    assert c.fx == c.fy == pytest.approx(32.0)
+
+
+def test_applied_transform_and_scale_are_taken_back(tmp_path: Path) -> None:
+    before = {str(i): each for i, each in enumerate(cameras(3))}
+    save_transforms(tmp_path / "a.json", before)
+    data = json.loads((tmp_path / "a.json").read_text())
+    applied = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0.5], [0, 0, 0, 1]], dtype=torch.float64)
+    for frame in data["frames"]:
+        pose = applied @ torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+        pose[:3, 3] *= 0.25
+        frame["transform_matrix"] = pose.tolist()
+    data |= {"applied_transform": applied[:3].tolist(), "applied_scale": 0.25}
+    for name, each in load_transforms(written(tmp_path, data), near=0.1).items():
+        assert_same(each, before[name])
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    return PATH | {"camera_path": [ENTRY, {k: v for k, v in (ENTRY | changes).items() if v is not None}]}
+
+
+def frame(**changes: Any) -> dict[str, Any]:
+    return SCENE | {"frames": [{k: v for k, v in (FRAME | changes).items() if v is not None}]}
+
+
+SINGULAR = torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0])).flatten().tolist()
+BAD = [
+    ("{", "expected JSON, could not parse it"),
+    ("[]", "expected a JSON object, got list"),
+    ({}, "expected the key camera_path or frames, found none"),
+    ({"poses": [], "fps": 3}, "expected the key camera_path or frames, found fps, poses"),
+    (PATH | {"camera_path": []}, "camera_path: expected a list of at least one camera"),
+    (PATH | {"camera_path": [3]}, r"camera_path\[0\]: expected a JSON object, got 3"),
+    (PATH | {"camera_type": "fisheye"}, "camera_type: expected perspective, got 'fisheye'"),
+    (PATH | {"render_width": 0}, "render_width: expected a number above 0, got 0"),
+    (PATH | {"render_height": 10.5}, "render_height: expected a whole number of pixels, got 10.5"),
+    (PATH | {"fps": "fast"}, "fps: expected a number above 0, got 'fast'"),
+    (entry(fov=None), r"camera_path\[1\]: expected the key fov, found none"),
+    (entry(fov=180), r"camera_path\[1\]: fov: expected a number above 0 below 180, got 180"),
+    (entry(camera_to_world=None), r"camera_path\[1\]: expected the key camera_to_world, found none"),
+    (entry(camera_to_world=SINGULAR), r"camera_path\[1\]: camera_to_world: expected an invertible pose, got the sing"),
+    (entry(camera_to_world=[0.0] * 16), r"camera_path\[1\]: camera_to_world: expected the last row 0, 0, 0, 1"),
+    (entry(camera_to_world=[1.0] * 9), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers"),
+    (entry(camera_to_world="eye"), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers, got eye"),
+    (entry(camera_to_world=[math.nan, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected finite numbers"),
+    (entry(camera_to_world=[2.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected an orthonormal rotation"),
+    (entry(camera_to_world=[-1.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected a rotation with determinant 1"),
+    (frame(transform_matrix=None), r"frames\[0\]: expected the key transform_matrix, found none"),
+    (SCENE | {"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of PINHOLE"),
+    (SCENE | {"applied_transform": [[0.0] * 4] * 3}, "applied_transform: expected an invertible pose"),
+    (SCENE | {"frames": [FRAME, FRAME]}, r"frames\[1\]\.file_path: expected a name of its own, got 'a.png' again"),
+    ({"w": 64, "h": 48, "frames": [FRAME]}, r"frames\[0\]: expected the key camera_angle_x, found none"),
+    ({"fl_x": 50.0, "frames": [FRAME]}, r"frames\[0\]: expected the key w, found none"),
+    (SCENE | {"fl_x": -50.0}, r"frames\[0\]: K: expected focal lengths > 0"),
+]
+
+
+@pytest.mark.parametrize(("data", "message"), BAD)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, data: Any, message: str) -> None:
+    path = written(tmp_path, data)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_camera_path(path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_other_wrong_inputs(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no\.json: no such file, expected cameras as JSON"):
+        load_camera_path(tmp_path / "no.json")
+    one = cameras(1)[0]
+    other = Camera(one.viewmat, one.K, 65, 48)
+    with pytest.raises(ValueError, match="cameras: expected one size, got 64x48 and 65x48"):
+        save_camera_path(tmp_path / "a.json", [one, other])
+    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+        save_camera_path(tmp_path / "a.json", [])
+    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+        save_transforms(tmp_path / "a.json", {})
+    with pytest.raises(ValueError, match="fps: expected more than 0 frames a second, got 0"):
+        save_camera_path(tmp_path / "a.json", [one], fps=0)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,364 @@
+"""Laws of camera paths."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nexwarp.cameras.between import between
+from nexwarp.cameras.camera import Camera, reduced, resized
+from nexwarp.cameras.paths import ellipse, focus, interpolate, look_at, spiral
+from tests.tolerances import assert_close
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+INTRINSICS = torch.tensor([[90.0, 0.0, 33.0], [0.0, 95.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def camera(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor = UP) -> Camera:
+    return Camera(look_at(position.double(), target.double(), up), INTRINSICS, 64, 48, near=0.2)
+
+
+def ring(count: int = 24, radii: tuple[float, float] = (3.0, 2.0), height: float = 1.5) -> list[Camera]:
+    """Cameras on a noisy ellipse about (1, -2, 0), looking more or less at (1, -2, 0.3)."""
+    middle = torch.tensor([1.0, -2.0, 0.0], dtype=torch.float64)
+    cameras = []
+    for angle in torch.rand(count, dtype=torch.float64) * 2 * math.pi:
+        offset = torch.stack([radii[0] * angle.cos(), radii[1] * angle.sin(), angle.new_tensor(height)])
+        position = middle + offset + 0.05 * torch.randn(3, dtype=torch.float64)
+        cameras.append(camera(position, middle + 0.3 * UP + 0.05 * torch.randn(3, dtype=torch.float64)))
+    return cameras
+
+
+def positions(cameras: list[Camera]) -> torch.Tensor:
+    return torch.stack([each.position for each in cameras])
+
+
+def similarity(scale: float) -> tuple[torch.Tensor, torch.Tensor, float]:
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    return rotation * torch.linalg.det(rotation), torch.randn(3, dtype=torch.float64), scale
+
+
+def moved(each: Camera, motion: tuple[torch.Tensor, torch.Tensor, float]) -> Camera:
+    """The camera after the world is rotated, scaled, then shifted."""
+    rotation, shift, scale = motion
+    viewmat = each.viewmat.clone()
+    viewmat[:3, :3] = each.viewmat[:3, :3] @ rotation.T
+    viewmat[:3, 3] = scale * each.viewmat[:3, 3] - viewmat[:3, :3] @ shift
+    return Camera(viewmat, each.K, each.width, each.height, each.near)
+
+
+def test_focus_is_where_the_axes_meet() -> None:
+    target = torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
+    cameras = [camera(target + 3 * torch.randn(3), target) for _ in range(5)]
+    assert_close(focus(cameras), target, kind="value", name="focus")
+
+
+def test_focus_of_two_skew_axes_is_half_way() -> None:
+    """Axes along x at z = 0 and along y at z = 1 pass each other at (0, 0, 0) and (0, 0, 1)."""
+    a = camera(torch.tensor([-2.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0]))
+    b = camera(torch.tensor([0.0, -5.0, 1.0]), torch.tensor([0.0, 0.0, 1.0]))
+    assert_close(focus([a, b]), torch.tensor([0.0, 0.0, 0.5]), kind="value", name="focus")
+
+
+def test_every_camera_looks_at_the_focus_upright() -> None:
+    cameras = ring()
+    up = -torch.stack([each.viewmat[1, :3] for each in cameras]).mean(0)
+    for each in ellipse(cameras, 30):
+        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
+        assert depth > 1.0
+        assert (x / depth).item() == pytest.approx(33.0, abs=1e-9)
+        assert (y / depth).item() == pytest.approx(20.0, abs=1e-9)
+        right, down = each.viewmat[0, :3], each.viewmat[1, :3]
+        assert abs(right @ up) < 1e-12 and down @ up < 0
+        rotation = each.viewmat[:3, :3]
+        assert (rotation @ rotation.T - torch.eye(3)).abs().max() < 1e-12
+        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
+
+
+def test_path_is_an_ellipse_through_the_cameras_region() -> None:
+    cameras = ring(count=60)
+    path, given = positions(ellipse(cameras, 200)), positions(cameras)
+    centre = path.mean(0)
+    values = torch.linalg.svdvals(path - centre) / 10.0  # of a * cos over 200 steps: a * 10
+    assert values[2] < 1e-9, "the path leaves its plane"
+    assert values[0].item() == pytest.approx(3.0, rel=0.1)
+    assert values[1].item() == pytest.approx(2.0, rel=0.1)
+    assert (path[:, 2].mean() - given[:, 2].mean()).abs() < 0.02
+    for axis in range(2):
+        low, high = torch.quantile(given[:, axis], torch.tensor([0.05, 0.95]).double())
+        assert path[:, axis].max().item() == pytest.approx(high.item(), abs=0.15)
+        assert path[:, axis].min().item() == pytest.approx(low.item(), abs=0.15)
+
+
+def test_path_is_closed_and_smooth() -> None:
+    """Each step, the one from the last to the first included, is a chord of 3 degrees of the ellipse."""
+    path = positions(ellipse(ring(), 120))
+    steps = (path - path.roll(1, 0)).norm(dim=1)
+    assert steps.max() < 2 * 3.2 * math.sin(math.radians(1.5))
+    assert steps.min() > 2 * 1.7 * math.sin(math.radians(1.5))
+    turns = path - 2 * path.roll(1, 0) + path.roll(2, 0)
+    assert turns.norm(dim=1).max() < 3.2 * math.radians(3) ** 2
+
+
+def test_path_starts_beside_the_first_camera_and_turns_one_way() -> None:
+    for _ in range(10):  # the signs of principal axes are up to chance
+        cameras = ring()
+        path = positions(ellipse(cameras, 90))
+        nearest = (path - cameras[0].position).norm(dim=1).argmin().item()
+        assert min(nearest, 90 - nearest) <= 8
+        spokes = path - path.mean(0)
+        assert (torch.linalg.cross(spokes, spokes.roll(-1, 0))[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
+def test_path_moves_and_scales_with_the_cameras(scale: float) -> None:
+    cameras, motion = ring(), similarity(scale)
+    expected = [moved(each, motion) for each in ellipse(cameras, 17)]
+    actual = ellipse([moved(each, motion) for each in cameras], 17)
+    for mine, theirs in zip(actual, expected, strict=True):
+        assert_close(mine.viewmat, theirs.viewmat, kind="value", name="viewmat")
+
+
+def test_path_takes_the_rest_from_the_first_camera(device: torch.device) -> None:
+    cameras = [each.to(device, torch.float32) for each in ring()]
+    path = ellipse(cameras, 5)
+    assert len(path) == 5
+    for each in path:
+        assert each.viewmat.dtype == torch.float32 and each.device == cameras[0].device
+        assert each.K.equal(cameras[0].K)
+        assert (each.width, each.height, each.near) == (64, 48, 0.2)
+    assert len(ellipse(cameras)) == 120
+
+
+def test_an_upright_wall_of_cameras_gives_an_upright_ellipse() -> None:
+    target = torch.tensor([0.0, 4.0, 0.0])
+    places = [torch.tensor([float(x), 0.0, float(z)]) for x in range(-3, 4) for z in range(-1, 2)]
+    path = ellipse([camera(place, target) for place in places], 40)
+    assert positions(path)[:, 1].abs().max() < 1e-9
+    assert positions(path)[:, 2].max() > 0.5
+
+
+def test_centres_on_a_line_give_a_path_along_it() -> None:
+    target = torch.tensor([0.0, 4.0, 0.0])
+    path = positions(ellipse([camera(torch.tensor([x, 0.0, 1.0]), target) for x in (-2.0, -1.0, 2.0)], 20))
+    assert (path[:, 1:] - torch.tensor([0.0, 1.0])).abs().max() < 1e-9
+    assert path[:, 0].max().item() == pytest.approx(1.7) and path[:, 0].min().item() == pytest.approx(-1.9)
+
+
+def test_degenerate_cameras_are_refused() -> None:
+    origin, ahead = torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])
+    one = camera(origin, ahead)
+    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+        ellipse([])
+    for cameras in ([one], [one, one], [one, camera(origin + 1, ahead + 1)]):
+        with pytest.raises(ValueError, match="cameras: expected two or more with axes that are not parallel"):
+            ellipse(cameras)
+    with pytest.raises(ValueError, match="cameras: expected at least two distinct centres"):
+        ellipse([camera(ahead, 2 * ahead), camera(ahead, ahead + torch.tensor([1.0, 0.0, 0.0]))])
+    with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
+        ellipse(ring(), 0)
+    with pytest.raises(ValueError, match="up: expected a direction across the line"):
+        look_at(UP, 3 * UP, UP)
+
+
+def row(count: int = 15, bend: float = 0.3) -> list[Camera]:
+    """Cameras on a noisy patch of the x-z plane that face +y and look, more or less, at (0, 6, 0)."""
+    target = torch.tensor([0.0, 6.0, 0.0])
+    places = torch.randn(count, 3, dtype=torch.float64) * torch.tensor([1.0, 0.1, 0.5])
+    return [camera(place, target + (1 - bend) * place) for place in places]
+
+
+# Spiral
+
+
+def test_spiral_winds_within_the_cameras() -> None:
+    cameras = row(200)
+    path = spiral(cameras, 240)
+    given, mine = positions(cameras), positions(path)
+    offsets = mine - given.mean(0)
+    reach = torch.quantile((given - given.mean(0)).abs(), 0.9, dim=0)
+    assert torch.allclose(offsets.abs().amax(0), reach, rtol=0.1, atol=0.02)
+    # Twice around the viewing direction, evenly, always the same way, and closed.
+    scaled = offsets / reach
+    angles = torch.atan2(scaled[:, 2], scaled[:, 0])
+    steps = (angles.roll(-1) - angles + math.pi) % (2 * math.pi) - math.pi
+    assert abs(abs(steps.sum().item()) - 4 * math.pi) < 1e-6
+    assert (steps.abs() - 4 * math.pi / 240).abs().max() < 0.02
+    assert (mine - mine.roll(1, 0)).norm(dim=1).max() < 0.2
+
+
+def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
+    cameras = row()
+    for each in spiral(cameras, 12):
+        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
+        assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
+    for bend in (0.0, -0.5):  # parallel axes, axes that part
+        cameras = row(bend=bend)
+        forward = torch.stack([each.viewmat[2, :3] for each in cameras]).mean(0)
+        for each in spiral(cameras, 12):
+            assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
+
+
+@pytest.mark.parametrize("make", [spiral, interpolate])
+@pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
+def test_the_other_paths_move_and_scale_with_the_cameras(make, scale: float) -> None:
+    cameras, motion = row(), similarity(scale)
+    expected = [moved(each, motion) for each in make(cameras, 23)]
+    actual = make([moved(each, motion) for each in cameras], 23)
+    for mine, theirs in zip(actual, expected, strict=True):
+        assert (mine.viewmat - theirs.viewmat).abs().max() < 1e-7 * max(scale, 1.0)
+
+
+@pytest.mark.parametrize("make", [spiral, interpolate])
+def test_the_other_paths_take_the_rest_from_the_first_camera(make, device: torch.device) -> None:
+    path = make([each.to(device, torch.float32) for each in row()], 5)
+    assert len(path) == 5
+    for each in path:
+        assert each.viewmat.dtype == torch.float32 and each.device.type == device.type
+        assert each.K.equal(INTRINSICS.float().to(device)) and (each.width, each.height, each.near) == (64, 48, 0.2)
+
+
+# Interpolation
+
+
+def nearest(path: list[Camera], target: Camera) -> float:
+    return min((each.viewmat - target.viewmat).abs().max().item() for each in path)
+
+
+def test_interpolation_passes_through_every_key_in_turn() -> None:
+    cameras = ring(6)
+    path = interpolate(cameras, 2001, keys=6)
+    errors = [(torch.stack([each.viewmat for each in path]) - c.viewmat).abs().amax((1, 2)) for c in cameras]
+    assert all(error.min() < 2e-2 for error in errors)
+    order = [error.argmin().item() for error in errors]
+    assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
+    assert nearest(path[:1], cameras[0]) < 1e-9 and nearest(path[-1:], cameras[-1]) < 1e-9
+
+
+def test_interpolation_thins_many_cameras() -> None:
+    cameras = ring(50)
+    path = interpolate(cameras, 101, keys=3)
+    expected = interpolate([cameras[0], cameras[24], cameras[49]], 101, keys=3)
+    for mine, theirs in zip(path, expected, strict=True):
+        assert mine.viewmat.equal(theirs.viewmat)
+    assert len(interpolate(cameras, 1)) == 1
+
+
+def test_interpolation_is_smooth() -> None:
+    """Neither the way nor the direction jumps from one frame to the next, at the keys included."""
+    path = torch.stack([each.viewmat for each in interpolate(ring(8), 2000, keys=8)])
+    first = path.diff(dim=0).flatten(1).norm(dim=1)
+    second = path.diff(n=2, dim=0).flatten(1).norm(dim=1)
+    assert first.max() < 8 * first.mean() and second.max() < 0.05 * first.mean()
+    rotations = path[:, :3, :3]
+    assert (rotations @ rotations.mT - torch.eye(3)).abs().max() < 1e-12
+
+
+def test_interpolation_of_two_is_a_straight_even_flight() -> None:
+    target = torch.tensor([0.0, 5.0, 0.0])
+    ends = [camera(torch.tensor([x, 0.0, 0.0]), target + torch.tensor([x, 0.0, 0.0])) for x in (-1.0, 3.0)]
+    path = positions(interpolate(ends, 5))
+    expected = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]).double()
+    assert_close(path, expected, kind="value", name="positions")
+
+
+def test_interpolation_turns_at_one_place_and_skips_repeated_views() -> None:
+    origin = torch.zeros(3)
+    views = [camera(origin, torch.tensor([math.sin(a), math.cos(a), 0.0])) for a in (0.0, 0.0, 0.5, 1.0)]
+    path = interpolate(views, 3, keys=4)
+    assert positions(path).abs().max() < 1e-12
+    angles = [math.atan2(each.viewmat[2, 0], each.viewmat[2, 1]) for each in path]
+    assert angles == pytest.approx([0.0, 0.5, 1.0])
+
+
+def test_the_other_paths_refuse_degenerate_cameras() -> None:
+    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    with pytest.raises(ValueError, match=r"expected cameras that face one way, .* an ellipse suits"):
+        spiral(ring(height=0.6))
+    for cameras in ([one], [one, one, one]):
+        with pytest.raises(ValueError, match="cameras: expected at least two distinct"):
+            spiral(cameras)
+        with pytest.raises(ValueError, match="cameras: expected at least two distinct ones, got"):
+            interpolate(cameras)
+    for make in (spiral, interpolate):
+        with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+            make([])
+        with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
+            make(row(), 0)
+    with pytest.raises(ValueError, match="keys: expected at least 2, got 1"):
+        interpolate(row(), 5, keys=1)
+
+
+# Sizes
+
+
+def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
+    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))  # 64 x 48, fx 90, fy 95, cx 33, cy 20
+    wide = resized(one, 256, 96)
+    assert (wide.width, wide.height, wide.fx, wide.fy) == (256, 96, 180.0, 190.0)
+    assert wide.viewmat.equal(one.viewmat) and wide.near == one.near
+    for y in (0.0, 48.0):
+        assert (y * 2 - wide.cy) / wide.fy == pytest.approx((y - one.cy) / one.fy)
+    # The rays in the middle third of the wide picture are those of the old one.
+    assert (128 - 64 - wide.cx) / wide.fx == pytest.approx((0 - one.cx) / one.fx)
+    assert resized(one, 64, 48) is one
+    with pytest.raises(ValueError, match="height: expected at least 1, got 0"):
+        resized(one, 64, 0)
+    small = reduced(one, 24)
+    assert (small.width, small.height) == (32, 24) and small.K.equal(resized(one, 32, 24).K)
+    assert reduced(one, 48) is reduced(one, 100) is one
+    thin = Camera(one.viewmat, one.K, 2, 48, near=0.2)
+    assert reduced(thin, 5).width == 1  # 2 * 5 / 48 is less than half a pixel
+
+
+def turned(each: Camera) -> Rotation:
+    return Rotation.from_matrix(each.viewmat[:3, :3].numpy())
+
+
+def test_cameras_between_lie_on_the_way_to_a_neighbour_that_looks_alike() -> None:
+    """Of a row of three: the middle one goes to either side, the others to either too; a fourth looks elsewhere."""
+    ahead = torch.tensor([0.0, 9.0, 0.0], dtype=torch.float64)
+    row = [torch.tensor([x, 0.0, 0.0], dtype=torch.float64) for x in (0.0, 1.0, 3.0)]
+    cameras = [camera(each, each + ahead + 0.5 * each) for each in row]
+    cameras.append(camera(row[0] - 0.1 * UP, row[0] - ahead))
+    seen = set()
+    for seed in range(40):
+        made = between(cameras, torch.Generator().manual_seed(seed))
+        assert_close(made[3].viewmat, cameras[3].viewmat, kind="value", name="viewmat")
+        for one, new in zip(cameras[:3], made[:3], strict=True):
+            x = (new.position - one.position)[0].item()
+            others = [c for c in cameras[:3] if c is not one]
+            shares = [x / (c.position - one.position)[0].item() for c in others]
+            turns = (turned(new) * turned(one).inv()).as_rotvec()
+            full = [(turned(c) * turned(one).inv()).as_rotvec() for c in others]
+            fits = [abs(turns - s * f).max() < 1e-12 and -0.5 <= s <= 1.5 for s, f in zip(shares, full, strict=True)]
+            assert any(fits) and (new.position - one.position)[1:].abs().max() < 1e-12
+            assert torch.equal(new.K, one.K) and (new.width, new.height, new.near) == (64, 48, 0.2)
+            seen.add(round(shares[fits.index(True)], 1))
+    assert {-0.5, 0.0, 0.5, 1.0, 1.5} <= seen  # all of the way, and beyond its ends
+
+
+def test_cameras_between_follow_a_similarity() -> None:
+    cameras, motion = ring(), similarity(3.0)
+    one = between(cameras, torch.Generator().manual_seed(2))
+    other = between([moved(c, motion) for c in cameras], torch.Generator().manual_seed(2))
+    for a, b in zip(one, other, strict=True):
+        assert_close(b.viewmat, moved(a, motion).viewmat, kind="value", name="viewmat")
+
+
+def test_a_camera_without_a_neighbour_stays() -> None:
+    lonely = camera(torch.tensor([0.0, 0, 0]), torch.tensor([0.0, 1, 0]))
+    other = camera(torch.tensor([1.0, 0, 0]), torch.tensor([1.0, -1, 0]))
+    for cameras in ([lonely], [lonely, other]):
+        for old, new in zip(cameras, between(cameras, torch.Generator()), strict=True):
+            assert_close(new.viewmat, old.viewmat, kind="value", name="viewmat")
+
+
+def test_cameras_between_two_at_one_place_are_there() -> None:
+    """There is a way to turn, though none to go."""
+    place = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    pair = [camera(place, place + torch.tensor([x, 1.0, 0.0])) for x in (0.0, 0.5)]
+    for new in between(pair, torch.Generator().manual_seed(0)):
+        assert_close(new.position, place, kind="value", name="position")
+        assert new.viewmat.isfinite().all()

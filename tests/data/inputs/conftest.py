@@ -1,0 +1,34 @@
+"""The demo as a scene in other forms, and a cache of its own for every test."""
+
+from functools import partial
+
+import pytest
+
+import nexwarp.data.scene
+from benchmarks.inputs import BARREL, FISHEYE, demo_lens, write_distorted
+from nexwarp.data import write_demo
+from nexwarp.data.random_points import random_points
+from tests.data.inputs.support import SIZE
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("NEXWARP_CACHE", str(folder))
+    monkeypatch.setattr(nexwarp.data.scene, "random_points", partial(random_points, count=4000))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    return write_demo(tmp_path_factory.mktemp("demo") / "demo", **SIZE)
+
+
+@pytest.fixture(scope="module")
+def distorted(demo, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("distorted")
+    lenses = {"OPENCV": BARREL, "OPENCV_FISHEYE": FISHEYE}
+    return {
+        model: write_distorted(demo, folder / model, demo_lens(demo, model, coefficients), samples=3)
+        for model, coefficients in lenses.items()
+    }

@@ -1,0 +1,214 @@
+"""Bad scenes are one clear line."""
+
+import json
+import struct
+import warnings
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import nexwarp.data.scene
+from benchmarks.inputs import APPLIED, write_blender, write_nerfstudio
+from nexwarp.data import load_scene
+from tests.data.inputs.support import MASK, assert_same_cameras, edit, file, frame, spoilt, write_mask
+from tests.data.test_scene import make_scene
+
+
+def text(content: str | bytes):
+    def make(demo, path):
+        write_nerfstudio(demo, path)
+        (path / "transforms.json").write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return make
+
+
+def mask_of(width: int, height: int, value: int = 255):
+    def make(demo, path):
+        write_nerfstudio(demo, path)
+        (path / "masks").mkdir()
+        Image.new("L", (width, height), value).save(path / "masks" / "view_003.png")
+        return path
+
+    return make
+
+
+def header_only(width: int, height: int) -> bytes:
+    """A PNG that says it is large and holds nothing."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return start + b"\0\0\0\0IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
+
+
+ROWS = np.eye(4).tolist()
+SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
+BAD = {
+    "no JSON": (text("{frames: []"), r"transforms.json: expected JSON, could not parse it"),
+    "no text": (text(b"\xff\xfe\x00"), "expected JSON"),
+    "a list": (text("[]"), "expected a JSON object, got list"),
+    "NaN": (text('{"frames": [NaN]}'), "NaN is no JSON number"),
+    "too deep": (text('{"frames": ' + "[" * 100_000), "nested too deeply|could not parse"),
+    "a number of 5,000 digits": (text('{"frames": [{"w": ' + "9" * 5000 + "}]}"), "could not parse"),
+    "no frames": (spoilt(lambda data: data.pop("frames") and None), "frames: expected a list .*, got None"),
+    "empty frames": (spoilt(lambda data: data["frames"].clear()), r"frames: expected a list .*, got \[\]"),
+    "frame that is none": (spoilt(lambda data: data["frames"].append(7)), "frame 10: expected a JSON object, got 7"),
+    "one frame": (spoilt(lambda data: data.update(frames=data["frames"][:1])), "at least 2 registered images"),
+    "frame twice": (
+        spoilt(lambda data: data["frames"].append(data["frames"][2])),
+        "each photo once, got view_00.* twice",
+    ),
+    "no file name": (frame(file_path=None), "frame 3: file_path: expected the name of a file, got None"),
+    "no such file": (frame(file_path="images/x.png"), "1 of .* photos: image not found: images/x.png; --skip-missing"),
+    "parent": (frame(file_path="images/../../x.png"), "file_path: .* leaves the scene's folder"),
+    "absolute": (frame(file_path="/etc/passwd"), "file_path: '/etc/passwd' leaves the scene's folder"),
+    "drive": (frame(file_path="C:\\x.png"), "file_path: .* leaves the scene's folder"),
+    "backslashes": (frame(file_path="images\\..\\..\\x.png"), "leaves the scene's folder"),
+    "zero byte": (frame(file_path="images/\0.png"), "leaves the scene's folder"),
+    "no matrix": (frame(transform_matrix=None), "frame 3 .*: transform_matrix: expected 4 rows of 4 numbers, got None"),
+    "short matrix": (frame(transform_matrix=ROWS[:2]), "expected 4 rows of 4 numbers"),
+    "ragged matrix": (frame(transform_matrix=[[1, 2], *ROWS[1:]]), "expected 4 rows of 4 numbers"),
+    "text matrix": (frame(transform_matrix=[["1", 0, 0, 0], *ROWS[1:]]), "expected 4 rows of 4 numbers"),
+    "infinite matrix": (frame(transform_matrix=[[1e999, 0, 0, 0], *ROWS[1:]]), "Infinity is no JSON|expected finite"),
+    "large whole number": (frame(transform_matrix=[[10**400, 0, 0, 0], *ROWS[1:]]), "expected finite numbers"),
+    "singular matrix": (frame(transform_matrix=SINGULAR), "got a singular, sheared, scaled or mirroring one"),
+    "scaled matrix": (
+        frame(transform_matrix=(2 * np.eye(4)).tolist()),
+        "last row 0, 0, 0, 1|singular, sheared, scaled",
+    ),
+    "projective matrix": (frame(transform_matrix=[*ROWS[:3], [0, 0, 1, 1]]), "the last row 0, 0, 0, 1"),
+    "singular applied": (
+        spoilt(lambda d: d.update(applied_transform=SINGULAR)),
+        "applied_transform: .* got a singular",
+    ),
+    "applied scale of 0": (spoilt(lambda data: data.update(applied_scale=0)), "applied_scale: expected a number > 0"),
+    "endless applied scale": (
+        spoilt(lambda data: data.update(applied_scale=1e200)),
+        "applied_transform: .* got a singular",
+    ),
+    "focal length of 0": (spoilt(lambda data: data.update(fl_x=0.0)), "K: expected focal lengths > 0, got 0"),
+    "no focal length": (spoilt(lambda d: [d.pop(k) for k in ("fl_x", "fl_y")] and None), "expected a focal length"),
+    "angle of pi": (
+        spoilt(lambda d: d.pop("fl_x") and d.update(camera_angle_x=3.2)),
+        "camera_angle_x: expected radians between 0 and pi",
+    ),
+    "text focal length": (spoilt(lambda data: data.update(fl_x="wide")), "fl_x: expected a number, got 'wide'"),
+    "half a pixel": (spoilt(lambda data: data.update(w=96.5)), "w, h: expected whole numbers of pixels"),
+    "billions of pixels": (spoilt(lambda data: data.update(w=10**9)), "expected an image size of 1 to 65536"),
+    "unknown camera model": (
+        spoilt(lambda d: d.update(camera_model="FISHEYE624")),
+        "camera_model: .* got 'FISHEYE624'",
+    ),
+    "model of a list": (spoilt(lambda data: data.update(camera_model=[1])), r"camera_model: .* got \[1\]"),
+    "unknown coefficient": (spoilt(lambda data: data.update(p3=0.1)), "lens coefficient p3 is no part of camera model"),
+    "photos of another shape": (spoilt(lambda data: data.update(w=50, h=72)), "expected an image of 50x72 pixels"),
+    "unknown test photo": (spoilt(lambda d: d.update(test_filenames=["images/q.png"])), "test_filenames: .* got q.png"),
+    "split that is no list": (spoilt(lambda d: d.update(train_filenames=3)), "train_filenames: expected a list"),
+    "no training photo": (spoilt(lambda data: data.update(train_filenames=[])), "at least one photo"),
+    "no such ply": (spoilt(lambda d: d.update(ply_file_path="q.ply")), "ply_file_path: points not found: .*q.ply"),
+    "ply elsewhere": (spoilt(lambda d: d.update(ply_file_path="../q.ply")), "ply_file_path: .* leaves the scene"),
+    "ply that is none": (file("sparse_pc.ply", b"obj"), "expected a PLY file, but it does not begin with 'ply'"),
+    "id of an image": (frame(colmap_im_id="four"), "frame 3: colmap_im_id: expected an image's id, got 'four'"),
+    "no such mask": (frame(mask_path="masks/q.png"), "frame 3 .*: mask not found: .*q.png"),
+    "mask elsewhere": (frame(mask_path="../q.png"), "mask_path: '../q.png' leaves the scene's folder"),
+    "mask that is none": (file("q.png", b"GIF", mask_path="q.png"), "q.png: expected a complete image file"),
+    "mask of another size": (mask_of(72, 96), "view_003.png: expected a mask of 96x72 pixels .* got 72x96"),
+    "black mask": (mask_of(96, 72, 0), "view_003.png: expected a mask with pixels that count, got none"),
+    "bomb": (
+        file("images/view_003.png", header_only(60_000, 60_000)),
+        "view_003.png: expected .* megapixels, got more",
+    ),
+    "cut-off photo": (file("images/view_003.png", header_only(96, 72)), "view_003.png: expected a complete image file"),
+    "mask bomb": (file("q.png", header_only(60_000, 60_000), mask_path="q.png"), "q.png: expected .* megapixels"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_input_is_one_clear_line(demo, tmp_path, kind):
+    make, message = BAD[kind]
+    path = make(demo, tmp_path / "scene")
+    before = sorted(path.rglob("*"))
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+        load_scene(path)
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value) and len(str(caught.value)) < 400
+    assert sorted(path.rglob("*")) == before
+
+
+def test_a_json_file_of_any_size_is_not_read(demo, tmp_path):
+    path = write_nerfstudio(demo, tmp_path / "scene")
+    with (path / "transforms.json").open("r+b") as stream:
+        stream.truncate(2**40)  # sparse: it takes no room
+    with pytest.raises(ValueError, match=r"expected at most 33,554,432 bytes of JSON, got 1,099,511,627,776"):
+        load_scene(path)
+
+
+def test_unknown_keys_are_ignored(demo, tmp_path):
+    def change(data):
+        data |= {"aabb_scale": 16, "orientation_override": "none", "offset": [1, 2]}
+        data["frames"][0] |= {"sharpness": 12.5, "colmap_im_id": 3, "depth_file_path": "../nowhere"}
+
+    assert_same_cameras(load_scene(edit(write_nerfstudio(demo, tmp_path / "scene"), change)), load_scene(demo))
+
+
+def test_a_photo_may_not_be_in_both_of_blenders_files(demo, tmp_path):
+    path = write_blender(demo, tmp_path / "scene")
+    train = json.loads((path / "transforms_train.json").read_text())
+    edit(path, lambda data: data["frames"].append(train["frames"][0]), "transforms_test.json")
+    with pytest.raises(ValueError, match=r"transforms_test.json: train/view_001.png is in transforms_train.json too"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"masks": "absent"}, FileNotFoundError, "masks: no folder 'absent' in .*, which has no folder masks"),
+        ({"masks": 3}, TypeError, "masks: expected the name of a folder, got int"),
+        ({"background": "pink"}, ValueError, "background: expected white, black, random or three numbers"),
+        ({"background": (0, 0, 2)}, ValueError, "background: expected white, black, random or three numbers"),
+        ({"background": 0.5}, ValueError, "background: expected white, black, random or three numbers"),
+        ({"points": "absent.ply"}, FileNotFoundError, "absent.ply: no such file"),
+        ({"points": 3}, TypeError, "points: expected the path of a PLY file, got int"),
+        ({"images": "images_9"}, FileNotFoundError, "images: no folder 'images_9'"),
+    ],
+)
+def test_bad_arguments(demo, options, error, message):
+    with pytest.raises(error, match=message):
+        load_scene(demo, **options)
+
+
+def test_masks_that_no_photo_has(tmp_path):
+    path = make_scene(tmp_path / "scene")
+    write_mask(path / "masks" / "other.png", MASK)
+    with pytest.raises(FileNotFoundError, match=r"masks: none in .* is named after a photo, expected 00.png.png, say"):
+        load_scene(path)
+    assert len(load_scene(path, masks=None).train) == 8
+
+
+def test_damaged_json_never_crashes(demo, tmp_path):
+    """Cut off or with bytes changed at 120 places: it loads, or says so in a line."""
+    path = write_nerfstudio(demo, tmp_path / "scene")
+    good = (path / "transforms.json").read_bytes()
+    rng = np.random.default_rng(0)
+    outcomes = {"loaded": 0, "refused": 0}
+    for trial in range(120):
+        data = bytearray(good)
+        if trial % 3 == 0:
+            data = data[: rng.integers(len(data))]
+        elif trial % 3 == 1:
+            for place in rng.integers(0, len(data), 2):
+                data[place] = rng.choice(list(b'0123456789-.eE[]{},:"\xff'))
+        else:  # another digit: poses that are none, focal lengths of 0, photos that are not there
+            digits = [place for place, byte in enumerate(data) if byte in b"0123456789"]
+            data[rng.choice(digits)] = rng.choice(list(b"0123456789"))
+        (path / "transforms.json").write_bytes(data)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                nexwarp.data.scene._read_capture(path, "images", "nerfstudio")
+            outcomes["loaded"] += 1
+        except (ValueError, FileNotFoundError) as error:
+            assert "\n" not in str(error) and str(path) in str(error)
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 10
+    assert APPLIED.shape == (3, 4)

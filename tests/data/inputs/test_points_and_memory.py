@@ -1,0 +1,72 @@
+"""Points of one's own, memory, and progress."""
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp.data.memory
+import nexwarp.data.scene
+import nexwarp.data.views
+import nexwarp.machine
+from benchmarks.inputs import write_points
+from nexwarp.data import load_scene
+from tests.data.test_scene import make_scene
+
+# Points of one's own
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_points_of_a_ply_file(tmp_path, form):
+    path = make_scene(tmp_path / "scene")
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3))
+    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", points, colors, form))
+    assert np.array_equal(scene.points.numpy(), points.astype(np.float32))
+    assert np.array_equal(scene.colors.numpy(), colors)
+    assert scene.scale == pytest.approx(load_scene(path).scale)
+
+
+def test_points_of_one_s_own_make_up_for_none(tmp_path):
+    path = make_scene(tmp_path / "scene", points=np.zeros((0, 3)))
+    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", np.eye(3), np.eye(3)))
+    assert torch.equal(scene.points, torch.eye(3))
+
+
+def test_huge_clouds_are_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(nexwarp.data.scene, "MAX_POINTS", 10)
+    path = make_scene(tmp_path / "scene")
+    scene, again = load_scene(path), load_scene(path)
+    assert len(scene.points) == len(scene.colors) == len(scene.track_lengths) == 10
+    assert torch.equal(scene.points, again.points)
+
+
+# Memory, progress, formats
+
+
+def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    path = make_scene(tmp_path / "scene")
+    (path / "images_2").mkdir()
+    need = 10 * 48 * 36 * 3
+    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: need // 3)
+    monkeypatch.setattr(nexwarp.data.views, "read_image", lambda *_: pytest.fail("read"))
+    with pytest.raises(ValueError, match=r"10 photos of up to 48x36 .* use downscale=2 \(.*\) or .* \(images_2\)") as e:
+        load_scene(path)
+    assert "\n" not in str(e.value)
+    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: 0)
+    with pytest.raises(ValueError, match="use fewer photos"):
+        load_scene(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: need // 3)
+    load_scene(path, downscale=2)
+
+
+def test_a_thousand_photos_of_eight_megapixels_fit_8_gb_at_half_size():
+    sizes = [(3264, 2448)] * 1000
+    assert nexwarp.data.memory.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.memory.photos_bytes(sizes, 1, 3)
+    assert nexwarp.machine.available_memory() > 2**20
+
+
+def test_progress_counts_every_photo(tmp_path):
+    calls = []
+    load_scene(make_scene(tmp_path / "scene"), progress=lambda *call: calls.append(call))
+    assert calls == [(done, 10) for done in range(1, 11)]

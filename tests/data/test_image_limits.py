@@ -1,0 +1,288 @@
+"""Images that are too large for int32 or for the memory, and arguments that cannot be rendered, get one clear error."""
+
+import gc
+import weakref
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.cli import main as cli
+from nexwarp.errors import NexwarpError, OutOfMemoryError
+from nexwarp.kernels import launch as launching
+from nexwarp.kernels.types import types
+from nexwarp.model.buffers import render_buffers
+from nexwarp.model.model_file import save_model
+from nexwarp.ops import _interop, memory, tiles
+from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.train.trainer import Trainer
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.trainer_support import small
+
+GIB = 2**30
+CROP = r"render the image in parts \(Camera\.crop\)"
+SMALLER = r"render a smaller image, with a lower K, or in parts \(Camera\.crop\)"
+
+
+def parts(device: torch.device | str = "cpu", **size: int) -> tuple[nw.Surfels, nw.NeuralTexture, nw.Camera]:
+    scene = random_scene(12, device=device)
+    return make_surfels(scene), make_texture(device=device), make_camera(scene, **size)
+
+
+def renderings(surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, max_hits: int) -> list[Any]:
+    """The calls that render, all of the same picture."""
+    model = nw.Model(surfels, texture, options=nw.RenderOptions(max_hits=max_hits))
+    return [
+        lambda: nw.render(surfels, texture, camera, max_hits),
+        lambda: model.render(camera),
+        lambda: render_buffers(model, camera),
+    ]
+
+
+@pytest.fixture
+def no_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail the test when a pass begins."""
+
+    def fail(*_: Any, **__: Any) -> None:
+        pytest.fail("a pass was launched")
+
+    monkeypatch.setattr(launching, "launch", fail)
+
+
+# int32
+
+
+@pytest.mark.usefixtures("no_allocation")
+@pytest.mark.parametrize("size", [(100_000, 100_000), (2**31, 1), (1, 2**31), (46_341, 46_341), (2**27, 1), (2**40, 2)])
+def test_more_pixels_than_int32_counts(size, device):
+    surfels, texture, camera = parts(device, width=size[0], height=size[1])
+    line = rf"^camera: expected an image of at most 2,147,483,647 pixels, in tiles of 16x16, got {size[0]}x{size[1]}; "
+    for textured in (texture, None):
+        for call in renderings(surfels, textured, camera, 2):
+            with pytest.raises(ValueError, match=line + CROP):
+                call()
+
+
+@pytest.mark.usefixtures("no_allocation")
+def test_more_hits_than_int32_counts(device):
+    """Without a texture hits are counted; with one, the bytes of a row of its values are."""
+    surfels, texture, camera = parts(device, width=40_000, height=40_000)
+    for call in renderings(surfels, None, camera, 8):
+        with pytest.raises(
+            ValueError, match=r"^max_hits: expected at most 2,147,483,647 hits, .* 40000x40000 times 8; "
+        ):
+            call()
+    camera = parts(device, width=8192, height=8192)[2]
+    texture.half_precision = False
+    for call in renderings(surfels, texture, camera, 8):
+        with pytest.raises(
+            ValueError, match=r"^max_hits: expected at most 536,870,879 hits, .* got 8192x8192 times 8; "
+        ):
+            call()
+
+
+def test_rows_that_warp_cannot_address_are_refused():
+    wide = torch.empty_strided((2, 4), (2**29, 1))  # of memory that is never touched
+    with pytest.raises(ValueError, match=r"^expected a tensor with rows of at most 2,147,483,647 bytes, got \(2, 4\)$"):
+        _interop.array(wide, types(_interop.real_of(wide)).real)
+    single = torch.empty_strided((1, 4), (2**40, 1))
+    assert _interop.array(single, types(_interop.real_of(single)).real) is not None
+
+
+# Memory
+
+
+def limit_memory(monkeypatch: pytest.MonkeyPatch, device: torch.device, size: int) -> None:
+    if device.type == "cuda":
+        found = type("Properties", (), {"total_memory": size})
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: found)
+    monkeypatch.setattr(memory, "available_memory", lambda: size)
+
+
+@pytest.mark.usefixtures("no_allocation")
+def test_an_image_that_memory_cannot_hold_is_refused_before_anything_is_allocated(monkeypatch, device):
+    surfels, texture, camera = parts(device, width=8192, height=8192)
+    limit_memory(monkeypatch, device, 3 * GIB)
+    where = "are free" if device.type == "cpu" else "are on the GPU"
+    for textured in (texture, None):
+        for call in renderings(surfels, textured, camera, 2):
+            with pytest.raises(OutOfMemoryError) as caught:
+                call()
+            text = str(caught.value)
+            assert text.startswith("out of memory: an image of 8192x8192 pixels with K = 2 needs at least "), text
+            assert f" GiB, of which 3.0 GiB {where}; render a smaller image" in text and "\n" not in text
+            assert isinstance(caught.value, MemoryError) and isinstance(caught.value, NexwarpError)
+
+
+def test_what_is_counted_is_less_than_what_a_rendering_takes(monkeypatch):
+    """The bound never refuses what would fit: it is at most what the tensors of a rendering take."""
+    asked: list[int] = []
+    monkeypatch.setattr(memory, "check_memory", lambda needed, *_: asked.append(needed))
+    surfels, texture, camera = parts(width=300, height=200)
+    for textured in (texture, None):
+        for max_hits in (0, 4):
+            with torch.profiler.profile(profile_memory=True) as profile, torch.no_grad():
+                nw.render(surfels, textured, camera, max_hits)
+            taken = sum(max(event.self_cpu_memory_usage, 0) for event in profile.key_averages())
+            assert asked[-1] <= taken, (max_hits, textured is None)
+            assert asked[-1] > 300 * 200 * 40
+
+
+@pytest.mark.usefixtures("no_allocation")
+def test_small_images_do_not_ask_for_the_free_memory(monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: pytest.fail("asked"))
+    memory.check_memory(GIB - 1, torch.device("cpu"), "a small image")
+
+
+def test_lists_that_memory_cannot_hold(monkeypatch):
+    """A few entries stand for a thousand million."""
+    surfels, _, camera = parts(width=640, height=480)
+    monkeypatch.setattr(memory, "SMALLEST_CHECKED", 100)
+    monkeypatch.setattr(memory, "available_memory", lambda: 100)
+    monkeypatch.setattr(ops, "check_image", lambda *_, **__: None)
+    with pytest.raises(
+        OutOfMemoryError, match=rf"a list of [\d,]+ \(tile, surfel\) entries needs at least .*{SMALLER}"
+    ):
+        nw.render(surfels, None, camera)
+
+
+@pytest.mark.parametrize(
+    ("error", "needed"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has"), "2.50 GiB"),
+        (RuntimeError("Failed to allocate 3221225472 bytes on device 'cuda:0'"), "3.00 GiB"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 5242880 bytes."), "5.00 MiB"),
+        (MemoryError(), "more than there is"),
+    ],
+)
+def test_an_allocation_that_fails_is_our_error_and_frees_what_there_was(monkeypatch, error, needed, device):
+    surfels, texture, camera = parts(device)
+    model = nw.Model(surfels, texture)
+    expected = model.render(camera).image
+    kept: list[weakref.ref[torch.Tensor]] = []
+    original = tiles._tile_polygons
+
+    def fail(*arguments: Any) -> Any:
+        polygons = original(*arguments)
+        kept.append(weakref.ref(polygons[1]))
+        raise type(error)(*error.args)
+
+    monkeypatch.setattr(tiles, "_tile_polygons", fail)
+    with pytest.raises(
+        OutOfMemoryError, match=f"^out of memory: an image of 23x18 .* needs {needed}; {SMALLER}$"
+    ) as told:
+        model.render(camera)
+    assert told.value.needed == needed
+    gc.collect()
+    assert kept[0]() is None
+    monkeypatch.undo()
+    assert torch.equal(model.render(camera).image, expected)
+
+
+def test_other_errors_stay_what_they_are(monkeypatch):
+    surfels, texture, camera = parts()
+
+    def fail(*_: Any) -> None:
+        raise RuntimeError("shape mismatch")
+
+    monkeypatch.setattr(tiles, "_tile_polygons", fail)
+    with pytest.raises(RuntimeError, match=r"^shape mismatch$"):
+        nw.render(surfels, texture, camera)
+
+
+def test_a_training_says_what_to_lower_when_a_rendering_is_refused(tiny_scene, monkeypatch):
+    trainer = Trainer(tiny_scene, small(), "cpu")
+    monkeypatch.setattr(memory, "SMALLEST_CHECKED", 1000)
+    monkeypatch.setattr(memory, "available_memory", lambda: 2000)
+    with pytest.raises(OutOfMemoryError, match=r"^out of memory at iteration 1: it needed at least .* lower --max"):
+        trainer.run()
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder that can be rendered, as far as the command looks."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    surfels, texture, camera = parts()
+    create_run(folder, SceneSource("scene"), small(), "cpu")
+    save_model(folder, nw.Model(surfels, texture))
+    save_cameras(folder / "cameras.json", {"train": {"a.png": camera}, "test": {"b.png": camera}})
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("flags", "line"),
+    [
+        (["--size", "100000x100000"], "--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100000x100000'"),
+        (["--scale", "1e6"], "--scale: expected at most 16384 pixels a side, got 23000000x18000000 with 1e+06"),
+        (
+            ["--size", "16384x16384"],
+            "max_hits: expected at most 536,870,879 hits, pixels times max_hits, got 16384x16384 times 2; "
+            "render the image in parts (Camera.crop)",
+        ),
+        (
+            ["--size", "8192x8192"],
+            "out of memory: an image of 8192x8192 pixels with K = 2 needs at least 11.2 GiB, of which 8.0 GiB are "
+            "free; render a smaller image, with a lower K, or in parts (Camera.crop)",
+        ),
+    ],
+)
+def test_the_command_refuses_images_that_are_too_large(run, monkeypatch, capsys, flags, line):
+    limit_memory(monkeypatch, torch.device("cpu"), 8 * GIB)
+    before = sorted(run.rglob("*"))
+    assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 2
+    assert capsys.readouterr().err == f"nexwarp: error: {line}\n"
+    assert sorted(run.rglob("*")) == before
+
+
+# Values and devices
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e39])
+def test_a_background_must_be_finite(value):
+    surfels, texture, camera = parts()
+    for background in (value, (0.0, value, 0.0), [0, 0, value]):
+        with pytest.raises(ValueError, match=r"^background: expected finite values, got "):
+            nw.render(surfels, texture, camera, background=background)
+        with pytest.raises(ValueError, match=r"^background: expected finite values, got "):
+            nw.Model(surfels, texture).render(camera, background=background)
+    if value != 1e39:
+        with pytest.raises(ValueError, match=r"^background: expected finite values, got -?(nan|inf) at index \(1,\)$"):
+            nw.render(surfels, texture, camera, background=torch.tensor([0.0, value, 0.0]).requires_grad_())
+        with pytest.raises(ValueError, match=r"^background: expected finite values, got -?(nan|inf) at index \(\)$"):
+            nw.render(surfels, texture, camera, background=torch.tensor(value))
+
+
+def moved(camera: nw.Camera, K: torch.Tensor) -> nw.Camera:
+    """The camera with a K that its own check does not see."""
+    checked = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return nw.Camera(camera.viewmat, K, camera.width, camera.height, checked=checked)
+
+
+def test_tensors_on_the_meta_device_are_named():
+    surfels, texture, camera = parts()
+    viewmat, K, width, height = camera.viewmat, camera.K, camera.width, camera.height
+    for given, name in (((viewmat, K.to("meta")), "K"), ((viewmat.detach().to("meta"), K), "viewmat")):
+        with pytest.raises(ValueError, match=f"^{name}: expected a tensor with values, got one on the device meta$"):
+            nw.Camera(*given, width, height)
+    with pytest.raises(ValueError, match=r"^camera\.K: expected a tensor on cpu, got one on meta$"):
+        nw.render(surfels, texture, moved(camera, K.to("meta")))
+    with pytest.raises(ValueError, match=r"^surfels: expected parameters on a CPU or a CUDA device, got meta$"):
+        nw.render(surfels.to("meta"), texture, camera)
+
+
+@pytest.mark.cuda
+def test_tensors_on_another_device_are_named():
+    surfels, texture, camera = parts("cuda")
+    with pytest.raises(ValueError, match=r"^K: expected a tensor on cuda:0 as viewmat is, got one on cpu$"):
+        nw.Camera(camera.viewmat, camera.K.cpu(), camera.width, camera.height)
+    with pytest.raises(ValueError, match=r"^camera\.K: expected a tensor on cuda:0, got one on cpu$"):
+        nw.render(surfels, texture, moved(camera, camera.K.cpu()))
+    with pytest.raises(ValueError, match=r"^camera\.viewmat: expected a tensor on cuda:0, got one on cpu$"):
+        nw.render(surfels, texture, camera.to("cpu"))

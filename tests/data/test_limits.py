@@ -1,0 +1,363 @@
+"""What a stranger's files may ask for: nothing is allocated or followed before it is known to be honest."""
+
+import json
+import shutil
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from PIL import Image
+
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path
+from nexwarp.data import load_scene
+from nexwarp.data.colmap import read_model
+from nexwarp.data.images import read_image, read_mask
+from nexwarp.data.lens import pycolmap_module
+from nexwarp.io.files import one_line
+from nexwarp.io.json_files import parse_json
+from nexwarp.model.model_file import load, save_model
+from nexwarp.train.config import Config
+from nexwarp.train.presets import config_from_dict
+from tests.data.test_scene import HEIGHT, WIDTH, make_scene, pose
+from tests.model_file_support import make_model, rewrite
+
+CAMERA_SIZE = 8 + 8  # where width and height lie in cameras.bin, after the count, id and model
+
+
+def refused(path: Path, match: str, error: type[Exception] = ValueError, **options: Any) -> None:
+    with pytest.raises(error, match=match) as caught:
+        load_scene(path, **options)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def overwrite(file: Path, offset: int, data: bytes) -> None:
+    content = bytearray(file.read_bytes())
+    content[offset : offset + len(data)] = data
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("size", [(0, 36), (48, 0), (48 * 2**30, 36 * 2**30), (2**64 - 1, 1)])
+def test_camera_sizes(tmp_path, size):
+    path = make_scene(tmp_path)
+    overwrite(path / "sparse/0/cameras.bin", CAMERA_SIZE, struct.pack("<QQ", *size))
+    refused(path, rf"00\.png: .* expected an image size of 1 to 65536 pixels, got {size[0]}x{size[1]}")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300])
+def test_poses_and_intrinsics_that_are_not_finite_name_the_photo(tmp_path, value):
+    path = make_scene(tmp_path / "a")
+    overwrite(path / "sparse/0/images.bin", 8 + 4 + 32, struct.pack("<d", value))
+    refused(path, r"00\.png: expected a finite pose with a rotation, got")
+    path = make_scene(tmp_path / "b")
+    overwrite(path / "sparse/0/images.bin", 8 + 4, struct.pack("<4d", 0, 0, 0, 0))
+    refused(path, r"00\.png: expected a finite pose with a rotation, got")
+    path = make_scene(tmp_path / "c")
+    overwrite(path / "sparse/0/cameras.bin", CAMERA_SIZE + 16, struct.pack("<d", value))
+    refused(path, r"00\.png: the COLMAP camera of this image is not usable: camera model PINHOLE: expected")
+
+
+def test_point_errors_that_are_not_finite(tmp_path):
+    path = make_scene(tmp_path)
+    overwrite(path / "sparse/0/points3D.bin", 8 + 35, struct.pack("<d", float("nan")))
+    refused(path, r"expected finite reprojection errors, got nan \(point id \d+\)")
+
+
+def test_photos_come_once(tmp_path):
+    for again in ("a.png", "./a.png"):
+        path = make_scene(tmp_path / str(len(again)), names=["a.png", "b.png", again])
+        refused(path, "expected each photo once, got a.png twice")
+    scene = load_scene(make_scene(tmp_path / "c", names=["x/./a.png", "x//b.png"]))
+    assert [view.name for view in scene.test + scene.train] == ["x/a.png", "x/b.png"]
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "y/" * 600 + "a.png"])
+def test_names_of_absurd_length(tmp_path, name):
+    path = make_scene(tmp_path, names=["a.png", "b.png"])
+    file = path / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"a.png\0", name.encode() + b"\0"))
+    refused(path, r"image name '[xy/]+\.\.\.: expected at most 240 bytes a part and 1024 in all")
+
+
+def test_links_stay_in_the_scene(tmp_path):
+    outside = tmp_path / "private.png"
+    Image.new("RGB", (WIDTH, HEIGHT)).save(outside)
+    path = make_scene(tmp_path / "scene")
+    (path / "images/03.png").unlink()
+    (path / "images/03.png").symlink_to(outside)
+    refused(path, r"image name '03\.png': a link leaves .*images, expected a file in it; --follow-links allows it")
+    followed = load_scene(path, follow_links=True)
+    assert "03.png" in {view.name for view in followed.train}
+    (path / "images/03.png").unlink()
+    (path / "images/03.png").symlink_to("04.png")
+    load_scene(path)
+    # The folder itself is the user's to choose, and may lie on another disk.
+    (path / "images").rename(tmp_path / "elsewhere")
+    (path / "images").symlink_to(tmp_path / "elsewhere")
+    load_scene(path)
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path"])
+def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
+    path = tmp_path / "scene"
+    (path / "images").mkdir(parents=True)
+    frames = []
+    for index in range(3):
+        viewmat = np.eye(4)
+        viewmat[:3] = pose(index)
+        matrix = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        Image.new("RGB", (8, 6)).save(path / f"images/{index}.png")
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": matrix.tolist()})
+    data = {"w": 8, "h": 6, "fl_x": 9.0, "frames": frames}
+    (tmp_path / "private").write_bytes((path / "images/0.png").read_bytes())
+    (path / "link.png").symlink_to(tmp_path / "private")
+    (data if key == "ply_file_path" else frames[1])[key] = "link.png"
+    (path / "transforms.json").write_text(json.dumps(data))
+    refused(path, rf"{key}.* 'link.png': a link leaves .*, expected a file in it; --follow-links allows it")
+    if key == "file_path":  # the link leads to a picture
+        assert len(load_scene(path, follow_links=True).train) == 2
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_missing_photos_are_all_named_at_once(tmp_path, kind):
+    path = make_scene(tmp_path)
+    if kind == "nerfstudio":
+        poses = [np.eye(4) + np.outer([i, 0, 0, 0], [0, 0, 0, 1]) for i in range(10)]
+        frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": poses[i].tolist()} for i in range(10)]
+        (path / "transforms.json").write_text(json.dumps({"fl_x": 40.0, "w": WIDTH, "h": HEIGHT, "frames": frames}))
+        shutil.rmtree(path / "sparse")
+    for name in ("03.png", "07.png"):
+        (path / "images" / name).unlink()
+    named = r"2 of 10 photos: image not found: (images/)?03\.png, (images/)?07\.png"
+    with pytest.raises(FileNotFoundError, match=rf"{named}; --skip-missing goes on without them$"):
+        load_scene(path)
+    with pytest.warns(UserWarning, match=rf"{named}; going on without them$"):
+        scene = load_scene(path, skip_missing=True)
+    names = {view.name for view in scene.train + scene.test}
+    assert names == {f"{index:02d}.png" for index in range(10)} - {"03.png", "07.png"}
+    for file in sorted((path / "images").iterdir())[1:]:
+        file.unlink()
+    with pytest.raises(FileNotFoundError, match="9 of 10 photos"):
+        load_scene(path, skip_missing=True)
+
+
+def test_a_huge_photo_of_a_small_camera_is_not_decoded(tmp_path, monkeypatch):
+    path = make_scene(tmp_path)
+    Image.new("1", (1200 * 10, 900 * 10)).save(path / "images/03.png")
+    assert (path / "images/03.png").stat().st_size < 20_000
+    monkeypatch.setattr(Image.Image, "load", None)
+    refused(path, r"03\.png: expected an image of at most 16 times the size of its camera, 48x36, got 12000x9000")
+
+
+def test_a_huge_mask_of_a_small_photo_is_not_decoded(tmp_path, monkeypatch):
+    path = make_scene(tmp_path)
+    (path / "masks").mkdir()
+    Image.new("1", (1200 * 10, 900 * 10)).save(path / "masks/03.png.png")
+    refused(path, r"03\.png\.png: expected an image of at most 16 times the size of its photo, 48x36, got 12000x9000")
+
+
+def test_images_of_more_pixels_than_their_file_holds(tmp_path):
+    file = tmp_path / "a.png"
+    Image.new("L", (16, 16)).save(file)
+    header = b"IHDR" + struct.pack(">IIBBBBB", 9_000, 9_000, 8, 0, 0, 0, 0)
+    overwrite(file, 12, header + struct.pack(">I", zlib.crc32(header)))
+    with pytest.raises(ValueError, match="9000x9000 pixels are more than a file of this size holds"):
+        read_mask(file)
+    header = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    overwrite(file, 12, header + struct.pack(">I", zlib.crc32(header)))
+    with pytest.raises(ValueError, match="expected an image of at most 178 megapixels, got more"):
+        read_mask(file)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames", "rigs"])
+def test_counts_are_checked_before_they_are_believed(tmp_path, name):
+    path = make_scene(tmp_path)
+    file = path / f"sparse/0/{name}.bin"
+    good = file.read_bytes()
+    for count in (2**20, 2**40, 2**64 - 1):
+        overwrite(file, 0, struct.pack("<Q", count))
+        refused(path, rf"{name}\.bin: truncated or damaged, expected more records than the file holds")
+    for size in range(0, len(good), max(len(good) // 40, 1)):
+        file.write_bytes(good[:size])
+        refused(path, rf"{name}\.bin: truncated or damaged")
+    file.write_bytes(good + b"\0")
+    refused(path, rf"{name}\.bin: damaged, expected {len(good):,} bytes as its counts say, got {len(good) + 1:,}")
+
+
+def test_ids_that_are_not_there_or_twice(tmp_path):
+    path = make_scene(tmp_path / "a")
+    overwrite(path / "sparse/0/points3D.bin", 8 + 51, struct.pack("<I", 77))
+    refused(path, r"point \d+ is seen by image 77, which the model does not have")
+    path = make_scene(tmp_path / "b")
+    overwrite(path / "sparse/0/images.bin", 8 + 60, struct.pack("<I", 5))
+    refused(path, r"00\.png: expected a camera of the model, got id 5")
+    path = make_scene(tmp_path / "c")
+    overwrite(path / "sparse/0/images.bin", 8, struct.pack("<I", 2))
+    refused(path, r"images\.bin: damaged, expected each id once, got 2 twice")
+
+
+def test_poses_of_a_rig_are_those_of_pycolmap(tmp_path):
+    pycolmap = pycolmap_module()
+    rng = np.random.default_rng(1)
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    for index in (1, 2):
+        params = [40.0, 43.0, 25.5, 16.0]
+        model.add_camera(pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=index))
+    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
+    offset = pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(size=3)), rng.normal(size=3))
+    rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 2), offset)
+    model.add_rig(rig)
+    for index in range(3):
+        frame = pycolmap.Frame(frame_id=index + 1, rig_id=1)
+        frame.rig_from_world = pycolmap.Rigid3d(pose(index))
+        images = []
+        for camera in (1, 2):
+            image = pycolmap.Image(name=f"{camera}/{index}.png", camera_id=camera, image_id=2 * index + camera)
+            image.frame_id = index + 1
+            frame.add_data_id(image.data_id)
+            images.append(image)
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+        model.register_frame(index + 1)
+    for kind, write in (("binary", model.write_binary), ("text", model.write_text)):
+        folder = tmp_path / kind
+        folder.mkdir()
+        write(str(folder))
+        photos = read_model(folder, folder).photos
+        assert len(photos) == 6
+        for photo in photos:
+            expected = model.find_image_with_name(photo.name).cam_from_world().matrix()
+            np.testing.assert_allclose(photo.viewmat[:3], expected, atol=1e-12)
+
+
+BIG = """
+import sys
+import zlib
+from pathlib import Path
+from nexwarp.data.colmap import read_model
+def peak():  # of this program alone, in bytes
+    return 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+before = peak()
+capture = read_model(Path(sys.argv[1]), Path(sys.argv[1]) / "images")
+print(len(capture.cloud.positions), (peak() - before) / 2**30)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of a process' memory is told in /proc")
+def test_a_million_points_load_in_little_memory(tmp_path):
+    path = make_scene(tmp_path, names=["a.png", "b.png"])
+    count = 1_000_000
+    record = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8"),
+                       ("track", "<u4", 4)])  # fmt: skip
+    records = np.zeros(count, record)
+    records["id"] = np.arange(count)
+    records["xyz"] = np.random.default_rng(0).normal(size=(count, 3))
+    records["length"], records["track"] = 2, (1, 0, 2, 0)
+    (path / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", count) + records.tobytes())
+    run = subprocess.run([sys.executable, "-c", BIG, str(path)], capture_output=True, text=True, check=True)
+    points, gib = run.stdout.split()
+    assert int(points) == count and float(gib) < 0.5
+
+
+def test_too_many_points(tmp_path, monkeypatch):
+    monkeypatch.setattr("nexwarp.data.colmap_files.MAX_POINTS", 19)
+    refused(make_scene(tmp_path / "a"), r"points3D\.bin: expected at most 19 records, got 20")
+    refused(make_scene(tmp_path / "b", text=True), r"points3D\.txt: expected at most 19 points, got more")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"levels": 64, "table_size": 2**30, "features": 8}, {"width": 4096, "hidden_layers": 64}],
+    ids=["tables", "matrices"],
+)
+def test_a_models_tables_are_checked_before_they_are_allocated(tmp_path, changes):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, meta: meta["texture"].update(changes))
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(.*expected"):
+        load(file)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int8, torch.bool, torch.bfloat16])
+def test_a_models_tensors_have_the_dtypes_of_models(tmp_path, dtype):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, meta: tensors.update({"surfels.means": tensors["surfels.means"].to(dtype)}))
+    with pytest.raises(ValueError, match=r"surfels\.means: expected float16 or float32, got"):
+        load(file)
+
+
+def test_a_models_metadata_is_bounded(tmp_path):
+    file = tmp_path / "model.safetensors"
+    safetensors.torch.save_file({"x": torch.zeros(1)}, file, {"nexwarp": "[" * 100_000})
+    with pytest.raises(ValueError, match="expected a JSON object as the nexwarp metadata"):
+        load(file)
+
+
+def test_json_is_bounded():
+    assert parse_json("x", b'{"a": [1, "[[[\\"[[["]}') == {"a": [1, '[[["[[[']}
+    assert parse_json("x", b"[" * 64 + b"]" * 64) is not None
+    for text in (b"[" * 65 + b"]" * 65, b"[" * 10**6, b'{"a":' * 10**5, b'["", ' * 65):
+        with pytest.raises(ValueError, match="x: expected JSON of at most 64 levels, got one nested too deeply"):
+            parse_json("x", text)
+    with pytest.raises(ValueError, match="x: expected at most 10 bytes of JSON, got 11"):
+        parse_json("x", b" " * 11, max_bytes=10)
+    with pytest.raises(ValueError, match="x: expected JSON, could not parse it"):
+        parse_json("x", b'["' + b'\\"' * 10**6)  # no end to the text: found in one look at it
+    with pytest.raises(ValueError, match="NaN is no JSON number"):
+        parse_json("x", b"[NaN]", finite=True)
+
+
+def test_paths_and_cameras_with_absurd_numbers(tmp_path):
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps({"camera_path": [{}], "render_width": 10**400, "render_height": 10}))
+    with pytest.raises(ValueError, match="render_width: expected a number"):
+        load_camera_path(file)
+    file.write_text(json.dumps({"camera_path": [{}], "render_width": 10**9, "render_height": 10}))
+    with pytest.raises(ValueError, match="render_width: expected at most 65536 pixels, got 1e"):
+        load_camera_path(file)
+    camera = {"viewmat": [[10**400]], "K": [[1]], "width": 4, "height": 4, "near": 0.1}
+    file.write_text(json.dumps({"train": {"a": camera}}))
+    with pytest.raises(ValueError, match="expected named cameras as JSON"):
+        load_cameras(file)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"seed": "0"}, "config: seed: expected int, got '0'"),
+        ({"footprints": 1}, "config: footprints: expected bool, got 1"),
+        ({"rates": {"quats": float("inf")}}, "rates: quats: expected float, got inf"),
+        ({"rates": {"means": [1e-4]}}, "rates: means: expected .*, got "),
+        ({"texture": {"levels": 2.5}}, "texture: levels: expected int, got 2.5"),
+        ({"losses": {"alpha": float("nan")}}, "losses: alpha: expected float, got nan"),
+        ({"background": [0, 0]}, "config: background: expected .*, got "),
+    ],
+)
+def test_settings_have_types(changes, match):
+    assert config_from_dict(json.loads(json.dumps(Config().as_dict()))) == Config()
+    with pytest.raises(ValueError, match=match):
+        config_from_dict({**Config().as_dict(), **changes})
+
+
+def test_what_files_say_is_told_on_one_line():
+    assert one_line("a\nb\tc") == "a b c" and one_line("\x00\ud800é") == "\\x00\\ud800é"
+    assert len(one_line("x" * 10**6)) == 300
+
+
+def test_a_jpeg_that_is_read_byte_by_byte_is_refused_at_once(tmp_path):
+    """Between markers PIL reads single bytes: 30 MB took a minute before there was a limit."""
+    photo = tmp_path / "a.jpg"
+    photo.write_bytes(b"\xff\xd8\xff\xe0\x00\x04\x00\x00" + bytes(30_000_000))
+    begun = time.process_time()
+    with pytest.raises(ValueError, match=r"could not decode it: its content needs more than 1,000,000 reads$"):
+        read_image(photo)
+    assert time.process_time() - begun < 5.0

@@ -1,0 +1,183 @@
+"""From videos and photos to scenes: which frames are taken, what is named, what is refused."""
+
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, shift
+
+from nexwarp.cli import main as cli
+from nexwarp.cli.process import is_video
+from nexwarp.data import load_scene
+from nexwarp.data.sfm.frames import choose_frames, motion, sharpness, write_frames
+from nexwarp.data.sfm.process import judge_photos, process
+from nexwarp.data.sfm.report import Overlaps, moving_things
+from nexwarp.io.video import frame_pixels, read_frames, video_writer
+from tests.cli.support import refused
+
+pytest.importorskip("av", reason="PyAV is not installed (pip install 'nexwarp[video]')")
+
+SIZE = (160, 120)
+Change = Callable[[int, np.ndarray], np.ndarray]
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Observe nothing."""
+
+
+def texture() -> np.ndarray:
+    """A smooth random picture, (160, 320) float in 0 to 255."""
+    noise = gaussian_filter(np.random.default_rng(1).random((160, 320)), 1.5)
+    return (noise - noise.min()) / (noise.max() - noise.min()) * 255.0
+
+
+def clip(
+    path: Path, count: int, change: Callable[[int, np.ndarray], np.ndarray] = lambda i, x: x, step: int = 2
+) -> Path:
+    """A video of a window that moves over the texture by `step` pixels a frame."""
+    picture = texture()
+    with video_writer(path, *SIZE, 24.0) as append:
+        for index in range(count):
+            window = change(index, picture[20:140, step * index : step * index + 160])
+            pixels = np.repeat(window.round().astype(np.uint8)[..., None], 3, axis=-1)
+            append(torch.from_numpy(np.ascontiguousarray(pixels)))
+    return path
+
+
+def test_a_blur_lowers_sharpness_and_brightness_does_not() -> None:
+    picture = texture()
+    values = [sharpness(gaussian_filter(picture, sigma).astype(np.uint8)) for sigma in (0.0, 1.0, 2.0, 4.0)]
+    assert all(first > 1.5 * second for first, second in pairwise(values))
+    darker = sharpness((0.5 * picture + 20.0).astype(np.uint8))
+    assert darker == pytest.approx(values[0], rel=0.1)  # but for the rounding to whole grey levels
+
+
+@pytest.mark.parametrize("pixels", [0.25, 0.5, 1.0])
+def test_motion_is_measured_in_pixels(pixels: float) -> None:
+    picture = texture()
+    moved = shift(picture, (0.0, pixels), order=3, mode="nearest")
+    # A shift along one axis changes the picture by its gradient along that axis, 2 / pi of the whole one on average.
+    assert motion(moved.astype(np.uint8), picture.astype(np.uint8)) == pytest.approx(pixels * 2 / np.pi, rel=0.25)
+
+
+def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
+    sharp = {3, 8, 14, 17, 23}
+    path = clip(tmp_path / "a.mp4", 25, lambda i, x: x if i in sharp else gaussian_filter(x, 1.0))
+    choice = choose_frames(path, 5, silent)
+    assert set(choice.chosen) == sharp
+    assert (choice.frames, choice.blurred, choice.duplicates) == (25, [], [])
+    write_frames(path, choice, tmp_path / "frames", silent)
+    assert sorted(f.name for f in (tmp_path / "frames").iterdir()) == [f"frame_{i:06d}.jpg" for i in sorted(sharp)]
+    assert len(choose_frames(path, 1000, silent).chosen) <= 25
+
+
+def test_blurred_and_repeated_frames_are_left_out_and_named(tmp_path: Path) -> None:
+    picture = texture()[20:140, :160]
+    path = clip(tmp_path / "a.mp4", 24, lambda i, x: gaussian_filter(x, 5.0) if i in (9, 10) else x)
+    assert choose_frames(path, 24, silent).blurred == [9, 10]
+    still = clip(tmp_path / "b.mp4", 12, lambda i, x: picture if i < 6 else x, step=4)
+    choice = choose_frames(still, 12, silent)
+    assert choice.duplicates == [1, 2, 3, 4, 5] and choice.chosen == [0, *range(6, 12)]
+
+
+def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) -> None:
+    from PIL import Image
+
+    picture, names = texture(), [f"{i}.png" for i in range(6)]
+    for index, name in enumerate(names):
+        window = picture[20:140, 10 * min(index, 4) : 10 * min(index, 4) + 160]
+        window = gaussian_filter(window, 5.0) if index == 2 else window
+        Image.fromarray(window.astype(np.uint8)).convert("RGB").save(tmp_path / name)
+    assert judge_photos(tmp_path, names, silent) == (["2.png"], ["5.png"])
+
+
+def test_things_that_move_refute_matches() -> None:
+    names = [f"{i}" for i in range(8)]
+    matches = {(f"{i}", f"{i + 1}"): 200 for i in range(7)}
+    inliers = {pair: 190 for pair in matches} | {("3", "4"): 60, ("4", "5"): 70}
+    assert moving_things(Overlaps({}, inliers, 7, True, matches), names).keys() == {"3", "4", "5"}
+    assert not moving_things(Overlaps({}, {pair: 190 for pair in matches}, 7, True, matches), names)
+    assert not moving_things(Overlaps({}, {}, 7, True, {}), names)
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_frames_stand_upright(turn: int) -> None:
+    class Frame:
+        rotation = turn
+
+        @staticmethod
+        def to_ndarray(format: str) -> np.ndarray:
+            assert format == "rgb24"
+            return np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+
+    expected = np.rot90(Frame.to_ndarray("rgb24"), turn // 90)
+    assert np.array_equal(frame_pixels(Frame()), expected)  # type: ignore[arg-type]  # what it reads of a frame
+
+
+def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken, scene = tmp_path / "broken.mp4", tmp_path / "scenes" / "scene"
+    broken.write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(100))
+    refused(capsys, ["process", str(broken), str(scene)], "broken.mp4: expected a video, could not decode it")
+    refused(capsys, ["process", str(tmp_path / "no.mp4"), str(scene)], "no.mp4", "no such")
+    # A training's settings are checked before the video is decoded.
+    refused(
+        capsys, ["train", str(broken), "--run", str(tmp_path / "run"), "--set", "typo=1"], "typo: expected a setting"
+    )
+    picture = texture()[20:140, :160]
+    still = clip(tmp_path / "still.mp4", 10, lambda i, x: picture)
+    refused(capsys, ["process", str(still), str(scene)], "expected a video of a moving camera, got 10 frames", "1 are")
+    refused(capsys, ["process", str(still), str(scene), "--frames", "2"], "--frames: expected at least 3, got 2")
+    refused(capsys, ["train", str(tmp_path / "no.mp4")], "no.mp4: no such file, expected a video")
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(still.read_bytes()[: still.stat().st_size // 2])
+    assert cli.main(["process", str(cut), str(scene)]) == 2
+    assert not scene.exists() and not scene.parent.exists()
+
+
+def test_a_missing_package_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.mp4").touch()
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    refused(capsys, ["process", str(tmp_path / "a.mp4"), str(tmp_path / "scene")], "pip install 'nexwarp[video]'")
+
+
+def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
+    (tmp_path / "scene.mp4").mkdir()
+    assert is_video("a/walk.MOV") and not is_video("a/walk") and not is_video(str(tmp_path / "scene.mp4"))
+    assert not is_video("demo")
+
+
+@pytest.mark.slow
+def test_a_clip_becomes_a_scene(tmp_path: Path) -> None:
+    """Rendered, compressed and processed: nine tenths of the frames kept are registered."""
+    from nexwarp.data.demo import TARGET, _look_at
+    from nexwarp.data.demo_room import LAMP, build_room
+    from nexwarp.data.raytrace import render
+
+    width, height, focal = 320, 240, 320.0
+    room, K = build_room(width), np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    with video_writer(tmp_path / "walk.mp4", width, height, 24.0) as append:
+        for azimuth in np.radians(np.linspace(-120.0, -60.0, 24)):
+            outward = np.array([np.cos(azimuth) * 0.95, np.sin(azimuth) * 0.95, 0.3 + 0.1 * np.sin(5.0 * azimuth)])
+            pixels = render(room, _look_at(TARGET + 3.15 * outward, TARGET), K, (width, height), LAMP)
+            append(torch.from_numpy(pixels))
+    report = process(tmp_path / "walk.mp4", tmp_path / "scene", 12)
+    assert report.choice is not None
+    assert len(report.sfm.registered) >= 0.9 * len(report.choice.chosen) >= 0.9 * 12
+    scene = load_scene(tmp_path / "scene")
+    assert len(scene.train) + len(scene.test) == len(report.sfm.registered)
+    notes = json.loads((tmp_path / "scene" / "sfm.json").read_text())
+    assert notes["video"]["name"] == "walk.mp4" and notes["frames"]["chosen"] == report.choice.chosen
+
+
+def test_pixels_of_a_video_come_back(tmp_path: Path) -> None:
+    path = clip(tmp_path / "a.mp4", 3)
+    frames = [frame_pixels(frame) for frame in read_frames(path)]
+    assert len(frames) == 3 and frames[0].shape == (SIZE[1], SIZE[0], 3)
+    error = frames[1].astype(float)[..., 0] - texture()[20:140, 2:162]
+    assert np.sqrt(np.mean(error**2)) < 3.0  # grey levels: what H.264 loses

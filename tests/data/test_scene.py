@@ -1,0 +1,316 @@
+"""COLMAP scenes: what is read is what was written, and bad input is one clear line."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nexwarp.data import load_scene
+from nexwarp.data.images import downscale_image, read_image
+from nexwarp.data.lens import pycolmap_module
+from nexwarp.errors import MissingError, SceneError
+
+WIDTH, HEIGHT = 48, 36
+REAL = Path(__file__).parents[3] / "shared" / "data"
+
+
+def pose(index: int) -> np.ndarray:
+    """(3, 4) world to camera on a circle of radius 2 around the origin, looking at it."""
+    angle = 0.37 * index
+    forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+    right = np.array([forward[1], -forward[0], 0.0])
+    rotation = np.stack([right, np.array([0.0, 0.0, -1.0]), forward])
+    return np.concatenate([rotation, rotation @ (2.0 * forward)[:, None]], axis=1)
+
+
+def make_scene(
+    path: Path,
+    *,
+    model: str = "PINHOLE",
+    params: tuple[float, ...] = (40.0, 43.0, 25.5, 16.25),
+    names: list[str] | None = None,
+    poses: list[np.ndarray] | None = None,
+    points: np.ndarray | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    where: str = "sparse/0",
+    text: bool = False,
+) -> Path:
+    """Write a COLMAP scene with random photos."""
+    pycolmap = pycolmap_module()
+    rng = np.random.default_rng(0)
+    names = [f"{index:02d}.png" for index in range(10)] if names is None else names
+    points = rng.uniform(-0.4, 0.4, (20, 3)) if points is None else points
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(params), camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for index, name in enumerate(names):
+        image = pycolmap.Image(name=name, keypoints=np.ones((len(points), 2)), camera_id=1, image_id=index + 1)
+        rigid = pycolmap.Rigid3d(pose(index) if poses is None else poses[index])
+        reconstruction.add_image_with_trivial_frame(image, rigid)
+    for index, point in enumerate(points):
+        track = pycolmap.Track()
+        for image in range(min(len(names), 2 + index % 4)):
+            track.add_element(image + 1, index)
+        identity = reconstruction.add_point3D(point, track, rng.integers(0, 256, 3).astype(np.uint8))
+        reconstruction.point3D(identity).error = 0.25 * index
+    folder = path / where
+    folder.mkdir(parents=True, exist_ok=True)
+    (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
+    for name in names:
+        if ".." not in name:
+            write_photo(path / "images" / name, size)
+    return path
+
+
+def write_photo(file: Path, size: tuple[int, int]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(sum(file.name.encode()))
+    Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)).save(file)
+
+
+def project(camera, points: torch.Tensor) -> torch.Tensor:
+    """(P, 2) pixel coordinates in float64."""
+    viewmat, K = camera.viewmat.double(), camera.K.double()
+    pixels = (points.double() @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+def views_of(scene):
+    return sorted([*scene.train, *scene.test], key=lambda view: view.name)
+
+
+@pytest.mark.parametrize("where", ["sparse/0", "sparse", "."])
+def test_text_and_binary_load_identically(tmp_path, where):
+    binary = load_scene(make_scene(tmp_path / "binary", where=where))
+    text = load_scene(make_scene(tmp_path / "text", where=where, text=True))
+    assert torch.equal(binary.points, text.points) and torch.equal(binary.colors, text.colors)
+    assert torch.equal(binary.track_lengths, text.track_lengths)
+    assert torch.equal(binary.reprojection_errors, text.reprojection_errors)
+    assert binary.scale == pytest.approx(text.scale, rel=1e-12)
+    for one, other in zip(views_of(binary), views_of(text), strict=True):
+        assert one.name == other.name and torch.equal(one.image, other.image)
+        torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, rtol=0, atol=1e-7)
+        assert torch.equal(one.camera.K, other.camera.K)
+
+
+def test_loads_what_was_written(tmp_path):
+    scene = load_scene(make_scene(tmp_path))
+    assert scene.path == tmp_path and scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8
+    expected = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3)).astype(np.float32)
+    assert np.array_equal(scene.points.numpy(), expected)
+    assert scene.track_lengths.tolist() == [2 + index % 4 for index in range(20)]
+    assert scene.reprojection_errors.tolist() == [0.25 * index for index in range(20)]
+    for index, view in enumerate(views_of(scene)):
+        camera = view.camera
+        assert view.name == f"{index:02d}.png" and view.mask is None and view.image.dtype == torch.uint8
+        np.testing.assert_allclose(camera.viewmat[:3].numpy(), pose(index), atol=1e-6)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40.0, 43.0, 25.5, 16.25)
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT) and view.image.shape == (HEIGHT, WIDTH, 3)
+        assert camera.near == pytest.approx(0.01 * scene.scale)
+        photo = np.asarray(Image.open(tmp_path / "images" / view.name))
+        assert np.array_equal(view.image.numpy(), photo)
+
+
+def test_simple_pinhole_has_one_focal_length(tmp_path):
+    camera = load_scene(make_scene(tmp_path, model="SIMPLE_PINHOLE", params=(41.0, 20.5, 19.75))).train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 41.0, 20.5, 19.75)
+
+
+def test_every_eighth_view_by_name_is_for_testing(tmp_path):
+    names = [f"{index:02d}.png" for index in (5, 16, 3, 0, 9, 12, 7, 1, 14, 2, 11, 4, 8, 15, 6, 10, 13)]
+    scene = load_scene(make_scene(tmp_path, names=names))
+    assert [view.name for view in scene.test] == ["00.png", "08.png", "16.png"]
+    assert [view.name for view in scene.train] == [f"{index:02d}.png" for index in range(17) if index % 8]
+    for view in views_of(scene):  # poses stay with their names
+        expected = pose(names.index(view.name))
+        np.testing.assert_allclose(view.camera.viewmat[:3].numpy(), expected, atol=1e-6)
+
+
+def test_names_may_hold_folders(tmp_path):
+    scene = load_scene(make_scene(tmp_path, names=["left/a.png", "right/a.png"]))
+    assert [view.name for view in scene.test + scene.train] == ["left/a.png", "right/a.png"]
+
+
+def test_scale_is_the_reach_of_the_training_cameras(tmp_path):
+    scene = load_scene(make_scene(tmp_path))
+    centres = torch.stack([view.camera.position for view in scene.train]).double()
+    reach = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
+    assert scene.scale == pytest.approx(1.1 * reach, rel=1e-5)
+
+
+def test_scale_of_a_turning_camera_is_the_distance_of_the_points(tmp_path):
+    centre = np.array([3.0, -1.0, 0.5])
+    poses = [np.concatenate([pose(i)[:, :3], -(pose(i)[:, :3] @ centre)[:, None]], axis=1) for i in range(10)]
+    scene = load_scene(make_scene(tmp_path, poses=poses))
+    distances = (scene.points.double() - torch.from_numpy(centre)).norm(dim=1)
+    assert scene.scale == pytest.approx(np.median(distances.numpy()), rel=1e-6)
+
+
+@pytest.mark.parametrize("downscale", [2, 5])
+def test_downscale_scales_pixels_and_keeps_areas(tmp_path, downscale):
+    path = make_scene(tmp_path)
+    full, small = load_scene(path), load_scene(path, downscale=downscale)
+    for one, other in zip(views_of(full), views_of(small), strict=True):
+        rows, columns = HEIGHT // downscale, WIDTH // downscale
+        assert other.image.shape == (rows, columns, 3)
+        assert (other.camera.width, other.camera.height) == (columns, rows)
+        torch.testing.assert_close(
+            project(other.camera, full.points),
+            project(one.camera, full.points) / downscale,
+            rtol=0,
+            atol=1e-5,
+        )
+        for row, column in ((0, 0), (rows - 1, columns - 1), (3, 4)):
+            block = one.image[row * downscale : (row + 1) * downscale, column * downscale : (column + 1) * downscale]
+            mean = block.double().mean(dim=(0, 1))
+            assert (other.image[row, column].double() - mean).abs().max() <= 0.5
+
+
+def test_downscale_rounds_to_nearest():
+    image = torch.tensor([[0, 1], [1, 1]], dtype=torch.uint8)[:, :, None].repeat(1, 1, 3)
+    assert downscale_image(image, 2).tolist() == [[[1, 1, 1]]]
+    assert downscale_image(255 * torch.ones(9, 7, 3, dtype=torch.uint8), 3).eq(255).all()
+
+
+def test_smaller_photos_scale_each_axis_by_its_own_ratio(tmp_path):
+    path = make_scene(tmp_path)
+    for index in range(10):  # 48 x 36 in quarters, the width rounded up
+        write_photo(path / "images_4" / f"{index:02d}.png", (13, 9))
+    full, small = load_scene(path), load_scene(path, images="images_4")
+    ratio = torch.tensor([13 / WIDTH, 9 / HEIGHT], dtype=torch.float64)
+    for one, other in zip(views_of(full), views_of(small), strict=True):
+        assert (other.camera.width, other.camera.height) == (13, 9)
+        torch.testing.assert_close(
+            project(other.camera, full.points), project(one.camera, full.points) * ratio, rtol=0, atol=1e-5
+        )
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "LA", "I;16"])
+def test_every_kind_of_photo_becomes_rgb(tmp_path, mode):
+    grey = np.random.default_rng(0).integers(0, 256, (6, 5), dtype=np.uint8)
+    if mode == "I;16":
+        image = Image.fromarray(grey.astype(np.uint16) * 257)
+    else:
+        image = Image.fromarray(grey).convert("RGBA" if mode == "RGBA" else mode)
+    if mode in ("RGBA", "LA"):
+        image.putalpha(77)
+    image.save(tmp_path / "photo.png")
+    assert np.array_equal(read_image(tmp_path / "photo.png").numpy(), np.repeat(grey[:, :, None], 3, axis=2))
+
+
+def damaged(name: str, change=lambda data: data[: len(data) // 2], **options):
+    """Maker of a scene in which the bytes of a file are changed, by default cut in half."""
+
+    def make(path: Path) -> Path:
+        file = make_scene(path, **options) / name
+        file.write_bytes(change(file.read_bytes()))
+        return path
+
+    return make
+
+
+def lacking(name: str):
+    """Maker of a scene without one of its files."""
+
+    def make(path: Path) -> Path:
+        (make_scene(path) / name).unlink()
+        return path
+
+    return make
+
+
+def built(**options):
+    """Maker of a scene with other options."""
+    return lambda path: make_scene(path, **options)
+
+
+NOT_A_NUMBER = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]])
+UNDECODABLE = "03.png: expected a complete image file, could not decode it"
+BAD_SCENES = {
+    "no folder": (lambda path: path / "absent", "no such folder, expected a scene: COLMAP, nerfstudio or Blender"),
+    "no model": (lambda path: path, "no scene found, expected a COLMAP model .*, transforms.json .*transforms_train"),
+    "half a model": (
+        lacking("sparse/0/points3D.bin"),
+        "incomplete COLMAP model in .*0: points3D.bin not found",
+    ),
+    "no images in the model": (built(names=[]), "has no registered images"),
+    "one image": (built(names=["a.png"]), "at least 2 registered images .* got 1"),
+    "no points": (built(points=np.zeros((0, 3))), "no 3D points, expected at least one"),
+    "points of NaN": (built(points=NOT_A_NUMBER), r"finite 3D points, got \(0.0, nan, 0.0\)"),
+    "escaping name": (built(names=["../x.png", "a.png"]), "image name '../x.png' leaves the images folder"),
+    "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
+    "name of bytes": (
+        damaged("sparse/0/images.bin", lambda data: data.replace(b"03.png", b"\xff3.png")),
+        r"expected image names in UTF-8, got b'\\xff3.png'",
+    ),
+    "name of two lines": (built(names=["a\nb.png", "a.png"]), r"image name 'a\\nb.png' leaves the images folder"),
+    "absent photo": (lacking("images/03.png"), "sparse/0: 1 of 10 photos: image not found: 03.png; --skip-missing"),
+    "truncated photo": (damaged("images/03.png"), UNDECODABLE),
+    "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
+    "photos of another shape": (built(size=(36, 48)), "00.png: expected an image of 48x36 .* got 36x48"),
+    "short cameras": (
+        damaged("sparse/0/cameras.bin", lambda data: data[:-3]),
+        "cameras.bin: truncated or damaged",
+    ),
+    "empty cameras": (damaged("sparse/0/cameras.bin", lambda data: b""), "cameras.bin: truncated or damaged"),
+    "truncated images": (damaged("sparse/0/images.bin"), "images.bin: truncated or damaged"),
+    "truncated frames": (damaged("sparse/0/frames.bin"), "frames.bin: truncated or damaged"),
+    # pycolmap would allocate for a count from nowhere: 95 seconds, and all the memory there is.
+    "truncated points": (damaged("sparse/0/points3D.bin"), "points3D.bin: truncated or damaged"),
+    "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),
+    "image id beyond 32 bits": (
+        damaged("sparse/0/images.txt", lambda data: re.sub(rb"(?m)^1 ", b"18446744073709551617 ", data), text=True),
+        "expected id, pose, camera and name of an image, got '18446744073709551617",
+    ),
+    "focal length of zero": (
+        built(params=(0.0, 43.0, 25.5, 16.25)),
+        "00.png: .* K: expected focal lengths > 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_SCENES)
+def test_bad_scenes_are_told_in_one_line(tmp_path, kind):
+    make, message = BAD_SCENES[kind]
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        load_scene(make(tmp_path))
+    assert isinstance(caught.value, (SceneError, MissingError))
+    text = str(caught.value)
+    assert "\n" not in text and str(tmp_path) in text
+
+
+def test_absent_images_folder_lists_those_that_exist(tmp_path):
+    path = make_scene(tmp_path)
+    (path / "images_2").mkdir()
+    with pytest.raises(MissingError, match=r"images: no folder 'images_8' in .* which has images, images_2$"):
+        load_scene(path, images="images_8")
+
+
+def test_bad_downscale(tmp_path):
+    path = make_scene(tmp_path)
+    with pytest.raises(ValueError, match="downscale: expected at least 1, got 0"):
+        load_scene(path, downscale=0)
+    with pytest.raises(TypeError, match="downscale: expected an int, got float"):
+        load_scene(path, downscale=2.0)  # type: ignore[arg-type]  # what is refused
+    with pytest.raises(ValueError, match=r"downscale: expected at most the size of .*, 48x36, got 37"):
+        load_scene(path, downscale=37)
+
+
+def test_real_scene():
+    if not (REAL / "fox").is_dir():
+        pytest.skip(f"the real scenes are not here: {REAL / 'fox'}")
+    scene = load_scene(REAL / "fox", downscale=2)
+    assert (len(scene.train), len(scene.test)) == (43, 7) and scene.points.shape == (10_844, 3)
+    shares = []
+    for view in views_of(scene):
+        camera = view.camera
+        assert (camera.width, camera.height) == (265, 473) and view.image.shape == (473, 265, 3)
+        depths = (scene.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2]
+        pixels = project(camera, scene.points)
+        inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < 265) & (pixels[:, 1] < 473) & (depths > camera.near)
+        shares.append(inside.double().mean().item())
+    # The mean track has 6.9 of the 50 photos, and a point lies in at least those it was triangulated from.
+    assert min(shares) > 0.05 and np.mean(shares) > 6.9 / 50

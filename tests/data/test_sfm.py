@@ -1,0 +1,393 @@
+"""Structure from motion: cameras of rendered photos come back, and what cannot work is one line and leaves nothing."""
+
+import dataclasses
+import json
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from nexwarp.cli import main as cli
+from nexwarp.data import load_scene
+from nexwarp.data.capture import Capture
+from nexwarp.data.colmap import read_model
+from nexwarp.data.demo import TARGET, _look_at
+from nexwarp.data.demo_room import LAMP, build_room
+from nexwarp.data.lens import pycolmap_module
+from nexwarp.data.raytrace import render
+from nexwarp.data.sfm import SfmOptions, reconstruct
+from nexwarp.data.sfm.pairs import components, exhaustive_pairs, sequential_pairs
+from nexwarp.data.sfm.photos import list_photos
+from nexwarp.data.sfm.report import Overlaps, advise, left_out
+from tests.cli.support import refused, snapshot
+
+WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
+DISTANCE = 3.15  # of the cameras from what they look at
+K1 = -0.12
+PINHOLE = SfmOptions(camera_model="simple_pinhole")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arc:
+    """Photos of the demo's courtyard: `images` by name, and the world-to-camera matrices of their cameras."""
+
+    images: dict[str, np.ndarray]
+    viewmats: dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def arc() -> Arc:
+    """Views 8 degrees apart, two heights in turn."""
+    room = build_room(WIDTH)
+    K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    images, viewmats = {}, {}
+    for index in range(VIEWS):
+        azimuth, elevation = np.radians(-120 + 8 * index), np.radians(14 + 10 * (index % 2))
+        outward = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
+        name = f"view {index + 5}.png"  # up to "view 11": sorted as text, they would be in another order
+        viewmats[name] = _look_at(TARGET + DISTANCE * outward, TARGET)
+        images[name] = render(room, viewmats[name], K, (WIDTH, HEIGHT), LAMP)
+    return Arc(images, viewmats)
+
+
+def write_photos(folder: Path, images: dict[str, np.ndarray]) -> Path:
+    for name, image in images.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def photos(arc, tmp_path_factory) -> Path:
+    folder = write_photos(tmp_path_factory.mktemp("sfm") / "photos", arc.images)
+    (folder / "notes.txt").write_text("not a photo")
+    (folder / "._view 5.png").write_bytes(b"what macOS leaves on memory cards")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(photos) -> Path:
+    """A scene made through the command line."""
+    scene = photos.parent / "made" / "scene"
+    assert cli.main(["sfm", str(photos), str(scene), "--camera-model", "simple_pinhole", "--threads", "1"]) == 0
+    return scene
+
+
+def noise(seed: int) -> np.ndarray:
+    """Patches of 4 x 4 pixels: hundreds of features, and none in common with another seed."""
+    small = np.random.default_rng(seed).integers(0, 256, (HEIGHT // 4, WIDTH // 4, 3), dtype=np.uint8)
+    return small.repeat(4, axis=0).repeat(4, axis=1)
+
+
+def assert_cameras_agree(model: Capture, truth: dict[str, np.ndarray], within: float) -> None:
+    """Fail unless a similarity takes the cameras to the true ones.
+
+    Centres within this share of their distance from what they see, axes within as many radians.
+    """
+    ours = np.array([photo.viewmat for photo in model.photos])
+    theirs = np.array([truth[photo.name] for photo in model.photos])
+    x, y = (-np.einsum("nji,nj->ni", v[:, :3, :3], v[:, :3, 3]) for v in (ours, theirs))
+    dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
+    U, D, Vt = np.linalg.svd(dy.T @ dx)
+    sign = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
+    R = U @ sign @ Vt
+    scale = np.trace(np.diag(D) @ sign) / (dx**2).sum()
+    assert np.linalg.norm(scale * dx @ R.T - dy, axis=1).max() < within * DISTANCE
+    turned = ours[:, :3, :3] @ R.T
+    assert np.linalg.norm(turned - theirs[:, :3, :3], ord=2, axis=(1, 2)).max() < within
+
+
+# What comes back
+
+
+def test_cameras_come_back(made, arc):
+    model = read_model(made, made / "images")
+    assert [photo.name for photo in model.photos] == sorted(arc.images)
+    assert_cameras_agree(model, arc.viewmats, within=0.01)
+    for photo in model.photos:
+        assert (photo.lens.width, photo.lens.height) == (WIDTH, HEIGHT)
+        assert photo.lens.model == "SIMPLE_PINHOLE"
+        assert photo.lens.params[0] == pytest.approx(FOCAL, rel=0.02)
+
+
+def test_the_scene_loads_and_holds_the_photos(made, photos, arc):
+    assert {entry.name for entry in made.iterdir()} == {"images", "sparse", "sfm.json"}
+    assert {entry.name for entry in made.parent.iterdir()} == {"scene"}
+    scene = load_scene(made)
+    assert len(scene.train) + len(scene.test) == VIEWS and len(scene.points) > 200
+    for view in [*scene.train, *scene.test]:  # nothing to undistort: the very pixels
+        assert np.array_equal(view.image.numpy(), arc.images[view.name])
+
+
+def test_points_lie_where_their_features_are(made):
+    """The model without untracked features is whole: every observation projects to its keypoint."""
+    model = pycolmap_module().Reconstruction(str(made / "sparse" / "0"))
+    assert sum(model.image(i).num_points2D() for i in model.reg_image_ids()) == model.compute_num_observations()
+    for point_id, point in model.points3D.items():
+        errors = []
+        for element in point.track.elements:
+            image = model.image(element.image_id)
+            keypoint = image.point2D(element.point2D_idx)
+            assert keypoint.point3D_id == point_id
+            errors.append(np.linalg.norm(image.project_point(point.xyz) - keypoint.xy))
+        assert np.mean(errors) == pytest.approx(point.error, abs=1e-3)
+
+
+def test_the_report_is_about_the_scene(made):
+    report = json.loads((made / "sfm.json").read_text())
+    cloud = read_model(made, made / "images").cloud
+    assert cloud is not None
+    assert report["photos"] == len(report["registered"]) == VIEWS and not report["left_out"] and not report["advice"]
+    assert report["points"] == len(cloud.positions)
+    assert report["mean_track_length"] == pytest.approx(cloud.track_lengths.mean())
+    assert report["mean_reprojection_error"] == pytest.approx(cloud.reprojection_errors.mean(), rel=1e-4)
+    assert report["mean_reprojection_error"] < 0.5
+    assert report["pairs"] == VIEWS * (VIEWS - 1) // 2 and report["matching"] == "exhaustive"
+    assert [camera["model"] for camera in report["cameras"]] == ["SIMPLE_PINHOLE"]
+    assert not report["cameras"][0]["exif_focal"] and report["options"]["threads"] == 1
+
+
+def test_the_same_photos_give_the_same_bits(made, photos, tmp_path):
+    reconstruct(photos, tmp_path / "again", dataclasses.replace(PINHOLE, threads=1))
+    ours, theirs = snapshot(tmp_path / "again"), snapshot(made)
+    del ours["sfm.json"], theirs["sfm.json"]  # they hold seconds
+    assert ours == theirs
+
+
+def test_distortion_is_found_and_taken_out(arc, tmp_path):
+    """Photos bent by a known radial distortion become straight ones with the same cameras."""
+    camera = pycolmap_module().Camera(
+        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2, K1]
+    )
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    straight = camera.cam_from_img(np.stack([x, y], axis=-1).reshape(-1, 2)) * FOCAL
+    rows, columns = straight[:, 1] + HEIGHT / 2 - 0.5, straight[:, 0] + WIDTH / 2 - 0.5
+    bent = {}
+    for name, image in arc.images.items():
+        channels = [map_coordinates(image[..., c], [rows, columns], order=1, mode="nearest") for c in range(3)]
+        bent[name] = np.stack(channels, axis=-1).reshape(image.shape)
+    folder = write_photos(tmp_path / "bent", bent)
+    report = reconstruct(folder, tmp_path / "scene", SfmOptions(camera_model="simple_radial"))
+    assert len(report.registered) == VIEWS
+    assert report.cameras[0].params[3] == pytest.approx(K1, abs=0.03)
+    assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
+    scene = load_scene(tmp_path / "scene")
+    shape = scene.train[0].image.shape
+    assert shape[:2] != (HEIGHT, WIDTH) and report.sizes == [(shape[1], shape[0])]
+
+
+def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
+    """Folders have cameras of their own, EXIF starts their focal lengths, a photo of something else is left out."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[41989] = 37  # focal length for 35 mm film, whose diagonal is 43.3: 342 pixels
+    folder = tmp_path / "photos"
+    for index, (name, image) in enumerate(arc.images.items()):
+        file = folder / f"camera {index % 2}" / Path(name).with_suffix(".JPG")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        options: dict[str, Any] = {"exif": exif} if index % 2 else {}
+        Image.fromarray(image).save(file, quality=95, **options)
+    Image.fromarray(noise(0)).save(folder / "camera 0" / "stray.png")
+    command = ["sfm", str(folder), str(tmp_path / "scene"), "--cameras", "folder", "--camera-model", "simple_pinhole"]
+    assert cli.main(command) == 0
+    out = capsys.readouterr().out
+    assert f"{VIEWS} of {VIEWS + 1} photos" in out and "left out: camera 0/stray.png: overlaps no other photo" in out
+    report = json.loads((tmp_path / "scene" / "sfm.json").read_text())
+    assert list(report["left_out"]) == ["camera 0/stray.png"]
+    assert [camera["exif_focal"] for camera in report["cameras"]] == [False, True]
+    assert [camera["photos"] for camera in report["cameras"]] == [4, 3]
+    truth = {f"camera {i % 2}/{Path(n).stem}.JPG": v for i, (n, v) in enumerate(arc.viewmats.items())}
+    model = read_model(tmp_path / "scene", tmp_path / "scene" / "images")
+    assert_cameras_agree(model, truth, within=0.01)
+    assert len({photo.lens.params[0] for photo in model.photos}) == 2
+
+
+# What is compared
+
+
+def test_photos_are_in_the_order_people_number_them(photos, arc):
+    assert list_photos(photos) == list(arc.images) == [f"view {number}.png" for number in range(5, 12)]
+
+
+def test_every_pair_once():
+    pairs = exhaustive_pairs(50)
+    assert len(pairs) == len(set(pairs)) == 50 * 49 // 2 and all(0 <= i < j < 50 for i, j in pairs)
+
+
+def test_a_walk_is_joined_to_its_start():
+    pairs = set(sequential_pairs(100, 3))
+    assert {(0, 1), (0, 2), (0, 3), (0, 4), (0, 99), (1, 99), (2, 99), (40, 44)} <= pairs
+    assert (0, 5) not in pairs and (0, 96) not in pairs and all(i < j for i, j in pairs)
+    assert set(sequential_pairs(6, 10)) == set(exhaustive_pairs(6))
+    assert len(components(map(str, range(100)), ((str(i), str(j)) for i, j in pairs))) == 1
+
+
+def test_components_are_largest_first():
+    assert components("abcdef", [("a", "b"), ("d", "e"), ("e", "f")]) == [{"d", "e", "f"}, {"a", "b"}, {"c"}]
+
+
+# What to do
+
+
+def overlaps(features: dict[str, int], pairs: list[str], sequential: bool = False) -> Overlaps:
+    return Overlaps(features, {(pair[0], pair[1]): 50 for pair in pairs}, 15, sequential)
+
+
+RICH = dict.fromkeys("abcdef", 4000)
+ADVICE = [
+    (overlaps(RICH, []), 0, "no two photos overlap"),
+    (overlaps(RICH, ["ab", "bc", "de", "ef"]), 3, "groups of 3, 3 that do not overlap: add photos between a and d"),
+    (overlaps(RICH, ["ab", "bc", "cd"]), 4, "add photos between those left out and the rest"),
+    (overlaps(RICH, ["ab", "bc", "cd", "de", "ef"]), 2, "too little or without depth"),
+    (overlaps(RICH, ["ab", "bc", "cd"], sequential=True), 4, "--matching exhaustive"),
+    (overlaps(dict.fromkeys("abcdef", 40), []), 0, "6 of 6 photos have fewer than 500 features"),
+]
+
+
+@pytest.mark.parametrize(("found", "registered", "text"), ADVICE)
+def test_advice_fits_the_trouble(found, registered, text):
+    assert any(text in line for line in advise(found, registered))
+    assert advise(found, len(found.features)) == []
+
+
+def test_every_photo_left_out_has_its_reason():
+    found = overlaps(RICH | {"g": 3, "h": 900}, ["ab", "bc", "ad", "ef", "fh"])
+    reasons = left_out(found, "abc", [["a", "b", "c"], ["e", "f", "x"]])
+    assert reasons == {
+        "d": "too few points in common with the 1 registered photos that it overlaps",
+        "e": "in a separate model of 3 photos",
+        "f": "in a separate model of 3 photos",
+        "g": "only 3 features: dark, blurred or without texture",
+        "h": "overlaps no registered photo",
+    }
+
+
+# Bad input
+
+
+def with_files(**files: Any):
+    """Maker of a folder with these files: bytes, or an array to save as a PNG of that name."""
+
+    def make(folder: Path, arc: Arc) -> None:
+        folder.mkdir()
+        for name, content in files.items():
+            file = folder / name.replace("_", ".")
+            if isinstance(content, bytes):
+                file.write_bytes(content)
+            else:
+                Image.fromarray(content).save(file)
+
+    return make
+
+
+def spoilt(folder: Path, arc: Arc) -> None:
+    write_photos(folder, arc.images)
+    (folder / "view 7.png").write_bytes((folder / "view 7.png").read_bytes()[:9000])
+
+
+def of_two_sizes(folder: Path, arc: Arc) -> None:
+    write_photos(folder, arc.images | {"small.png": noise(0)[::2, ::2]})
+
+
+BAD_PHOTOS = {
+    "no folder": (lambda folder, arc: None, [], "no such folder, expected one with photos"),
+    "an empty folder": (with_files(), [], "expected at least 3 photos (.jpg, .jpeg, .png"),
+    "no photos": (with_files(notes_txt=b"none", __hidden_png=b"x"), [], "found none"),
+    "other formats": (
+        with_files(a_heic=b"", b_HEIC=b"", c_mp4=b""),
+        [],
+        "none; 2 .heic: convert to JPEG or PNG first; 1",
+    ),
+    "one photo": (with_files(a_png=noise(0)), [], "expected at least 3 photos"),
+    "a truncated photo": (spoilt, [], "view 7.png: expected a complete image file"),
+    "no image at all": (
+        with_files(a_jpg=b"<html>", b_jpg=b"", c_jpg=b"x"),
+        [],
+        "a.jpg: expected a complete image file",
+    ),
+    "photos of nothing in common": (
+        with_files(a_png=noise(0), b_png=noise(1), c_png=noise(2), d_png=noise(3)),
+        [],
+        "no scene could be made: 0 of 4 photos registered, expected at least 3; 0 of 6 pairs overlap; no two photos",
+    ),
+    "grey walls": (
+        with_files(**{f"{n}_png": np.full((HEIGHT, WIDTH, 3), 128, np.uint8) for n in "abc"}),
+        [],
+        "3 of 3 photos have fewer than 500 features",
+    ),
+    "sizes that differ": (
+        of_two_sizes,
+        ["--cameras", "single"],
+        "must have one size, got 160x120 (small.png) and 320x240",
+    ),
+    "no threads": (with_files(), ["--threads", "0"], "threads: expected at least 1, got 0"),
+    "no overlap": (with_files(), ["--overlap", "-1"], "overlap: expected at least 1, got -1"),
+    "no features": (with_files(), ["--max-features", "0"], "max_features: expected at least 64, got 0"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PHOTOS)
+def test_bad_photos_are_told_in_one_line(kind, arc, tmp_path, capsys):
+    make, flags, words = BAD_PHOTOS[kind]
+    make(tmp_path / "photos", arc)
+    before = snapshot(tmp_path)
+    refused(capsys, ["sfm", str(tmp_path / "photos"), str(tmp_path / "new" / "scene"), *flags], words)
+    assert snapshot(tmp_path) == before and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("stage", ["reading", "features", "matching", "mapping"])
+def test_an_interrupt_leaves_nothing(stage, photos, tmp_path, monkeypatch):
+    seen = []
+
+    def observe(name: str, done: int, total: int) -> None:
+        assert 0 <= done <= total
+        seen.append(name)
+        if name == stage and seen.count(name) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(photos, tmp_path / "new" / "scene", PINHOLE, observe=observe)
+    assert seen[-1] == stage and not list(tmp_path.iterdir())
+
+
+def test_what_exists_is_replaced_only_when_asked(made, photos, tmp_path, capsys):
+    scene, precious = tmp_path / "scene", tmp_path / "precious"
+    shutil.copytree(made, scene)
+    precious.mkdir()
+    (precious / "thesis.tex").write_text("years of work")
+    before = snapshot(tmp_path)
+    refused(capsys, ["sfm", str(photos), str(scene)], str(scene), "exists", "--overwrite")
+    refused(capsys, ["sfm", str(photos), str(precious), "--overwrite"], "holds no sfm.json; not touching it")
+    (tmp_path / "empty").mkdir()
+    refused(capsys, ["sfm", str(tmp_path / "empty"), str(scene), "--overwrite"], "expected at least 3 photos")
+    assert snapshot(tmp_path) == before
+    (scene / "images" / "old.png").touch()
+    assert cli.main(["sfm", str(photos), str(scene), "--overwrite", "--camera-model", "simple_pinhole"]) == 0
+    assert {entry.name for entry in (scene / "images").iterdir()} == {
+        entry.name for entry in (made / "images").iterdir()
+    }
+    assert {entry.name for entry in tmp_path.iterdir()} == {"scene", "precious", "empty"}
+
+
+def test_a_failure_keeps_the_scene_it_should_replace(made, tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(made, scene)
+    folder = write_photos(tmp_path / "photos", {f"{seed}.png": noise(seed) for seed in range(3)})
+    before = snapshot(tmp_path)
+    refused(capsys, ["sfm", str(folder), str(scene), "--overwrite"], "no scene could be made")
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("place", ["", "scene", ".."])
+def test_photos_and_scene_must_be_apart(place, photos, capsys):
+    before = snapshot(photos)
+    refused(
+        capsys,
+        ["sfm", str(photos), str(photos / place), "--overwrite"],
+        "expected a scene folder apart from the photos",
+    )
+    assert snapshot(photos) == before

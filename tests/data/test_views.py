@@ -1,0 +1,83 @@
+"""Training views: photos, masks and alpha agree with each other at any size, however they reach the device."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.data import View
+from nexwarp.train import views as training_views
+
+K = torch.tensor([[20.0, 0.0, 9.0], [0.0, 21.0, 6.0], [0.0, 0.0, 1.0]])
+
+
+def make_views(count: int, width: int = 19, height: int = 13) -> list[View]:
+    generator = torch.Generator().manual_seed(0)
+    views = []
+    for index in range(count):
+        shape = (height, width)
+        image = torch.randint(0, 256, (*shape, 3), generator=generator, dtype=torch.uint8)
+        mask = torch.rand(shape, generator=generator) < 0.8
+        alpha = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+        plain = index % 3 == 0
+        camera = Camera(torch.eye(4), K, width, height)
+        views.append(View(camera, image, None if plain else mask, f"{index}", None if plain else alpha))
+    return views
+
+
+def blocks(values: np.ndarray, factor: int) -> np.ndarray:
+    """(h, factor, w, factor, ...) of what fills whole blocks."""
+    height, width = values.shape[0] // factor, values.shape[1] // factor
+    cut = values[: height * factor, : width * factor]
+    return cut.reshape(height, factor, width, factor, *values.shape[2:])
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 14])
+def test_photo_mask_and_alpha_are_reduced_alike(factor):
+    views = make_views(3)
+    mine = training_views.TrainingViews(views, torch.device("cpu"))
+    used = factor if factor <= 13 else 1  # smaller photos than a block stay as they are
+    for index, view in enumerate(views):
+        camera, photo = mine.get(index, factor)
+        expected = blocks(view.image.numpy() / 255.0, used).mean(axis=(1, 3))
+        np.testing.assert_allclose(photo.numpy(), expected, atol=1e-6)
+        assert photo.shape == (camera.height, camera.width, 3) == (13 // used, 19 // used, 3)
+        torch.testing.assert_close(camera.K[:2], K[:2] / used)
+        mask, alpha = mine.mask(index, factor), mine.alpha(index, factor)
+        if view.mask is None:
+            assert mask is None and alpha is None
+            continue
+        assert mask is not None and alpha is not None and view.alpha is not None
+        assert np.array_equal(mask.numpy(), blocks(view.mask.numpy(), used).all(axis=(1, 3)))
+        expected = blocks(view.alpha.numpy() / 255.0, used).mean(axis=(1, 3))
+        np.testing.assert_allclose(alpha.numpy(), expected, atol=1e-6)
+
+
+def test_what_comes_next_changes_nothing_on_a_cpu():
+    views = make_views(4)
+    mine = training_views.TrainingViews(views, torch.device("cpu"))
+    for index, ahead in ((2, [1, 0]), (1, []), (3, [3, 3]), (0, [1, 2, 3])):
+        _, photo = mine.get(index, 1, ahead)
+        assert torch.equal(photo, views[index].image.float() / 255.0)
+
+
+@pytest.mark.cuda
+def test_photos_fetched_ahead_are_the_photos(monkeypatch: Any):
+    """In any order, right guesses and wrong ones, while the GPU is busy; and no more than two wait."""
+    monkeypatch.setattr(training_views, "PHOTO_SHARE", 0.0)
+    views = make_views(12, width=640, height=480)
+    mine = training_views.TrainingViews(views, torch.device("cuda"))
+    assert all(not photo.is_cuda for photo in mine.photos)
+    order = np.random.default_rng(0).integers(0, 12, 300).tolist()
+    load = torch.rand(1024, 1024, device="cuda")
+    seen = []
+    for step, index in enumerate(order):
+        ahead = order[step + 1 : step + 4] if step % 5 else [(index + 5) % 12]
+        _, photo = mine.get(index, 1, ahead)
+        load = load @ load / load.norm()
+        seen.append((index, (photo * 255.0).round().byte()))
+        assert len(mine.coming) <= 2
+    for index, photo in seen:
+        assert torch.equal(photo.cpu(), views[index].image)

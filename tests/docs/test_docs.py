@@ -1,0 +1,376 @@
+"""The documents against the code: options.md and cli.md are made from it, and every command and link is tried.
+
+python -m tests.docs.test_docs --write      # writes docs/options.md and docs/cli.md
+"""
+
+import ast
+import contextlib
+import dataclasses
+import importlib.util
+import inspect
+import io
+import itertools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+import nexwarp as nw
+from nexwarp.cli import main as cli
+from nexwarp.cli.train import Train
+from nexwarp.train.config import Config
+from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
+from nexwarp.train.settings import setting, with_settings
+
+DOCS = Path(__file__).parents[2] / "docs"
+ROOT = DOCS.parent
+
+# The publication's symbol of a setting, and the section that gives its value (docs/paper.md has their titles);
+# "code": only the authors' code gives it.
+SYMBOLS: dict[str, tuple[str, str]] = {
+    "preset": ("", ""),
+    "iterations": ("", "4.3"),
+    "max_surfels": ("P", "4.3"),
+    "max_hits": ("K", "5"),
+    "more_hits_from": ("", ""),
+    "sh_degree": ("S = (d + 1)^2", "5"),
+    "sh_every": ("", "code"),
+    "coarse": ("", ""),
+    "background": ("", "code"),
+    "footprints": ("", ""),
+    "smooth_sh": ("", ""),
+    "exposures": ("", ""),
+    "mask_mode": ("", ""),
+    "refine_poses": ("", ""),
+    "blur_poses": ("", ""),
+    "depth_jitter": ("", ""),
+    "low_pass": ("", ""),
+    "order": ("", ""),
+    "filter_points": ("", ""),
+    "orient_points": ("", ""),
+    "skybox": ("", ""),
+    "teachers": ("", ""),
+    "seed": ("", "code"),
+    "deterministic": ("", ""),
+    "cuda_graphs": ("", ""),
+    "losses.dssim": ("λ_D-SSIM", "4.3"),
+    "losses.alpha": ("λ_alpha", "4.3"),
+    "losses.texture": ("λ_texture", "4.3"),
+    "losses.opacity": ("λ_opacity", "4.3"),
+    "losses.grid": ("λ_grid", "4.3"),
+    "losses.empty": ("", ""),
+    "losses.depth": ("", ""),
+    "losses.normals": ("", ""),
+    "losses.distortion": ("", ""),
+    "rates.means": ("", "code"),
+    "rates.quats": ("", "code"),
+    "rates.scales": ("", "code"),
+    "rates.opacities": ("", "code"),
+    "rates.gammas": ("", "code"),
+    "rates.sh0": ("", "code"),
+    "rates.shN": ("", "code"),
+    "rates.grid": ("", "code"),
+    "rates.mlp": ("", "code"),
+    "texture.levels": ("L", "5"),
+    "texture.table_size": ("T", "5"),
+    "texture.features": ("F", "5"),
+    "texture.min_resolution": ("s_0", "code"),
+    "texture.max_resolution": ("s_(L-1)", "code"),
+    "texture.width": ("", "5"),
+    "texture.hidden_layers": ("", "5"),
+    "texture.sh_degree": ("S = (d + 1)^2", "5"),
+    "texture.residual": ("", ""),
+    "texture.down_weighting": ("Δ", "4.1"),
+    "densify.start": ("", "4.3"),
+    "densify.stop": ("", "4.3"),
+    "densify.every": ("", "4.3"),
+    "densify.fraction": ("", "4.3"),
+    "densify.prune_opacity": ("", "4.3"),
+    "densify.prune_at_cap": ("", "code"),
+    "densify.relocate": ("", ""),
+}
+
+INTRODUCTION = """\
+# Settings
+
+Options of each command, and all settings of a training ([below](#all-settings)). The page is made from the code by
+`python -m tests.docs.test_docs --write`; a test fails if the two disagree.
+
+Every command has `--help` ([Commands](cli.md)). Bad input gives one line on stderr and exit code 2. Ctrl-C exits
+with 130.
+"""
+
+SETTINGS = """\
+## All settings
+
+What a training depends on beside its scene: `nexwarp.Config`. `--preset` picks the values to start from, the
+flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
+
+    nexwarp train SCENE --preset paper --set texture.max_resolution=1024
+    nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
+
+VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY and a value of another type or
+out of range are refused before anything is written. The settings of a run are in its `config.json`. With `--resume`
+they come from there, and options that are given must agree with them.
+
+`demo` has settings of its own, for a short training on a CPU, with either preset: DEMO.
+
+Symbol and section are the publication's; "code" means that only the authors' code has the setting. A setting without
+either is not in the publication; `paper` turns it off, or it has no effect there. Values that differ are bold.
+[Presets and paper](paper.md) says why they differ.
+"""
+
+
+# docs/options.md
+
+
+def field_docs(owner: type) -> dict[str, str]:
+    """Docstrings of a dataclass's fields, on one line each."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
+    assert isinstance(definition, ast.ClassDef)
+    docs = {}
+    for line, following in itertools.pairwise(definition.body):
+        if isinstance(line, ast.AnnAssign) and isinstance(following, ast.Expr):
+            assert isinstance(line.target, ast.Name) and isinstance(following.value, ast.Constant)
+            docs[line.target.id] = " ".join(str(following.value.value).split())
+    return docs
+
+
+def options(command: Any) -> Iterator[tuple[str, str, str]]:
+    """What a command takes: how it is written, its default, what it means."""
+    docs, hints = field_docs(command), get_type_hints(command, include_extras=True)
+    for f in dataclasses.fields(command):
+        extras = getattr(hints[f.name], "__metadata__", ())
+        parts = [p for p in (f.type, getattr(hints[f.name], "__origin__", None)) if dataclasses.is_dataclass(p)]
+        if parts:
+            assert isinstance(parts[0], type)
+            yield from options(parts[0])
+            continue
+        (shown,) = [e for e in extras if hasattr(e, "metavar")] or [None]
+        name = f"--{((shown and shown.name) or f.name).replace('_', '-')}"
+        choices = getattr(hints[f.name], "__args__", ()) if shown is None else ()
+        metavar = shown.metavar if shown else "{" + ",".join(choices) + "}" if choices else ""
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            yield metavar, "required", docs[f.name]
+            continue
+        hint = shown.help_behavior_hint if shown else None
+        default = hint.removeprefix("(default: ").strip("()") if hint else "off" if f.default is False else f.default
+        yield f"{name} {metavar}".strip(), str(default), docs[f.name]
+
+
+def setting_names(config: Config) -> Iterator[tuple[str, str]]:
+    """Names of all settings, and what they mean."""
+    parts = []
+    for name, text in field_docs(type(config)).items():
+        if dataclasses.is_dataclass(getattr(config, name)):
+            parts.append(name)
+        else:
+            yield name, text
+    for part in parts:
+        for name, text in field_docs(type(getattr(config, part))).items():
+            yield f"{part}.{name}", text
+
+
+def cell(text: Any) -> str:
+    return str(text).replace("|", "\\|")
+
+
+def options_page() -> str:
+    """The text of docs/options.md."""
+    page = [INTRODUCTION]
+    for name, command in cli.COMMANDS.items():
+        rows = list(options(command))
+        needed = " ".join(option for option, default, _ in rows if default == "required")
+        page.append(f"## nexwarp {name} {needed}".rstrip() + f"\n\n{inspect.getdoc(command)}\n")
+        page.append("| option | default | what |\n|---|---|---|")
+        page += [f"| `{cell(option)}` | {cell(default)} | {cell(text)} |" for option, default, text in rows]
+        page.append("")
+    demo = ", ".join(f"`{name}` {json.dumps(value)}" for name, value in DEMO_SETTINGS.items())
+    page.append(SETTINGS.replace("DEMO", demo))
+    page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
+    ours, paper = preset("default"), preset("paper")
+    for name, text in setting_names(ours):
+        default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
+        symbol, section = SYMBOLS[name]
+        theirs = theirs if theirs == default else f"**{theirs}**"
+        section = f"paper Sec. {section}" if section[:1].isdigit() else section
+        page.append(f"| `{name}` | {default} | {theirs} | {cell(text)} | {symbol} | {section} |")
+    return "\n".join(page) + "\n"
+
+
+# docs/cli.md
+
+COMMANDS_PAGE = """\
+# Commands
+
+What `nexwarp COMMAND --help` prints. The page is made from the code by `python -m tests.docs.test_docs --write`; a test
+fails if the two disagree. [Settings](options.md) has the same options as tables, and the keys of `--set`.
+"""
+ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def help_text(*command: str) -> str:
+    """What --help of a command prints, 100 columns wide."""
+    out, columns = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            cli.main([*command, "--help"])
+    finally:
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+    lines = [line.rstrip() for line in ANSI.sub("", out.getvalue()).splitlines()]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).strip()
+
+
+def commands_page() -> str:
+    """The text of docs/cli.md."""
+    page = [COMMANDS_PAGE]
+    for command in ([], *([name] for name in cli.COMMANDS)):
+        page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
+    return "\n".join(page)
+
+
+def test_the_commands_page_is_that_of_the_code():
+    page = (DOCS / "cli.md").read_text(encoding="utf-8")
+    assert page == commands_page(), "docs/cli.md is out of date: python -m tests.docs.test_docs --write"
+
+
+def test_the_options_page_is_that_of_the_code():
+    page = (DOCS / "options.md").read_text(encoding="utf-8")
+    assert page == options_page(), "docs/options.md is out of date: python -m tests.docs.test_docs --write"
+
+
+def test_every_setting_has_its_symbol():
+    assert [name for name, _ in setting_names(Config())] == list(SYMBOLS)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_the_options_page_says_what_help_says(name, capsys, monkeypatch):
+    """The same options, defaults and words, so that the page's own reading of the code is right."""
+    monkeypatch.setenv("COLUMNS", "600")
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    out = capsys.readouterr().out
+    shown = " ".join(out.replace("│", " ").split())
+    rows = list(options(cli.COMMANDS[name]))
+    found = set(re.findall(r"^[ │]+(--[a-z][a-z-]*)", out, re.M))
+    assert found == {option.split()[0] for option, _, _ in rows if option.startswith("--")}
+    for option, default, text in rows:
+        ending = {"required": " (required)", "off": " (default: False)", "repeatable": " (repeatable)"}
+        assert f"{option} {text}{ending.get(default, f' (default: {default})')}" in shown, option
+    assert "{None}" not in out
+
+
+def test_settings_on_the_page_can_be_set():
+    """What the tables print is what --set takes: each preset is the other one with the page's values."""
+    ours, paper = PRESETS["default"], PRESETS["paper"]
+    values = {name: json.loads(json.dumps(setting(paper, name))) for name in SYMBOLS}
+    assert with_settings(ours, values) == paper
+
+
+# docs/paper.md, the README, and commands on any page
+
+PAGES = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Arguments of every nexwarp command in a page's indented blocks."""
+    pattern = rf"\bnexwarp ((?:{'|'.join(cli.COMMANDS)})\b[^#;\n]*)"
+    blocks = re.findall(r"^    .*$", page.read_text(encoding="utf-8"), re.M)
+    return [shlex.split(command) for line in blocks for command in re.findall(pattern, line)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_can_be_typed(page, monkeypatch):
+    """Every command is understood, and every setting of a training exists and takes its value."""
+    understood = []
+    for command in cli.COMMANDS.values():
+        monkeypatch.setattr(command, "__call__", lambda self, console: understood.append(self))
+    monkeypatch.setattr(Train, "starts", lambda self: 0)  # --gpus asks for more than a test machine has
+    for arguments in commands(page):
+        assert cli.main(arguments) == 0, arguments
+        command = understood.pop()
+        if isinstance(command, Train):
+            config = dataclasses.replace(command, resume=False)._config(Path("nowhere"))
+            assert config.preset == command.preset
+
+
+def test_the_paper_page_has_commands_for_all_scenes():
+    page = (DOCS / "paper.md").read_text(encoding="utf-8")
+    scenes = " ".join(re.findall(r"for s in ([^;]+);", page)).split() + re.findall(r"data/custom/(\w+) ", page)
+    assert len(scenes) == len(set(scenes)) == 15
+    typed = commands(DOCS / "paper.md")
+    assert len(typed) == 12 and all("--preset" in arguments for arguments in typed)
+
+
+def test_the_paper_page_lists_all_that_differs():
+    page = (DOCS / "paper.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `([a-z_.]+)` \|", page, re.M)
+    ours, paper = preset("default"), preset("paper")
+    differ = {name for name in SYMBOLS if setting(ours, name) != setting(paper, name)} - {"preset"}
+    assert set(listed) == differ and len(listed) == len(differ)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1000
+
+
+def test_pages_are_in_the_site_s_navigation():
+    """Each page of docs/ is there, and each is reached from the first page."""
+    listed = set(re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M))
+    pages = {page.name for page in DOCS.glob("*.md")}
+    assert pages <= listed
+    first = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert pages - {"index.md"} <= set(re.findall(r"\]\(([a-z_]+\.md)", first))
+
+
+def test_the_api_page_has_every_public_name():
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
+
+
+def test_every_setting_has_a_row_of_evidence() -> None:
+    rows = re.findall(r"^\| (`.+?`) \|", (DOCS / "evidence.md").read_text(encoding="utf-8"), re.M)
+    named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    assert sorted(named) == sorted(SYMBOLS)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
+def test_the_site_builds(tmp_path):
+    """All links and anchors between pages lead somewhere, and all names of the API are found."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "paper Eq. 6" in (tmp_path / "site" / "method" / "index.html").read_text(encoding="utf-8")
+
+
+def test_links():
+    """Every link from one document to another leads somewhere."""
+    for page in PAGES:
+        for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def main(arguments: list[str]) -> int:
+    """Write docs/options.md and docs/cli.md."""
+    if arguments != ["--write"]:
+        print("usage: python -m tests.docs.test_docs --write", file=sys.stderr)
+        return 2
+    (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
+    (DOCS / "cli.md").write_text(commands_page(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

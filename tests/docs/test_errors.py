@@ -1,0 +1,174 @@
+"""One family of errors, each also the built-in one that callers expect; what of them reaches a terminal."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import errors
+from nexwarp.cli import main as cli
+from nexwarp.cli.commands import Info
+from nexwarp.cli.device import pick_device
+from nexwarp.errors import (
+    CheckpointError,
+    DivergedError,
+    FormatError,
+    MissingError,
+    NexwarpError,
+    OutOfMemoryError,
+    RankError,
+    RunError,
+    SceneError,
+    SettingError,
+    StorageError,
+)
+from nexwarp.io.files import write_atomically
+from nexwarp.run.folder import SceneSource, prepare_run, read_run
+from nexwarp.run.render_job import RenderOrder
+from nexwarp.train.checkpoint import load_checkpoint
+from tests.subprocesses import python_path
+
+KIN = {
+    SettingError: ValueError,
+    SceneError: ValueError,
+    FormatError: ValueError,
+    CheckpointError: FormatError,
+    RunError: ValueError,
+    MissingError: FileNotFoundError,
+    StorageError: OSError,
+    DivergedError: RuntimeError,
+    RankError: RuntimeError,
+    OutOfMemoryError: MemoryError,
+}
+
+
+def test_the_family_is_whole():
+    family = {x for x in vars(errors).values() if isinstance(x, type) and issubclass(x, NexwarpError)}
+    assert family == {NexwarpError, *KIN}
+    for kind, kin in KIN.items():
+        assert issubclass(kind, NexwarpError) and issubclass(kind, kin)
+        assert kind.__name__ in errors.__doc__
+        with pytest.raises(kin, match=r"^what, where$"):
+            raise kind("what, where")
+
+
+def test_a_storage_error_says_what_and_where(tmp_path):
+    error = StorageError.at(tmp_path / "x", OSError(errno.ENOSPC, "No space left on device"))
+    assert str(error) == f"{tmp_path / 'x'}: cannot be written (No space left on device)"
+    assert (error.errno, error.filename) == (errno.ENOSPC, str(tmp_path / "x"))
+
+
+def test_boundaries_raise_the_family(tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{")
+    (tmp_path / "run" / "model.safetensors").write_bytes(b"no")
+    source = SceneSource("demo")
+    for kind, call in (
+        (MissingError, lambda: nw.load(tmp_path / "no")),
+        (FormatError, lambda: nw.load(tmp_path / "run")),
+        (MissingError, lambda: read_run(tmp_path / "no")),
+        (FormatError, lambda: read_run(tmp_path / "run")),
+        (MissingError, lambda: load_checkpoint(tmp_path / "run")),
+        (SettingError, lambda: pick_device("tpu")),
+        (SettingError, lambda: RenderOrder(path="circle")),
+        (RunError, lambda: prepare_run(tmp_path / "run", source, resume=False, overwrite=False)),
+        (SettingError, lambda: prepare_run(tmp_path / "run", source, resume=True, overwrite=True)),
+    ):
+        with pytest.raises(kind) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match=r"run/config\.json: cannot be written"):
+        write_atomically(tmp_path / "run" / "config.json", b"{}")
+    assert (tmp_path / "run" / "config.json").read_text() == "{"
+
+
+# The terminal
+
+
+def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Info, "__call__", fail)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (RunError("x: expected a run"), 2, "nexwarp: error: x: expected a run"),
+        (ValueError("two\n lines"), 2, "nexwarp: error: two lines"),
+        (OSError(28, "No space left on device", "f"), 2, "nexwarp: error: [Errno 28] No space left on device: 'f'"),
+        (DivergedError("iteration 3: not finite"), 2, "nexwarp: error: iteration 3: not finite"),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more"),
+            2,
+            "nexwarp: error: out of memory: needed 2.00 GiB; try a smaller image size",
+        ),
+        (KeyError("means"), 3, "nexwarp: internal error: KeyError: 'means'; --debug shows the traceback"),
+        (
+            RuntimeError("[bold]x[/bold]"),
+            3,
+            "nexwarp: internal error: RuntimeError: [bold]x[/bold]; --debug shows the traceback",
+        ),
+        (KeyboardInterrupt(), 130, "nexwarp: interrupted"),
+    ],
+)
+def test_every_error_is_one_line(monkeypatch, capsys, error, code, line):
+    fail_with(monkeypatch, error)
+    assert cli.main(["info", "run"]) == code
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", f"{line}\n")
+
+
+@pytest.mark.parametrize("where", [0, 1, 2])
+@pytest.mark.parametrize(("error", "code"), [(RunError("x: expected a run"), 2), (KeyError("means"), 3)])
+def test_debug_shows_the_whole_trace(monkeypatch, capsys, where, error, code):
+    fail_with(monkeypatch, error)
+    arguments = ["info", "run"]
+    arguments.insert(where, "--debug")
+    assert cli.main(arguments) == code
+    err = capsys.readouterr().err
+    assert err.startswith("Traceback (most recent call last):\n") and "in fail\n    raise error\n" in err
+    assert err.splitlines()[-1].startswith("nexwarp: ") and "--debug" not in err.splitlines()[-1]
+
+
+def test_help_tells_of_debug(capsys):
+    with pytest.raises(SystemExit) as exited:
+        cli.main(["--help"])
+    assert exited.value.code == 0 and "--debug" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("first", ["", "pycolmap_module()"])  # whose import takes the signal for itself
+def test_terminated_commands_end_in_order(tmp_path, first):
+    """SIGTERM unwinds: what is half-written goes."""
+    program = f"""
+import os, signal, sys
+from pathlib import Path
+from nexwarp.cli import main as cli
+from nexwarp.data.lens import pycolmap_module
+from nexwarp.io.files import written_aside
+
+def wait(*_):
+    {first}
+    with written_aside(Path({str(tmp_path)!r}) / "file") as temporary:
+        temporary.write_text("half")
+        os.kill(os.getpid(), signal.SIGTERM)
+
+cli.Info.__call__ = wait
+sys.exit(cli.main(["info", "run"]))
+"""
+    root = Path(__file__).parents[2]
+    environment = os.environ | python_path(root)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 143 and done.stderr.splitlines()[-1] == "nexwarp: terminated"
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,115 @@
+"""The examples: each runs in its short form, shows what it is meant to show, and is short."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.data import Scene
+from nexwarp.io.pictures import load_exr
+from nexwarp.train.config import LearningRates, TextureConfig
+from tests.subprocesses import python_path
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory, few_places: None) -> Path:
+    """A run folder with a small model of the demo and its cameras."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    config = nw.Config(
+        iterations=100,
+        max_surfels=500,
+        texture=TextureConfig(levels=4, table_size=2**10, width=16),
+        rates=LearningRates(means=(5e-4, 5e-6), scales=2.5e-2, opacities=0.05, sh0=1.25e-2, grid=(2e-2, 2e-4)),
+    )
+    nw.train(tiny_scene, config, device="cpu").save(folder)
+    sets = {"train": tiny_scene.train, "test": tiny_scene.test}
+    save_cameras(folder / "cameras.json", {name: {v.name: v.camera for v in views} for name, views in sets.items()})
+    return folder
+
+
+def run(name: str, *arguments: object) -> str:
+    """What an example prints; warnings are errors."""
+    command = [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py"), *map(str, arguments)]
+    environment = os.environ | python_path(ROOT) | {"CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def numbers(pattern: str, text: str) -> list[float]:
+    """The groups of all matches of a pattern, in order."""
+    return [float(x) for match in re.finditer(pattern, text) for x in match.groups()]
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return image.size
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_are_short_and_tell_how_to_run_them(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") < 60
+    assert f"\npython examples/{path.name} " in text.split('"""')[1]
+
+
+def test_training_from_tensors_raises_the_psnr(tmp_path: Path) -> None:
+    out = run("train_from_tensors", "--steps", 60, "--downscale", 4, "--out", tmp_path)
+    steps = numbers(r"step \d+: ([\d.]+) dB", out)
+    (test,) = numbers(r"test views: ([\d.]+) dB", out)
+    assert steps[-1] > steps[0] + 2.0 and test > steps[0] + 2.0
+    assert len(nw.load(tmp_path).surfels) > 100
+
+
+def test_the_own_loss_falls() -> None:
+    out = run("own_loss", "--steps", 60)
+    first, first_psnr, last, last_psnr = numbers(r"edge loss ([\d.]+), ([\d.]+) dB", out)
+    assert last < first and last_psnr > first_psnr
+
+
+def test_the_pose_is_recovered(model: Path) -> None:
+    out = run("refine_pose", "--model", model, "--steps", 60)
+    errors = numbers(r"pose error ([\d.]+) degrees, ([\d.]+) world units", out)
+    assert errors[0] > 1.0 and errors[-2] < errors[0] / 10
+    assert errors[-1] < errors[1] / 5
+
+
+def test_depth_and_normals_are_those_of_the_rendering(model: Path, tmp_path: Path, tiny_scene: Scene) -> None:
+    run("depth_and_normals", "--model", model, "--out", tmp_path)
+    camera = tiny_scene.test[0].camera
+    with torch.no_grad():
+        rendering = nw.load(model).render(camera)
+    parts, _ = load_exr(tmp_path / "geometry.exr")
+    for name in ("expected_depth", "median_depth", "normals", "alpha"):
+        assert torch.equal(parts[name], getattr(rendering, name)), name
+    names = {path.name for path in tmp_path.glob("*.png")}
+    assert names == {"image.png", "mask.png", "expected_depth.png", "median_depth.png", "normals.png"}
+    assert all(size_of(tmp_path / name) == (camera.width, camera.height) for name in names)
+
+
+def test_frames_along_a_path_are_written(model: Path, tmp_path: Path) -> None:
+    run("render_path", "--model", model, "--out", tmp_path, "--frames", 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"frame_{i:04d}.png" for i in range(3)]
+    assert {size_of(path) for path in tmp_path.iterdir()} == {(48, 36)}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="PyAV is not installed")
+def test_a_video_along_a_path_is_written(model: Path, tmp_path: Path) -> None:
+    import av
+
+    run("render_path", "--model", model, "--out", tmp_path / "around.mp4", "--frames", 3, "--height", 72, "--white")
+    with av.open(str(tmp_path / "around.mp4")) as video:
+        frames = list(video.decode(video=0))
+    assert len(frames) == 3 and (frames[0].width, frames[0].height) == (96, 72)

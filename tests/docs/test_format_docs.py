@@ -1,0 +1,229 @@
+"""format.md says what a run holds, and the pages have Python that reads one: both are tried on a small run."""
+
+import itertools
+import json
+import re
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
+from nexwarp.data import write_demo
+from nexwarp.model.bounds import BOUNDS, MATRIX_BOUNDS
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
+from tests.docs.test_docs import DOCS, ROOT, SYMBOLS
+from tests.exposed import expose_photos
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, one_torch_thread: None) -> Path:
+    """A small run."""
+    folder = tmp_path_factory.mktemp("docs")
+    scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
+    expose_photos(scene)
+    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16", "sh_degree=6")
+    flags = [x for change in changes for x in ("--set", change)]
+    flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
+    assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
+    return folder / "run"
+
+
+# docs/format.md
+
+
+def section(title: str) -> str:
+    """Text of docs/format.md below a heading, up to the next of its kind."""
+    page = (DOCS / "format.md").read_text(encoding="utf-8")
+    return page.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
+
+
+def named(text: str) -> list[str]:
+    """First cells of a text's tables."""
+    return re.findall(r"^\| `([^`]+)` \|", text, re.M)
+
+
+def header(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    data = (run / "model.safetensors").read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    tensors = json.loads(data[8 : 8 + size])
+    metadata = tensors.pop("__metadata__")
+    assert set(metadata) == {"nexwarp"}
+    return tensors, json.loads(metadata["nexwarp"])
+
+
+def flat(data: dict[str, Any], *parts: str) -> set[str]:
+    """Keys, those of the named parts with a dot."""
+    inner = {f"{part}.{key}" for part in parts for key in data[part]}
+    return {key for key in data if key not in parts} | inner
+
+
+def test_files(run):
+    listed = named((DOCS / "format.md").read_text(encoding="utf-8").split("\n## ", 1)[0])
+    optional = {"tensorboard/", "camera_path_N.json", "export/", "diverged.json", "wandb.json", "teachers/N/"}
+    assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == set(listed) - optional
+    assert {f.name for f in (run / "checkpoint").iterdir()} == set(named(section("checkpoint/")))
+    assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}
+
+
+def test_tensors(run):
+    """Names, types and shapes of the table are those of the file."""
+    tensors, meta = header(run)
+    rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
+    shape = meta["texture"]
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 48, "3": 3, "1": 1, "2": 2, "4": 4}
+    sizes |= {
+        "V": len(json.loads((run / "cameras.json").read_text())["train"]),
+        "L": shape["levels"],
+        "T": shape["table_size"],
+        "F": shape["features"],
+    }
+    expected = {}
+    for name, dtype, dimensions in rows:
+        if ".I." in name:
+            widths = [sizes["L"] * sizes["F"], *[shape["width"]] * shape["hidden_layers"], 48]
+            for i, (inner, outer) in enumerate(itertools.pairwise(widths)):
+                expected[name.replace("I", str(2 * i))] = (dtype, [outer, inner])
+        else:
+            expected[name] = (dtype, [sizes[d.strip()] for d in dimensions.split(",")])
+    assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
+
+
+def test_bounds() -> None:
+    rows = re.findall(r"^\| `([a-zA-Z0-9_.]+)` \| (-?\d\S*) \| (\d\S*) \|", section("model.safetensors"), re.M)
+    documented = {name: (float(low), float(high)) for name, low, high in rows}
+    matrices = documented.pop("texture.mlp.I.weight")
+    assert matrices == MATRIX_BOUNDS
+    rounded = {name: (low, float(f"{high:.5g}")) for name, (low, high) in BOUNDS.items()}
+    assert documented == rounded
+
+
+def test_metadata(run):
+    _, meta = header(run)
+    text = section("model.safetensors").split("a JSON object:", 1)[1]
+    assert set(named(text)) == flat(meta, "texture")
+
+
+def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
+    """The document's program, executed: pixels of a test view, to rounding."""
+    (program,) = re.findall(r"```python\n(.*?)```", section("model.safetensors"), re.S)
+    reader: dict[str, Any] = {}
+    exec(program, reader)
+    cameras = json.loads((run / "cameras.json").read_text())["test"]
+    name = next(iter(cameras))
+    camera = load_cameras(run / "cameras.json")["test"][name]
+    model = nw.load(run)
+    texture = model.texture
+    assert texture is not None
+    others = list(load_cameras(run / "cameras.json")["train"].values())[:3]
+    with torch.no_grad():  # more to be seen than after so few steps
+        texture.grid.normal_(0, 2)
+        model.surfels.log_scales.add_(0.7)
+        model.surfels.raw_gammas.uniform_(-3, 1)
+        model.surfels.logit_opacities.uniform_(-2, 5)
+        model.surfels.shN.normal_(0, 0.2)
+    count = len(model.surfels)
+    model.detail_limits = DetailLimits(torch.rand(count) * 0.2, torch.rand(count) * 0.4)  # within, and beyond
+    gains = torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]])
+    model.exposures = Exposures.of(gains, others, (-0.3, -0.4, 0.15))
+    pixels = [(3, 5), (24, 18), (40, 30), (47, 0), (11, 27), (30, 9)]
+    # As trained; with the texture in place of the plain colours; and with each option that a file may hold.
+    for residual, changes in (
+        (True, {}),
+        (False, {}),
+        (False, {"clamp_texture": True}),
+        (True, {"max_hits": 1}),
+        (True, {"max_hits": 0}),
+        (True, {"exposure": "mean"}),
+        (True, {"detail_limits": False}),
+        (True, {"order": "distance"}),
+        (True, {"sh_degree": 3}),
+        (None, {}),  # without a texture
+    ):
+        if residual is None:
+            model.texture = None
+        else:
+            texture.residual = texture.config["residual"] = residual
+        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7), sh_degree=6).changed(**changes)
+        file = model.save(tmp_path)
+        stored = nw.load(file)
+        tensors, meta = reader["read"](file)
+        drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        plain = nw.Model(stored.surfels, None, stored.exposures, stored.detail_limits, stored.options)
+        with torch.no_grad():
+            images = [x.render(camera).image for x in (stored, plain)]
+        expected, untextured = (np.array([x[row, column].tolist() for column, row in pixels]) for x in images)
+        np.testing.assert_allclose(drawn, expected, atol=2e-4)
+        assert (abs(expected - untextured).max() > 0.01) == (stored.options.max_hits > 0 and residual is not None)
+
+
+def test_json_files(run):
+    config = json.loads((run / "config.json").read_text())
+    assert flat(config, "scene") == set(named(section("config.json")))
+    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(SYMBOLS)
+    cameras = json.loads((run / "cameras.json").read_text())
+    assert set(cameras) == {"train", "test"}
+    for camera in [*cameras["train"].values(), *cameras["test"].values()]:
+        assert set(camera) == set(named(section("cameras.json")))
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert list(metrics) and set(metrics) == set(named(section("metrics.json")))
+    for line in (run / "metrics.jsonl").read_text().splitlines():
+        assert set(json.loads(line)) == set(named(section("metrics.jsonl")))
+
+
+def test_checkpoint(run):
+    data = (run / "checkpoint" / "tensors.safetensors").read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    groups = {name.split(".")[0] for name in json.loads(data[8 : 8 + size]) if name != "__metadata__"}
+    assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
+
+
+# The Python of docs/paper.md, docs/migrating.md, docs/depth.md and the README
+
+
+def test_examples(run, tmp_path, monkeypatch, capsys):
+    """The Python in the pages runs as it stands."""
+    (tmp_path / "runs" / "one").mkdir(parents=True)
+    shutil.copy(run / "metrics.json", tmp_path / "runs" / "one")
+    monkeypatch.chdir(tmp_path)
+    (means,) = re.findall(r"```python\n(.*?)```", (DOCS / "paper.md").read_text(encoding="utf-8"), re.S)
+    exec(means, {})
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
+    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "migrating.md").read_text(encoding="utf-8"), re.S)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
+
+
+def test_the_readme_s_python_runs(run, tmp_path, monkeypatch, capsys):
+    """As it stands, where a run of the demo is."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    assert len([line for line in example.splitlines() if line]) <= 12
+    names: dict[str, Any] = {}
+    exec(example, names)
+    shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
+    assert capsys.readouterr().out.splitlines()[0] == shapes
+    assert names["model"].surfels.means.grad.norm() > 0
+
+
+def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
+    """It reads what its command writes."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
+    examples = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
+    assert len(examples) == 2
+    for example in examples:
+        exec(example, {})
+    views = len(list((tmp_path / "runs" / "demo" / "renders" / "test").glob("*.png")))
+    assert len(list(tmp_path.glob("*.npy"))) == len(list(tmp_path.glob("depth_*.png"))) == views > 0

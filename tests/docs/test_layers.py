@@ -1,0 +1,146 @@
+"""Data flows one way: a module may import only from layers below its own. And importing is cheap."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2] / "nexwarp"
+# The one list of layers, from the top to the bottom, is in CONTRIBUTING.md.
+(BLOCK,) = re.findall(r"```layers\n(.*?)```", (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.S)
+LAYERS = [line.split() for line in reversed(BLOCK.splitlines())]
+RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
+EXEMPT = {"__init__", "__main__"}
+PURE = {
+    "ctypes",
+    "math",
+    "collections",
+    "functools",
+    "concurrent",
+    "os",
+    "threading",
+    "typing",
+    "dataclasses",
+    "types",
+    "contextlib",
+}
+MOST_ROOMS, MOST_ARROWS = 17, 80  # benchmarks and notebooks are two of the rooms
+
+TIMED_IMPORT = """
+import time, torch
+start = time.process_time()
+import nexwarp
+print(time.process_time() - start)
+"""
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Return every dotted name that a file imports, at any nesting depth."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def modules() -> list[Path]:
+    """All files of the package."""
+    return sorted(ROOT.rglob("*.py"))
+
+
+def test_the_list_of_layers_is_that_of_the_rooms() -> None:
+    rooms = {path.stem if path.is_file() else path.name for path in ROOT.iterdir() if path.name != "__pycache__"}
+    rooms -= EXEMPT | {"py"}
+    assert set(RANK) == rooms
+    assert len(rooms) + len({"benchmarks", "notebooks"}) <= MOST_ROOMS
+
+
+def test_imports_point_downwards() -> None:
+    arrows = set()
+    for path in modules():
+        here = path.relative_to(ROOT).with_suffix("").parts[0]
+        if here in EXEMPT:
+            continue
+        assert here in RANK, f"{path}: in no layer"
+        for dotted in imported_modules(path):
+            root, _, rest = dotted.partition(".")
+            if root == "nexwarp":
+                there = rest.split(".")[0]
+                assert there in RANK, f"{path}: imports {dotted}, which is in no layer"
+                assert here == there or RANK[there] < RANK[here], f"{path}: imports {dotted}"
+                arrows.add((here, there))
+    assert len({arrow for arrow in arrows if arrow[0] != arrow[1]}) <= MOST_ARROWS
+
+
+def test_types_say_something() -> None:
+    """Outside kernels: few `Any`, and no SimpleNamespace."""
+    any_, loose = 0, []
+    for path in modules():
+        if path.is_relative_to(ROOT / "kernels"):
+            continue
+        names = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Name)]
+        any_ += sum(node.id == "Any" for node in names)
+        if any(node.id == "SimpleNamespace" for node in names):
+            loose.append(str(path))
+    assert any_ <= 60
+    assert not loose
+
+
+def test_kernels_are_pure_warp() -> None:
+    for path in sorted((ROOT / "kernels").rglob("*.py")):
+        for dotted in imported_modules(path):
+            root = dotted.split(".")[0]
+            pure = root in PURE | {"__future__", "warp"} or dotted.startswith("nexwarp.kernels")
+            assert pure, f"{path}: imports {dotted}"
+
+
+@pytest.fixture(scope="module")
+def fresh_imports(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[float], list[Path]]:
+    """CPU seconds of three imports in fresh processes, and the files they left in an empty Warp cache."""
+    cache = tmp_path_factory.mktemp("warp")
+    command = [sys.executable, "-c", TIMED_IMPORT]
+    environment = os.environ | {"WARP_CACHE_PATH": str(cache)}
+    seconds = []
+    for _ in range(3):
+        run = subprocess.run(command, env=environment, cwd=ROOT.parent, capture_output=True, text=True, check=True)
+        seconds.append(float(run.stdout.splitlines()[-1]))
+    return seconds, [path for path in cache.rglob("*") if path.is_file()]
+
+
+def test_import_is_quick(fresh_imports: tuple[list[float], list[Path]]) -> None:
+    seconds, _ = fresh_imports
+    assert min(seconds) <= 1.5, f"import nexwarp took {seconds} s beyond import torch"
+
+
+def test_import_compiles_nothing(fresh_imports: tuple[list[float], list[Path]]) -> None:
+    _, files = fresh_imports
+    assert not files
+
+
+USES = """
+import sys
+import nexwarp as nw
+
+from nexwarp.train.config import TextureConfig
+
+scene, shape = nw.load_scene(sys.argv[1]), TextureConfig(table_size=2**10)
+trainer = nw.Trainer(scene, nw.Config(iterations=2, max_surfels=50, texture=shape), "cpu")
+trainer.run()
+trainer.finish().save(sys.argv[2])
+nw.load(sys.argv[2]).render(scene.test[0].camera)
+print([name for name in sys.modules if name.startswith("torch._dynamo") or name.startswith("sympy")])
+"""
+
+
+def test_training_and_loading_import_no_compiler_of_torch(tiny_folder: Path, tmp_path: Path) -> None:
+    """It takes 0.6 to 1.2 s, at the start of every command."""
+    command = [sys.executable, "-c", USES, str(tiny_folder), str(tmp_path / "model")]
+    run = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, check=False)
+    assert run.stdout.splitlines()[-1:] == ["[]"], run.stdout + run.stderr

@@ -1,0 +1,191 @@
+"""Baking: the atlas' layout, the fit, the images of baked scenes, and the glTF and SPZ files."""
+
+import copy
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.errors import FormatError
+from nexwarp.export.bake.baked import Baked, decode_atlas, encode_atlas
+from nexwarp.export.bake.fit import bake, evaluate
+from nexwarp.export.bake.glb import CUTOFF, save_glb, upright
+from nexwarp.export.bake.layout import lay_out
+from nexwarp.export.bake.observe import observe
+from nexwarp.export.splats_spz import save_splats_spz
+from nexwarp.export.web.atlas import ATLAS_FILE, BAKED_FILE, as_stored, decode_harmonics, encode_baked, encode_harmonics
+from tests.export.web.baked_support import bilinear, composited, ring
+from tests.scenes import make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+
+def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float(-10 * (a - b).square().mean().log10())
+
+
+def make_model(residual: bool = True, count: int = 12, sh_degree: int = 1) -> nw.Model:
+    scene = random_scene(count, width=64, height=48, seed=3, sh_degree=sh_degree)
+    texture = make_texture(residual=residual, sh_degree=sh_degree)
+    with torch.no_grad():
+        texture.grid.mul_(0.3)
+    return nw.Model(make_surfels(scene), texture, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+
+
+@pytest.fixture(scope="module")
+def model() -> nw.Model:
+    return make_model()
+
+
+@pytest.fixture(scope="module")
+def cameras() -> dict[str, nw.Camera]:
+    return ring()
+
+
+@pytest.fixture(scope="module")
+def baked(model, cameras) -> Baked:
+    return bake(model, list(cameras.values()), steps=40)
+
+
+def test_no_texel_has_two_owners(baked):
+    layout = baked.layout
+    owners = torch.zeros(layout.height, layout.width, dtype=torch.long)
+    places, ids, _ = layout.centres()
+    owners.index_put_((places[:, 1], places[:, 0]), torch.ones(len(ids), dtype=torch.long), accumulate=True)
+    assert owners.max() == 1 and owners[0].sum() == 0, "the first row is that of surfels without a texture"
+    assert owners.sum() == len(ids) > 0
+
+
+def test_texels_lie_where_sampling_looks_for_them(baked):
+    places, ids, local = baked.layout.centres()
+    assert_close(baked.layout.texels(ids, local), places.float(), kind="value", name="places")
+    # Beyond its box a surfel has the colours of the box's side.
+    beyond = baked.layout.texels(ids, local + 100.0)
+    assert_close(beyond, (baked.layout.rects[ids, :2] + baked.layout.rects[ids, 2:] - 1).float(), kind="value", name="")
+
+
+def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras):
+    seen = observe(model, list(cameras.values()))
+    large, small = (lay_out(seen, texel=0.5, side=side) for side in (2048, 128))
+    assert max(small.width, small.height) <= 128 < max(large.width, large.height)
+
+
+@pytest.mark.parametrize("residual", [True, False])
+def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
+    """A texture without dependence on the direction, on a surfel that is textured in all views, is baked exactly."""
+    model = make_model(residual, count=1, sh_degree=0)
+    seen = observe(model, list(cameras.values()))
+    assert seen.textured[0] == 1
+    layout = lay_out(seen, texel=0.25, side=4096)
+    image = Baked(model, model.surfels, seen, layout, evaluate(model, seen, layout)).render(cameras["1.png"])
+    expected = model.render(cameras["1.png"]).image.detach()
+    plain = model.bare(max_hits=0).render(cameras["1.png"]).image.detach()
+    assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
+
+
+def test_images_are_those_of_the_definition(baked, cameras):
+    for camera in cameras.values():
+        image = baked.render(camera).double()
+        # Hits beyond the eighth, and those below a thousandth, have their plain colours.
+        assert psnr(image, composited(copy.deepcopy(baked), camera)) > 50
+
+
+def test_the_fit_approaches_the_model(baked, model, cameras):
+    for camera in cameras.values():
+        expected = model.render(camera).image.detach()
+        seen = baked.seen
+        first = Baked(model, model.surfels, seen, baked.layout, evaluate(model, seen, baked.layout)).render(camera)
+        plain = untextured_image(model, camera)
+        fitted = psnr(as_stored(baked).render(camera), expected)
+        assert fitted > psnr(first, expected) + 1, "the fit helps"
+        assert fitted > psnr(plain, expected) + 6 and fitted > 24
+
+
+def untextured_image(model: nw.Model, camera: nw.Camera) -> torch.Tensor:
+    return model.bare(max_hits=0).render(camera).image.detach()
+
+
+def test_a_model_without_texture_bakes_to_itself(model, cameras):
+    bare = model.bare(max_hits=0)
+    camera = cameras["0.png"]
+    image = bake(bare, list(cameras.values()), steps=0).render(camera)
+    assert_close(image, untextured_image(model, camera), kind="value", name="image")
+
+
+def test_codes_are_near_the_values(baked):
+    codes, scale = encode_atlas(baked.atlas)
+    inside = baked.atlas.clamp(-scale, scale)
+    assert float((decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
+    values = baked.surfels.shN.detach().numpy()
+    codes_, ranges = encode_harmonics(baked.surfels)
+    error = np.abs(decode_harmonics(codes_, ranges) - values)
+    assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
+
+
+@pytest.mark.cuda
+def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
+    views = list(cameras.values())
+    there = bake(copy.deepcopy(model).cuda(), views, steps=40)
+    for camera in views:
+        assert psnr(as_stored(there).render(camera).cpu(), as_stored(baked).render(camera)) > 35
+    assert encode_baked(there, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
+    pytest.importorskip("trimesh")
+    save_glb(tmp_path / "scene.glb", there, views)
+
+
+def test_no_cameras_are_refused(model):
+    with pytest.raises(ValueError, match="cameras: expected at least one"):
+        bake(model, [])
+
+
+def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    file = tmp_path / "scene.glb"
+    save_glb(file, baked, list(cameras.values()))
+    (mesh,) = trimesh.load(file).geometry.values()
+    visible = (baked.surfels.opacities > CUTOFF).nonzero()[:, 0]
+    assert mesh.vertices.shape == (4 * len(visible), 3) and mesh.faces.shape == (2 * len(visible), 3)
+    turn = upright(list(cameras.values()))
+    back = torch.from_numpy(np.asarray(mesh.vertices) @ turn).float().reshape(-1, 4, 3)
+    surfels = baked.surfels
+    across = (back - surfels.means[visible, None]) @ surfels.normals[visible, :, None]
+    assert float(across.detach().abs().max()) < 1e-4, "corners lie in the surfels' planes"
+    assert_close(back.mean(1), surfels.means[visible].detach(), kind="gradient", name="centres")
+    # The texture in the middle of a quad: the colour and the alpha at the surfel's centre.
+    image = np.asarray(mesh.visual.material.baseColorTexture).astype(float) / 255
+    middle = mesh.visual.uv.reshape(-1, 4, 2).mean(1)
+    places = np.stack([middle[:, 0] * image.shape[1], (1 - middle[:, 1]) * image.shape[0]], 1) - 0.5
+    found = bilinear(torch.from_numpy(image), torch.from_numpy(places)).numpy()
+    colors = baked.colors_from_mean_direction()[visible] + baked.added(visible, torch.zeros(len(visible), 2))
+    assert np.abs(found[:, :3] - colors.clamp(0, 1).detach().numpy()).mean() < 0.05
+    assert np.abs(found[:, 3] - surfels.opacities[visible].detach().numpy()).max() < 0.05
+    size = struct.unpack("<I", file.read_bytes()[12:16])[0]
+    (material,) = json.loads(file.read_bytes()[20 : 20 + size])["materials"]
+    assert material["alphaMode"] == "MASK" and "KHR_materials_unlit" in material["extensions"]
+
+
+def test_up_becomes_y(cameras):
+    turn = upright(list(cameras.values()))
+    assert np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) > 0
+    ups = np.stack([-camera.viewmat[1, :3].numpy() for camera in cameras.values()])
+    assert np.allclose(turn @ (ups.mean(0) / np.linalg.norm(ups.mean(0))), [0, 1, 0], atol=1e-6)
+
+
+def test_spz_files_hold_the_gaussians(model, tmp_path):
+    library = pytest.importorskip("gaussforge").GaussForge()
+    save_splats_spz(tmp_path / "a.spz", model.surfels)
+    found = library.read((tmp_path / "a.spz").read_bytes(), "spz")["data"]
+    positions, colors, alphas = (np.frombuffer(found[name], np.float32) for name in ("positions", "colors", "alphas"))
+    surfels = model.surfels
+    assert np.abs(positions.reshape(-1, 3) - surfels.means.detach().numpy()).max() <= 2**-12
+    assert np.abs(colors.reshape(-1, 3) - surfels.sh0[:, 0].detach().numpy()).max() < 0.02
+    assert np.abs(1 / (1 + np.exp(-alphas)) - surfels.opacities.detach().numpy()).max() < 1 / 255
+    far = copy.deepcopy(surfels)
+    with torch.no_grad():
+        far.means[0] = 5000.0
+    with pytest.raises(FormatError, match=r"a.spz: SPZ holds Gaussians up to 2,047 units from the origin, 1 of 12"):
+        save_splats_spz(tmp_path / "a.spz", far)

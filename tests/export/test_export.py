@@ -1,0 +1,304 @@
+"""Exported surfels: bits that come back, files that an independent reader and an independent renderer understand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks.splats import draw, untextured
+from nexwarp.cameras.camera import resized
+from nexwarp.cameras.paths import look_at
+from nexwarp.data import write_demo
+from nexwarp.export.splats import Pieces, split_large
+from nexwarp.export.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.io.pictures import to_uint8
+from nexwarp.run.metrics import psnr
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
+from nexwarp.train.trainer import Trainer
+from tests.reference import ewa
+from tests.reference.collect import rotations
+from tests.scenes import intrinsics, make_surfels, random_scene
+from tests.tolerances import assert_close
+
+
+def read(path: Path) -> dict[str, torch.Tensor]:
+    """The vertices, by property, as another program sees them."""
+    plyfile = pytest.importorskip("plyfile", reason="an independent reader of PLY (extra `dev`)")
+    data = plyfile.PlyData.read(str(path))
+    assert [element.name for element in data.elements] == ["vertex"] and data.byte_order == "<"
+    vertex = data["vertex"]
+    return {p.name: torch.from_numpy(np.array(vertex[p.name])) for p in vertex.properties}
+
+
+def stack(columns: dict[str, torch.Tensor], *names: str) -> torch.Tensor:
+    return torch.stack([columns[name] for name in names], dim=1)
+
+
+def numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{i}" for i in range(count)]
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2, 3, 6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_surfels_read_back_bit_for_bit(
+    tmp_path: Path, sh_degree: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    surfels = make_surfels(random_scene(sh_degree=sh_degree, dtype=dtype, device=device))
+    with torch.no_grad():
+        surfels.raw_quats.mul_(3.0)
+        surfels.means[0] = torch.tensor([-0.0, 1e-42, 9e15])
+    save_surfels_ply(tmp_path / "new" / "a.ply", surfels)
+    after = load_surfels_ply(tmp_path / "new" / "a.ply").state_dict()
+    for name, before in surfels.state_dict().items():
+        assert after[name].dtype == dtype and after[name].shape == before.shape, name
+        assert after[name].numpy().tobytes() == before.cpu().numpy().tobytes(), name
+    assert [f.name for f in (tmp_path / "new").iterdir()] == ["a.ply"]
+
+
+def test_no_surfels_read_back(tmp_path: Path) -> None:
+    empty = {name: x[:0] for name, x in make_surfels(random_scene(4)).state_dict().items()}
+    save_surfels_ply(tmp_path / "a.ply", nw.Surfels(empty))
+    assert len(load_surfels_ply(tmp_path / "a.ply")) == 0
+    save_splats_ply(tmp_path / "b.ply", nw.Surfels(empty))
+    assert len(read(tmp_path / "b.ply")["x"]) == 0
+
+
+def test_surfel_properties_as_another_program_sees_them(tmp_path: Path) -> None:
+    scene = random_scene(sh_degree=1)
+    save_surfels_ply(tmp_path / "a.ply", make_surfels(scene))
+    columns = read(tmp_path / "a.ply")
+    assert list(columns) == [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *numbered("f_dc", 3),
+        *numbered("f_rest", 9),
+        "opacity",
+        *numbered("scale", 2),
+        *numbered("rot", 4),
+        *numbered("gamma", 2),
+    ]
+    assert stack(columns, "x", "y", "z").equal(scene["means"])
+    assert_close(1 + stack(columns, "gamma_0", "gamma_1").exp(), scene["gammas"], kind="value", name="gamma")
+    assert_close(stack(columns, "scale_0", "scale_1").exp(), scene["scales"], kind="value", name="scale")
+    assert_close(columns["opacity"].sigmoid(), scene["opacities"], kind="value", name="opacity")
+    # All of red, then all of green, then all of blue.
+    assert stack(columns, *numbered("f_rest", 9)).view(-1, 3, 3).mT.equal(scene["sh"][:, 1:])
+    axes = rotations(stack(columns, *numbered("rot", 4)))
+    assert_close(stack(columns, "nx", "ny", "nz"), axes[..., 2], kind="value", name="normal")
+
+
+@pytest.mark.parametrize("given", [0, 1, 3, 5])
+@pytest.mark.parametrize("kept", [0, 2, 3])
+def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> None:
+    scene = random_scene(sh_degree=given)
+    save_splats_ply(tmp_path / "a.ply", make_surfels(scene), kept)
+    columns = read(tmp_path / "a.ply")
+    assert list(columns) == [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *numbered("f_dc", 3),
+        *numbered("f_rest", 45),
+        "opacity",
+        *numbered("scale", 3),
+        *numbered("rot", 4),
+    ]
+    assert all(x.dtype == torch.float32 and x.isfinite().all() for x in columns.values())
+    scales = stack(columns, *numbered("scale", 3)).exp()
+    assert_close(scales[:, :2], scene["scales"], kind="value", name="scale")
+    assert_close(scales[:, 2], THINNESS * scene["scales"].amin(1), kind="value", name="scale_2")
+    quats = stack(columns, *numbered("rot", 4))
+    assert (quats.norm(dim=1) - 1).abs().max() < 1e-6
+    assert_close(rotations(quats), rotations(scene["quats"]), kind="value", name="rotation")
+    assert_close(columns["opacity"].sigmoid(), scene["opacities"], kind="value", name="opacity")
+    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT
+    count = (min(given, kept) + 1) ** 2
+    assert rest[:, : count - 1].equal(scene["sh"][:, 1:count]) and (rest[:, count - 1 :] == 0).all()
+    assert stack(columns, *numbered("f_dc", 3)).equal(scene["sh"][:, 0])
+
+
+# Large surfels become several Gaussians
+
+
+def blended(pieces: Pieces, at: torch.Tensor) -> torch.Tensor:
+    """Alpha of Gaussians in one plane, at (P, 2) places."""
+    apart = (at[:, None] - pieces.offsets) / pieces.scales
+    return 1 - (1 - pieces.opacities * torch.exp(-0.5 * apart.square().sum(-1))).prod(1)
+
+
+@pytest.mark.parametrize("opacity", [0.03, 0.3, 0.8, 0.97, 1.0])
+@pytest.mark.parametrize("scales", [(0.5, 0.02), (0.6, 0.4), (3.0, 3.0)])
+def test_the_pieces_of_a_surfel_have_its_alpha(opacity: float, scales: tuple[float, float]) -> None:
+    camera = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
+    mean, sizes = torch.tensor([[0.0, 0.0, 1.0]]).double(), torch.tensor([scales]).double()
+    pieces = split_large(mean, sizes, torch.tensor([opacity]).double(), [camera], 0.25)
+    assert pieces.whole == 0 and len(pieces.ids) > 1 and (pieces.ids == 0).all()
+    # A grid has at most 16 pieces on either side, so that of the largest is coarser than asked for.
+    assert (pieces.scales.amax(0) <= (0.25 if scales[0] < 1 else 0.5)).all()
+    places = 3.5 * sizes * (2 * torch.rand(4000, 2, dtype=torch.float64) - 1)
+    expected = min(opacity, 0.99) * torch.exp(-0.5 * (places / sizes).square().sum(1))
+    error = (blended(pieces, places) - expected).abs()
+    assert error.max() < 0.06 and error.mean() < 0.008, (error.max(), error.mean())
+
+
+def test_small_surfels_and_those_of_no_camera_stay_one_gaussian(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene())
+    camera = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
+    with torch.no_grad():
+        surfels.log_scales.fill_(-9.0)
+        surfels.log_scales[::3] = 1.0
+    save_splats_ply(tmp_path / "none.ply", surfels)
+    save_splats_ply(tmp_path / "inf.ply", surfels, cameras=[camera], max_extent=float("inf"))
+    assert (tmp_path / "none.ply").read_bytes() == (tmp_path / "inf.ply").read_bytes()
+    save_splats_ply(tmp_path / "split.ply", surfels, cameras=[camera])
+    one, several = read(tmp_path / "none.ply"), read(tmp_path / "split.ply")
+    kept = torch.exp(one["scale_0"]) < 1
+    count = int(kept.sum())
+    assert len(several["x"]) > len(one["x"]) and all(several[n][:count].equal(x[kept]) for n, x in one.items())
+    with pytest.raises(ValueError, match="max_extent: expected more than 0, got 0"):
+        save_splats_ply(tmp_path / "bad.ply", surfels, cameras=[camera], max_extent=0)
+
+
+def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None:
+    """A floor that runs up to the camera: one Gaussian each it is another picture, split it is ours to 35 dB."""
+    x, z = (
+        a.flatten() for a in torch.meshgrid(torch.tensor([-0.7, 0.7]), torch.tensor([0.8, 2.0, 3.2]), indexing="ij")
+    )
+    means = torch.stack([x, torch.full_like(x, 0.6), z], dim=1)
+    quats = torch.tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]]).expand(6, 4)
+    sh = torch.rand(6, 1, 3) * 3 - 1.5
+    surfels = nw.Surfels.from_activated(
+        means, quats, torch.full((6, 2), 0.5), torch.full((6,), 0.9), torch.ones(6, 2), sh
+    )
+    # So fine that the renderer's blur does not count.
+    camera = nw.Camera(torch.eye(4), intrinsics(300, 300, 200, 150).float(), 400, 300)
+    with torch.no_grad():
+        mine = nw.render(surfels, None, camera, background=(0.2, 0.5, 0.8)).image
+    found = []
+    for extent in (float("inf"), 0.1):
+        save_splats_ply(tmp_path / "a.ply", surfels, cameras=[camera], max_extent=extent)
+        columns = {name: x.double() for name, x in read(tmp_path / "a.ply").items()}
+        theirs = ewa.render(
+            stack(columns, "x", "y", "z"),
+            stack(columns, *numbered("rot", 4)),
+            stack(columns, *numbered("scale", 3)).exp(),
+            columns["opacity"].sigmoid(),
+            0.5 + 0.28209479177387814 * stack(columns, *numbered("f_dc", 3)),
+            camera,
+            (0.2, 0.5, 0.8),
+        )
+        found.append(float(psnr(to_uint8(theirs.float()), to_uint8(mine))))
+    assert found[0] < 30 and found[1] >= 35, found
+
+
+# Another renderer
+
+
+def small_surfels(count: int, device: torch.device) -> nw.Surfels:
+    """A closed, bumpy shell of surfels that overlap, as small as those of a trained scene: some pixels wide."""
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    means = normals * (1 + 0.1 * torch.sin(7 * normals).prod(1, keepdim=True))
+    # Half-way from z to the normal; slightly tilted.
+    quats = torch.cat([1 + normals[:, 2:], -normals[:, 1:2], normals[:, :1], torch.zeros(count, 1)], dim=1)
+    quats = quats + 0.05 * torch.randn(count, 4, generator=generator)
+    spacing = (4 * torch.pi / count) ** 0.5
+    scales = spacing * (0.5 + torch.rand(count, 2, generator=generator))
+    sh = 0.1 * torch.randn(count, 16, 3, generator=generator)
+    sh[:, 0] = 1.2 * torch.sin(4 * means + torch.arange(3.0))
+    opacities = 0.2 + 0.75 * torch.rand(count, generator=generator)
+    gammas = torch.ones(count, 2)
+    values = (means, quats, scales, opacities, gammas, sh)
+    return nw.Surfels.from_activated(*(x.to(device) for x in values))
+
+
+@pytest.mark.cuda
+def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> None:
+    """Against our render without texture at gamma = 1."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    pytest.importorskip("plyfile", reason="an independent reader of PLY (extra `dev`)")
+    device = torch.device("cuda")
+    surfels = small_surfels(20_000, device)
+    save_splats_ply(tmp_path / "splats.ply", surfels)
+    size, background = 800, (0.2, 0.5, 0.8)
+    K = torch.tensor([[900.0, 0.0, size / 2], [0.0, 900.0, size / 2], [0.0, 0.0, 1.0]], device=device)
+    for position in ((0.0, -3.0, 0.5), (2.0, 2.0, 1.0)):
+        viewmat = look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])).to(device)
+        camera = nw.Camera(viewmat, K, size, size)
+        with torch.no_grad():
+            mine = nw.render(surfels, None, camera, background=background).image
+        found = float(psnr(to_uint8(draw(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
+        record_property(f"psnr from {position}", found)
+        assert mine.std() > 0.1
+        assert found >= 35.0
+
+
+@pytest.mark.cuda
+def test_gsplat_renders_a_trained_scene_as_we_do(tmp_path: Path, record_property) -> None:
+    """The demo as `nexwarp train demo` trains it, at 4 times its photos' size, where the blur is small."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
+    scene = nw.load_scene(write_demo(tmp_path / "demo"))
+    trainer = Trainer(scene, with_settings(preset("default"), DEMO_SETTINGS), "cuda")
+    trainer.run()
+    surfels = untextured(trainer.surfels)
+    cameras = [view.camera for view in [*scene.train, *scene.test]]
+    save_splats_ply(tmp_path / "splats.ply", surfels, cameras=cameras)
+    for view in scene.test:
+        camera = resized(view.camera, 4 * view.camera.width, 4 * view.camera.height).to("cuda")
+        with torch.no_grad():
+            mine = nw.render(surfels, None, camera).image
+        theirs = draw(tmp_path / "splats.ply", camera, (0.0, 0.0, 0.0))
+        found = float(psnr(to_uint8(theirs), to_uint8(mine)))
+        record_property(f"psnr of {view.name}", found)
+        assert found >= 35.0, view.name
+
+
+# Bad files
+
+
+def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene(4))
+    save_surfels_ply(tmp_path / "good.ply", surfels)
+    good = (tmp_path / "good.ply").read_bytes()
+    save_splats_ply(tmp_path / "splats.ply", surfels)
+    nan = good.index(b"end_header\n") + len(b"end_header\n")
+    bad = {
+        "empty": (b"", "expected a PLY file written by nexwarp"),
+        "text": (b"ply\nbut then something else", "expected a PLY file written by nexwarp"),
+        "short": (good[:-1], f"expected {len(good)} bytes, got {len(good) - 1}"),
+        "long": (good + b"x", "expected"),
+        "ascii": (good.replace(b"binary_little_endian", b"ascii"), r"expected binary_little_endian 1\.0, got ascii"),
+        "faces": (good.replace(b"element vertex", b"element face"), "expected vertices, got element face"),
+        "count": (good.replace(b"vertex 4", b"vertex -4"), "expected a number of vertices, got -4"),
+        "many": (good.replace(b"vertex 4", b"vertex 999999999999"), "expected a number of vertices"),
+        "mixed": (good.replace(b"float x", b"uchar x"), "expected properties of one floating type, got float, uchar"),
+        "list": (good.replace(b"float x", b"list uchar int x"), "expected vertices only, with one value per property"),
+        "twice": (good.replace(b"float y", b"float x"), "expected the header of nexwarp surfels"),
+        "other": (
+            (tmp_path / "splats.ply").read_bytes(),
+            "expected the properties of nexwarp surfels, found no gamma_0",
+        ),
+        "nan": (
+            good[:nan] + b"\x00\x00\xc0\x7f" + good[nan + 4 :],
+            r"surfels.means: expected values from .*, got nan at index",
+        ),
+    }
+    for name, (content, message) in bad.items():
+        path = tmp_path / f"{name}.ply"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message) as caught:
+            load_surfels_ply(path)
+        assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value), name
+    with pytest.raises(FileNotFoundError, match=r"no\.ply: no such file, expected surfels as PLY"):
+        load_surfels_ply(tmp_path / "no.ply")
+
+
+def test_what_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    surfels = make_surfels(random_scene(4))
+    (tmp_path / "file").touch()
+    for save in (save_surfels_ply, save_splats_ply):
+        with pytest.raises(OSError, match="file"):
+            save(tmp_path / "file" / "a.ply", surfels)
+    with pytest.raises(ValueError, match="sh_degree: expected at least 0 and at most 3, got 4"):
+        save_splats_ply(tmp_path / "a.ply", surfels, 4)
+    assert [f.name for f in tmp_path.iterdir()] == ["file"]

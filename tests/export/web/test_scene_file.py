@@ -1,0 +1,213 @@
+"""Scene files: what comes back, how large they are, and what damaged ones say."""
+
+import dataclasses
+import json
+import struct
+import zlib
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nexwarp as nw
+from nexwarp.export.web.quantise import (
+    CHUNK,
+    decode_chunks,
+    decode_limits,
+    decode_quats,
+    encode_chunks,
+    encode_limits,
+    encode_quats,
+    morton_order,
+)
+from nexwarp.export.web.scene_data import SceneData
+from nexwarp.export.web.scene_file import encode_scene
+from nexwarp.export.web.scene_reader import decode_scene, load_scene_file, read_header
+from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.options import RenderOptions
+from tests.export.web.support import named_cameras, web_model
+
+
+@cache
+def content_of(quality: str = "quantised") -> bytes:
+    model, camera = web_model()
+    return encode_scene(model, named_cameras(camera), quality=quality, title="a & b", poster=b"picture")
+
+
+def test_a_full_file_returns_every_bit():
+    model, _ = web_model()
+    expected, actual = SceneData.of(model), decode_scene(content_of("full"))
+    for field in dataclasses.fields(SceneData):
+        if isinstance(value := getattr(expected, field.name), np.ndarray):
+            np.testing.assert_array_equal(getattr(actual, field.name), value)
+    assert actual.options == expected.options
+    assert actual.texture is not None and expected.texture is not None
+    np.testing.assert_array_equal(actual.texture.grid, expected.texture.grid)
+    np.testing.assert_array_equal(actual.texture.resolutions, expected.texture.resolutions)
+    for one, other in zip(actual.texture.matrices, expected.texture.matrices, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert actual.exposures is not None and expected.exposures is not None
+    np.testing.assert_array_equal(actual.exposures.poses, expected.exposures.poses)
+
+
+def test_the_exposures_are_those_of_the_model():
+    model, camera = web_model()
+    exposures = decode_scene(content_of()).exposures
+    assert exposures is not None and model.exposures is not None
+    np.testing.assert_allclose(
+        exposures.gains(camera.viewmat.double().numpy()), model.exposures.gains(camera).numpy(), rtol=1e-5
+    )
+
+
+def test_values_in_chunks_return_within_half_a_step():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((3 * CHUNK + 7, 2)) * [1.0, 1e3]
+    values[CHUNK : 2 * CHUNK] = 5.0  # a chunk of one value
+    for dtype in (np.uint8, np.uint16):
+        codes, ranges = encode_chunks(values, dtype)
+        steps = np.repeat(ranges[..., 1], CHUNK, axis=0)[: len(values)]
+        rounding = 2e-7 * np.abs(values).max(0)
+        assert (np.abs(decode_chunks(codes, ranges) - values) <= 0.5 * steps * 1.001 + 2 * rounding).all()
+
+
+def test_rotations_return_the_same_surfel():
+    rng = np.random.default_rng(1)
+    quats = rng.standard_normal((2000, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    code, swapped = encode_quats(quats)
+    expected, actual = (_axes(x) for x in (quats, decode_quats(code).astype(np.float64)))
+    u, v = np.where(swapped[:, None, None], expected[:, [1, 0]], expected[:, :2]).transpose(1, 0, 2)
+    for axis, wanted in ((actual[:, 0], u), (actual[:, 1], v), (actual[:, 2], expected[:, 2])):
+        # Axes are lines: the surfel is the same with an axis reversed.
+        angles = np.arccos(np.clip(np.abs((axis * wanted).sum(1)), 0, 1))
+        assert angles.max() < 2e-3
+    assert 0.2 < swapped.mean() < 0.8
+
+
+def _axes(quats: np.ndarray) -> np.ndarray:
+    """The axes of rotations, (N, 3 axes, 3)."""
+    w, x, y, z = quats.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def test_detail_limits_keep_their_ends():
+    limits = np.array([[0.0, NEVER], [1e-3, 2.0], [0.5, 1e30]], np.float32)
+    codes, scale = encode_limits(limits)
+    np.testing.assert_allclose(decode_limits(codes, scale), limits, rtol=1e-3)
+    assert decode_limits(codes, scale)[0, 0] == 0 and decode_limits(codes, scale)[0, 1] == np.float32(NEVER)
+
+
+def test_the_morton_order_is_a_permutation_of_neighbours():
+    means = np.random.default_rng(2).uniform(size=(4096, 3))
+    order = morton_order(means)
+    assert sorted(order.tolist()) == list(range(4096))
+    extents = [np.ptp(means[order[i : i + CHUNK]], axis=0).max() for i in range(0, 4096, CHUNK)]
+    assert np.median(extents) < 0.6
+
+
+@pytest.mark.parametrize("quality", ["full", "quantised"])
+def test_an_empty_scene(quality):
+    model, camera = web_model(1)
+    empty = {name: value[:0] for name, value in model.surfels.state_dict().items()}
+    scene = decode_scene(encode_scene(nw.Model(nw.Surfels(empty), None), {"a": camera}, quality=quality))
+    assert len(scene) == 0 and scene.texture is None
+
+
+def test_the_size_follows_from_the_shape():
+    """Fox at 40,000 surfels: at most 6 MB, uncompressed parts added up; the demo's: at most 1 MB compressed."""
+    surfel = 3 * 2 + 4 + 2 * 2 + 1 + 2 + 2 * 2 + 48 + (7 + 4) * 8 / CHUNK
+    grid, mlp = 8 * 2**16 * 4, 2 * (32 * 64 + 64 * 64 + 64 * 48)
+    assert 40_000 * surfel + grid + mlp < 6e6
+
+
+def test_numbers_of_the_header_are_those_of_the_scene():
+    model, camera = web_model(options=RenderOptions(max_hits=3, sh_degree=2))
+    header, _ = read_header(encode_scene(model, named_cameras(camera), title="a & b", poster=b"picture"))
+    assert header["surfels"] == 60 and header["title"] == "a & b"
+    cameras = header["cameras"]
+    assert isinstance(cameras, list) and [entry["name"] for entry in cameras] == ["a.png", "b.png"]
+    np.testing.assert_allclose(cameras[0]["viewmat"], camera.viewmat.double().flatten().numpy(), rtol=1e-8)
+    assert cameras[1]["width"] == 20 and cameras[1]["K"][2] == pytest.approx(camera.cx - 2)
+    sections = header["sections"]
+    assert isinstance(sections, list)
+    names = [entry["name"] for entry in sections]
+    assert names[0] == "poster" and names[-1] == "grid" and names.index("sh") < names.index("mlp")
+    assert all(entry["offset"] % 8 == 0 for entry in sections)
+
+
+@cache
+def damaged() -> dict[str, bytes]:
+    """Files that are none, by what is wrong with them."""
+    content = content_of()
+    length = struct.unpack_from("<I", content, 12)[0]
+    header = json.loads(content[16 : 16 + length])
+
+    def changed(**values: object) -> bytes:
+        text = json.dumps({**header, **values}).encode()
+        return content[:12] + struct.pack("<I", len(text)) + text + content[16 + length :]
+
+    def entry(name: str, **values: object) -> bytes:
+        return changed(sections=[{**e, **values} if e["name"] == name else e for e in header["sections"]])
+
+    texture, options = header["texture"], header["options"]
+    large = [{**e, "shape": [3, 2**30, 2]} if e["name"] == "grid" else e for e in header["sections"]]
+    huge = changed(texture={**texture, "table_size": 2**30}, sections=large)
+    sh = next(e for e in header["sections"] if e["name"] == "sh")
+    bomb = zlib.compress(bytes(50_000_000))
+    begin = 16 + length + sh["offset"]
+    bombed = content[:begin] + bomb[: sh["bytes"]].ljust(sh["bytes"], b"\0") + content[begin + sh["bytes"] :]
+    return {
+        "empty": b"",
+        "another file": b"\x89PNG\r\n\x1a\n" + bytes(100),
+        "newer version": content[:8] + struct.pack("<I", 2) + content[12:],
+        "endless header": content[:12] + struct.pack("<I", 2**32 - 1) + content[16:],
+        "no JSON": content[:16] + b"x" * length + content[16 + length :],
+        "a list": content[:12] + struct.pack("<I", 2) + b"[]" + content[16 + length :],
+        "ends in the header": content[: 16 + length // 2],
+        "ends in the geometry": content[: 16 + length + 200],
+        "ends in the grid": content[:-8],
+        "many surfels": changed(surfels=2**24),
+        "too many surfels": changed(surfels=2**40),
+        "no number of surfels": changed(surfels="60"),
+        "half a surfel": changed(surfels=0.5),
+        "other SH": changed(sh_coefficients=7),
+        "a table of any size": changed(texture={**texture, "table_size": 2**26}),
+        "a grid of 8 GB": huge,
+        "endless levels": changed(texture={**texture, "levels": 10**9}),
+        "K of 100": changed(options={**options, "max_hits": 100}),
+        "no options": changed(options=None),
+        "no sections": changed(sections=[]),
+        "sections of nothing": changed(sections=[None]),
+        "other type": entry("means", dtype="f32"),
+        "other shape": entry("means", shape=[60, 3]),
+        "behind the end": entry("grid", offset=10**12),
+        "before the start": entry("means", offset=-8),
+        "other encoding": entry("means", encoding="brotli"),
+        "more than it has": entry("grid", bytes=10**9),
+        "a bomb": bombed,
+        "other quality": changed(quality="best"),
+    }
+
+
+@pytest.mark.parametrize("name", list(damaged()))
+def test_a_damaged_file_gives_one_line(name, tmp_path: Path):
+    file = tmp_path / "scene.nxw"
+    file.write_bytes(damaged()[name])
+    with pytest.raises(ValueError) as caught:
+        load_scene_file(file)
+    message = str(caught.value)
+    assert message.startswith(f"{file}: expected") and "\n" not in message and message.isprintable()
+
+
+def test_a_missing_file_and_a_wrong_quality_are_named(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="expected a scene file"):
+        load_scene_file(tmp_path / "none.nxw")
+    model, camera = web_model(3)
+    with pytest.raises(ValueError, match="--quality: expected quantised or full, got 'best'"):
+        encode_scene(model, {"a": camera}, quality="best")

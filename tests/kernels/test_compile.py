@@ -1,0 +1,31 @@
+"""Kernels compile for CUDA without a GPU, for NVRTC comes with Warp (CI has no GPU).
+
+For sm_90 most of them; for sm_80 those whose atomics differ from sm_90's; all of them for both with `-m slow`.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arch", "choice", "least"),
+    [
+        (80, "atomic", 6),
+        (90, "usual", 100),
+        *(pytest.param(arch, "all", 150, marks=pytest.mark.slow) for arch in (80, 90)),
+    ],
+)
+def test_kernels_compile_for_cuda(arch: int, choice: str, least: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    sizes = json.loads(done.stdout.splitlines()[-1])
+    assert len(sizes) >= least
+    assert all(size > 1000 for size in sizes.values()), "a kernel left no machine code"

@@ -1,0 +1,503 @@
+"""Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
+
+import copy
+import dataclasses
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks.exposures import compare
+from nexwarp.cameras.camera import Camera
+from nexwarp.data import Scene, View, write_demo
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model import exposures
+from nexwarp.model.buffers import load_buffers, render_buffers, save_buffers
+from nexwarp.model.exposures import EVEN, Exposures
+from nexwarp.model.model import Model
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train import exposure_calibration
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.exposure_calibration import (
+    PRIOR,
+    CalibrateOnce,
+    ExposureCalibration,
+    SharedPoints,
+    calibrate_exposures,
+    choose_fit,
+    fit_exposures,
+    observations,
+    photo_gains,
+)
+from nexwarp.train.losses import LossWeights
+from nexwarp.train.step_losses import as_taken, step_losses
+from nexwarp.train.target import Target
+from nexwarp.train.trainer import Trainer
+from nexwarp.train.views import TrainingViews, mean_color
+from tests.exposed import exposure_at, with_exposures
+from tests.narrowing import present
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+
+K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
+
+
+def looking(x: float, turn: float = 0.0) -> Camera:
+    """A camera at (x, 0, 0), turned about y."""
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float32)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ torch.tensor([float(x), 0.0, 0.0])
+    return Camera(viewmat, K, 64, 48)
+
+
+def light(camera: Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> torch.Tensor:
+    """What a lens leaves of the light at pixel coordinates (N, 2), its powers being of tan^2."""
+    tangents = (pixels - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
+    t = tangents.square().sum(1, keepdim=True)
+    return (lens[0] * t + lens[1] * t**2).exp()
+
+
+def photographs(
+    log_gains: torch.Tensor, outliers: float = 0.0, lens: tuple[float, float] = (0.0, 0.0)
+) -> tuple[list[Camera], list[torch.Tensor], list[torch.Tensor]]:
+    """Photos of coloured points, each a pixel, with gains, through a lens; some pixels are of something else."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(900, 3, generator=generator) * torch.tensor([3.0, 1.6, 1.0]) + torch.tensor([-1.5, -0.8, 2.2])
+    colors = 0.2 + 0.4 * torch.rand(900, 3, generator=generator)
+    cameras, photos, seen = [], [], []
+    for index, gains in enumerate(log_gains.exp().float()):
+        camera = looking(0.1 * index)
+        pixels, depths = camera.project(points)
+        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([64.0, 48.0])).all(1)
+        column, row = pixels[inside].long().unbind(1)
+        # One point a pixel, or a point's colour would be another's.
+        _, first = np.unique((row * 64 + column).numpy(), return_index=True)
+        kept = inside.nonzero()[:, 0][torch.from_numpy(first)]
+        photo = torch.zeros(48, 64, 3, dtype=torch.uint8)
+        color = colors[kept] * gains * light(camera, pixels[kept], lens)
+        wrong = torch.rand(len(kept), generator=generator) < outliers
+        color[wrong] = torch.rand(int(wrong.sum()), 3, generator=generator)
+        photo[row[torch.from_numpy(first)], column[torch.from_numpy(first)]] = to_uint8(color[None])[0]
+        cameras.append(camera)
+        photos.append(photo)
+        seen.append(points[kept])
+    return cameras, photos, seen
+
+
+def test_gains_are_found_up_to_their_mean():
+    expected = 0.3 * torch.randn(7, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    expected -= expected.mean(0)
+    for outliers, bound in ((0.0, 0.01), (0.2, 0.02)):
+        found, falloff = photo_gains(*photographs(expected, outliers))
+        assert abs(falloff[0]) + abs(falloff[1]) < 0.03  # the lens is even
+        assert abs(found.mean(0)).max() < 1e-6
+        assert abs(found - expected.numpy()).max() < bound
+
+
+def test_gains_do_not_depend_on_the_order_of_photos_or_points():
+    cameras, photos, points = photographs(torch.tensor([[0.2, 0.1, 0.0], [-0.3, 0.0, 0.1], [0.1, -0.1, -0.1]]))
+    found, falloff = photo_gains(cameras, photos, points)
+    order = [2, 0, 1]
+    shuffled = [points[i].flip(0) for i in order]
+    again, same = photo_gains([cameras[i] for i in order], [photos[i] for i in order], shuffled)
+    np.testing.assert_allclose(again, found[order], atol=2e-6)
+    np.testing.assert_allclose(same, falloff, atol=2e-6)
+
+
+@pytest.mark.parametrize("lens", [(-0.5, 0.0), (-0.1, -1.0), (0.3, -1.8)])
+def test_the_falloff_of_the_lens_is_found(lens):
+    """With gains and outliers beside it; as a function, since its two powers are alike."""
+    gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    gains -= gains.mean(0)
+    cameras, photos, points = photographs(gains, 0.1, lens)
+    found, falloff = photo_gains(cameras, photos, points)
+    assert abs(found - gains.numpy()).max() < 0.03
+    camera = cameras[0]
+    exposures = Exposures.of(torch.from_numpy(found), cameras, falloff)
+    row, column = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
+    assert expected.min() < 0.85
+    assert (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
+
+
+def test_exposures_can_be_pickled_and_loaded_into():
+    """As `torch.save` of a model and a process that is spawned do; a copy reads the falloff that it loads."""
+    cameras = [looking(0.0), looking(1.0)]
+    exposures = Exposures.of(torch.tensor([[0.1] * 3, [-0.1] * 3]), cameras, (-0.2, -0.1, 0.25))
+    copied = pickle.loads(pickle.dumps(exposures))
+    assert torch.equal(copied.gains(cameras[1]), exposures.gains(cameras[1]))
+    copied.load_state_dict(Exposures.of(torch.zeros(2, 3), cameras, (-0.3, -0.2, 0.4)).state_dict())
+    assert copied.lens == pytest.approx((-0.3, -0.2, 0.4))
+
+
+def test_the_falloff_is_the_angle_s():
+    """A window sees what the whole does there, and so does a camera of twice the pixels; beyond all points it ends."""
+    cameras = [looking(0.0), looking(1.0)]
+    exposures = Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.25))
+    whole = present(exposures.falloff_of(cameras[0]))
+    assert whole.shape == (48, 64, 1) and whole.max() > 0.999
+    torch.testing.assert_close(present(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30))), whole[5:35, 10:30])
+    K2 = K * torch.tensor([[3.0], [3.0], [1.0]])
+    fine = present(exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144)))
+    torch.testing.assert_close(fine[1::3, 1::3], whole)
+    wide = present(exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000)))
+    assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
+    assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
+    assert exposures.falloff_of(cameras[1]) is whole  # made once
+    for left in range(50):
+        exposures.falloff_of(cameras[0].crop(left, 0, 20, 30))
+    assert torch.equal(present(exposures.falloff_of(cameras[0])), whole)
+    with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
+        Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
+
+
+def test_known_gains_are_found_beside_saturated_skies():
+    """To 2 %, though a third of each photo's points is clipped in the brighter photos; the points' colours too."""
+    gains = torch.linspace(-0.5, 0.5, 11)[:, None].expand(11, 3).double()
+    cameras, photos, points = photographs(gains)
+    sky = [torch.where((p > 0) & (torch.arange(48)[:, None, None] < 16), (p * 2.0).clamp(max=255), p) for p in photos]
+    seen = observations(cameras, [p.to(torch.uint8) for p in sky], points, None)
+    fit = present(choose_fit(seen, cameras))
+    assert np.abs(np.exp(fit.gains - gains.numpy()) - 1).max() < 0.02 and (fit.lens == 0).all()
+
+
+def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
+    """The demo, and points that are shaded by what lies around them, which looks like gains on one side alone."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=160, height=120, views=20, points=1500))
+    assert calibrate_exposures(scene, Config()) is None
+    cameras, photos, points = photographs(torch.zeros(8, 3))
+    even = observations(cameras, photos, points, None)
+    assert choose_fit(even, cameras) is None
+    side = np.where(even.places[even.point, 1] < 0.1, 1.0, -1.0)
+    shaded = even._replace(color=even.color + 0.1 * (side * np.linspace(-1, 1, 8)[even.view])[:, None])
+    assert abs(fit_exposures(shaded, cameras, vignetting=False).gains).max() > 0.02
+    assert choose_fit(shaded, cameras) is None
+
+
+def test_a_single_point_tells_no_exposures():
+    """It cannot be cut in two."""
+    cameras, photos, points = photographs(torch.linspace(-0.3, 0.3, 5)[:, None].expand(5, 3).double())
+    shared = set.intersection(*({tuple(place) for place in seen.tolist()} for seen in points))
+    chosen = torch.tensor(sorted(shared)[:1])
+    seen = observations(cameras, photos, [chosen] * 5, None)
+    assert len(seen.view) == 5 and choose_fit(seen, cameras) is None
+
+
+def test_the_falloff_has_a_gate_of_its_own():
+    gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
+    for lens, expected in (((0.0, 0.0), False), ((-0.5, 0.0), True)):
+        cameras, photos, points = photographs(gains, 0.1, lens)
+        seen = observations(cameras, photos, points, None)
+        assert (present(choose_fit(seen, cameras)).lens != 0).any() == expected
+
+
+def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
+    """Those of the scene without exposures, whatever the exposures of the photos; a point in no photo keeps its own."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
+    exposed = with_exposures(scene)
+    far = torch.tensor([[1e3, 0.0, 0.0]])
+    exposed = dataclasses.replace(
+        exposed,
+        points=torch.cat([exposed.points, far]),
+        colors=torch.cat([torch.zeros_like(exposed.colors), torch.tensor([[7, 8, 9]], dtype=torch.uint8)]),
+    )
+    colors = present(calibrate_exposures(exposed, Config())).colors
+    torch.testing.assert_close(colors[-1], torch.tensor([7.0, 8.0, 9.0]) / 255)
+    shown = (colors[:-1] > 0).any(1)
+    assert shown.float().mean() > 0.5
+    mean = float(np.exp(np.mean([np.log(exposure_at(view)) for view in scene.train])))
+    ratio = colors[:-1][shown] / (mean * scene.colors[shown] / 255).clamp_min(0.05)
+    assert ratio.median().item() == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("most_dense", [0, 7])
+def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, most_dense):
+    """Also where a photo shows a point twice, or none; by a sparse and by a dense matrix of the photos."""
+    monkeypatch.setattr(exposure_calibration, "MOST_DENSE", most_dense)
+    random = np.random.default_rng(4)
+    photos, points, count = 7, 30, 150
+    view, point = random.integers(0, photos - 1, count), random.integers(0, points, count)
+    observed, weights = random.normal(size=count), random.uniform(0.1, 1.0, count)
+    design = np.zeros((count, photos + points))
+    design[np.arange(count), view] = design[np.arange(count), photos + point] = 1.0
+    root = np.sqrt(weights)
+    prior = np.sqrt(PRIOR) * np.eye(photos, photos + points)
+    together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
+    expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
+    shared = SharedPoints(view, point, photos)
+    for scale in (1.0, 3.0):  # the second problem of the same points leaves nothing of the first
+        found = shared.solve_gains(scale * observed, weights)
+        np.testing.assert_allclose(found, scale * (expected - expected.mean()), rtol=0, atol=1e-10)
+
+
+def test_trainings_of_a_run_share_one_calibration(tmp_path, monkeypatch):
+    """Each has a copy of its own, whatever the one before does with its exposures."""
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
+    results = [present(calibrate_exposures(scene, Config()))]
+    expected = copy.deepcopy(results[0])
+    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", lambda *_: results.pop())
+    calibrate = CalibrateOnce()
+    for seed in range(3):
+        found = present(calibrate(scene, Config(seed=seed)))
+        assert torch.equal(found.gains, expected.gains) and torch.equal(found.colors, expected.colors)
+        state = found.exposures.state_dict()
+        assert all(torch.equal(state[name], x) for name, x in expected.exposures.state_dict().items())
+        for value in (found.gains, found.colors, *state.values()):
+            value.zero_()
+
+
+def test_that_photos_have_one_exposure_is_kept_too(tiny_scene, monkeypatch):
+    results = [None]
+    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", lambda *_: results.pop())
+    calibrate = CalibrateOnce()
+    assert [calibrate(tiny_scene, Config(seed=seed)) for seed in range(3)] == [None] * 3
+
+
+def test_photos_that_share_nothing_keep_their_colours():
+    cameras, photos, points = photographs(torch.tensor([[0.2] * 3, [-0.2] * 3]))
+    nothing = [points[0][:0]] * 2
+    found, falloff = photo_gains(cameras, photos, nothing)
+    assert (found == 0).all() and falloff == EVEN
+    apart = [points[0][:100], points[1] + 1e-3]  # no point twice
+    assert abs(photo_gains(cameras, photos, apart)[0]).max() < 1e-6
+    white = [torch.full_like(photo, 255) for photo in photos]
+    assert (photo_gains(cameras, white, points)[0] == 0).all()
+
+
+def test_what_masks_leave_out_tells_nothing():
+    """A shade over the middle of one photo, in which most of its points lie, is masked."""
+    cameras, photos, points = photographs(torch.zeros(4, 3))
+    shade = torch.ones(48, 64, dtype=torch.bool)
+    shade[4:44, 4:60] = False
+    photos[1] = torch.where(shade[..., None], photos[1], photos[1] // 2)
+    assert abs(photo_gains(cameras, photos, points)[0]).max() > 0.1
+    assert abs(photo_gains(cameras, photos, points, [None, shade, None, None])[0]).max() < 0.01
+
+
+def test_a_camera_gets_the_gains_around_it():
+    cameras = [looking(x) for x in np.linspace(0, 6, 25)]
+    course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])
+    exposures = Exposures.of(course, cameras)
+    there = torch.stack([exposures.gains(camera).log() for camera in cameras])
+    assert (there - course).abs().max() < 0.01
+    low, high = course.min(0).values, course.max(0).values
+    for x in np.linspace(0.1, 5.9, 50):  # between the photos, too
+        expected = 0.3 * np.sin(x) * torch.tensor([1.0, 0.5, -1.0])
+        assert (exposures.gains(looking(x)).log() - expected).abs().max() < 0.01, x
+    for x in np.linspace(-20, 30, 50):
+        gains = exposures.gains(looking(x)).log()
+        assert (gains >= low - 1e-6).all() and (gains <= high + 1e-6).all()
+    far = exposures.gains(looking(1e6)).log()
+    torch.testing.assert_close(far, exposures.mean, atol=1e-6, rtol=0)
+    assert (far - course.mean(0)).abs().max() < 0.3
+
+
+def test_gains_that_nothing_predicts_are_smoothed():
+    """Each photo's own: the process does not follow what its neighbours do not share."""
+    noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    cameras = [looking(x) for x in np.linspace(0, 4, 40)]
+    exposures = Exposures.of(noise, cameras)
+    between = torch.stack([exposures.gains(looking(x)).log() for x in np.linspace(0.05, 3.95, 39)])
+    assert between.std() < 0.6 * noise.std()
+
+
+def test_many_photos_are_thinned():
+    cameras = [looking(x) for x in np.linspace(0, 4, 2100)]
+    course = torch.linspace(-0.3, 0.3, 2100)[:, None].expand(2100, 3)
+    exposures = Exposures.of(course, cameras)
+    assert len(exposures.log_gains) == 700
+    torch.testing.assert_close(exposures.gains(cameras[1000]).log(), course[1000], atol=0.005, rtol=0)
+
+
+def test_directions_count_as_positions_do():
+    cameras = [looking(0.0, turn) for turn in (-0.4, 0.0, 0.4)] + [looking(3.0)]
+    exposures = Exposures.of(torch.tensor([[0.3] * 3, [0.0] * 3, [-0.3] * 3, [0.1] * 3]), cameras)
+    left, right = (exposures.gains(looking(0.0, turn)).log()[0] for turn in (-0.39, 0.39))
+    assert left > right + 0.1
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_cameras_in_one_place(count):
+    exposures = Exposures.of(torch.full((count, 3), 0.2), [looking(0.0)] * count)
+    torch.testing.assert_close(exposures.gains(looking(1.0)).log(), torch.full((3,), 0.2))
+
+
+def test_gains_follow_a_scene_that_is_moved_and_scaled():
+    cameras = [looking(x, 0.1 * x) for x in (0.0, 0.7, 1.0, 2.5)]
+    log_gains = torch.randn(4, 3, generator=torch.Generator().manual_seed(1)) * 0.2
+    query = looking(0.8, 0.3)
+
+    def changed(camera: Camera) -> Camera:
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] = 100 * viewmat[:3, 3] - viewmat[:3, :3] @ torch.tensor([5.0, 6.0, 7.0])
+        return Camera(viewmat, K, 64, 48)
+
+    before = Exposures.of(log_gains, cameras).gains(query)
+    after = Exposures.of(log_gains, [changed(camera) for camera in cameras]).gains(changed(query))
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("falloff", [None, (-0.3, -0.2, 0.4)])
+def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff):
+    scene = random_scene(40, device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+    options = nw.RenderOptions(background=(0.2, 0.5, 0.9))
+    plain = nw.render(surfels, texture, camera, background=options.background)
+    cameras = [camera, Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
+    photos = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
+    gains = photos.gains(camera)
+    if falloff is not None:
+        gains = gains * present(photos.falloff_of(camera))
+        assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
+    out = nw.render(surfels, texture, camera, background=options.background, exposures=photos)
+    for name in ("image", "plain", "textured"):
+        assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
+    for name in ("alpha", "weights", "depths"):
+        assert torch.equal(getattr(out, name), getattr(plain, name))
+    save_buffers(tmp_path / "a.exr", render_buffers(nw.Model(surfels, texture, photos, options=options), camera))
+    buffers = load_buffers(tmp_path / "a.exr")
+    assert_close(buffers.image, out.image, kind="value", name="image of the buffers")
+    total = buffers.plain + buffers.textured + (1 - buffers.alpha)[..., None] * buffers.background
+    assert_close(total, buffers.image, kind="value", name="sum")
+    slots = (buffers.weights[..., None] * buffers.colors).sum(2)
+    assert_close(slots, buffers.textured, kind="value", name="sum over the slots")
+
+
+def test_renderings_are_brought_to_the_photo_s_exposure():
+    """Photos stay as they are; their exposures are those of the reduced camera where photos are reduced."""
+    camera = looking(0.0)
+    image = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    views = [View(camera, image, None, name) for name in "ab"]
+    gains = torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0]])
+    plain = TrainingViews(views, torch.device("cpu"))
+    mine = TrainingViews(views, torch.device("cpu"), gains)
+    assert plain.exposure(0, 1) is None and torch.equal(present(mine.exposure(0, 1)), gains[0])
+    assert torch.equal(mine.get(0, 1)[1], image / 255.0)
+    lens = Exposures.of(gains.log(), [camera, camera], (-0.3, -0.2, 0.4))
+    dark = TrainingViews(views, torch.device("cpu"), gains, lens)
+    small, photo = dark.get(0, 2)
+    torch.testing.assert_close(photo, (image / 255.0).view(24, 2, 32, 2, 3).mean((1, 3)))
+    torch.testing.assert_close(present(dark.exposure(0, 2)), gains[0] * present(lens.falloff_of(small)))
+
+
+def test_brighter_than_a_saturated_pixel_is_no_error():
+    """Photos of one surface, two of them clipped: losses and gradients are 0 for its true colour."""
+    scene = random_scene()
+    camera, surfels = make_camera(scene), make_surfels(scene)
+    out = nw.render(surfels, make_texture(), camera)
+    image = torch.full_like(out.image, 0.8).requires_grad_()
+    textured = 0.8 * out.weights.sum(-1, keepdim=True).detach().expand_as(image)
+    for gain in (1.0, 1.5, 3.0):
+        photo = torch.full_like(image, 0.8 * gain).clamp(max=1.0)
+        target = Target(camera, photo, 0.0, torch.tensor([gain] * 3))
+        taken = as_taken(dataclasses.replace(out, image=image, textured=textured), target)
+        losses = step_losses(taken, target, surfels, make_texture(), Config(losses=LossWeights(alpha=0.0)))
+        assert losses["l1"] < 1e-6 and losses["dssim"] < 1e-4
+        if gain > 1:
+            (gradient,) = torch.autograd.grad(losses["l1"] + losses["dssim"], image)
+            assert (gradient == 0).all()
+        darker = as_taken(dataclasses.replace(out, image=0.3 * image), target)
+        (gradient,) = torch.autograd.grad((darker.image - photo).abs().mean(), image)
+        assert (gradient < 0).all()  # too dark: it is pulled up
+    assert as_taken(out, Target(camera, out.image.detach(), 0.0)) is out
+
+
+def test_the_mean_colour_is_that_of_the_mean_exposure():
+    cameras, generator = [looking(0.1 * i) for i in range(4)], torch.Generator().manual_seed(0)
+    gains = torch.tensor([[0.5], [0.8], [1.25], [2.0]]).expand(4, 3)
+    exposures_ = Exposures.of(gains.log(), cameras, (-0.3, -0.2, 0.4))
+    scene = 0.1 + 0.2 * torch.rand(48, 64, 3, generator=generator)
+    light = present(exposures_.falloff_of(cameras[0]))
+    views = [View(c, to_uint8(scene * g * light), None, "") for c, g in zip(cameras, gains, strict=True)]
+    calibration = ExposureCalibration(exposures_, gains, torch.zeros(0, 3))
+    assert mean_color(views, calibration) == pytest.approx(scene.mean((0, 1)).tolist(), abs=2e-3)
+
+
+def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
+    """A small training with some settings changed, and the PSNR of its test views."""
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    trainer = Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
+    trainer.run()
+    model = trainer.finish()
+    return model, evaluate(model, scene.test)["psnr"]
+
+
+def test_training_takes_exposures_out(tmp_path):
+    """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
+    expected = torch.tensor([exposure_at(view) for view in scene.train]).log()
+    expected -= expected.mean()
+    _, without = trained(scene, exposures=False)
+    model, figure = trained(scene, exposures=True)
+    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03
+    assert figure > without + 0.5
+
+
+def test_training_takes_vignetting_out(tmp_path):
+    """Photos through a lens that leaves 60 % of the light in the corners."""
+    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
+    cameras = [view.camera for view in scene.train]
+    corner = max(((c.width / 2 / c.fx) ** 2 + (c.height / 2 / c.fy) ** 2) for c in cameras)
+    lens = Exposures.of(torch.zeros(len(cameras), 3), cameras, (0.0, float(np.log(0.6)), corner))
+
+    def dark(views: list[View]) -> list[View]:
+        falloffs = [present(lens.falloff_of(view.camera)) for view in views]
+        darker = [to_uint8(view.image / 255 * falloff) for view, falloff in zip(views, falloffs, strict=True)]
+        return [dataclasses.replace(view, image=image) for view, image in zip(views, darker, strict=True)]
+
+    scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
+    camera = scene.test[0].camera
+    even, without = trained(scene, exposures=False)
+    assert even.exposures is None
+    model, figure = trained(scene)
+    found = present(present(model.exposures).falloff_of(camera))
+    assert (found - present(lens.falloff_of(camera))).abs().max() < 0.08
+    assert figure > without + 0.2
+
+
+def test_each_of_many_photos_has_its_own_gains(tmp_path, monkeypatch):
+    """Renderings take theirs from some of the photos; training takes out what each has."""
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60)))
+    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
+    config = Config(iterations=20, max_surfels=40, texture=texture)
+    expected = present(Trainer(scene, config, "cpu").views.gains)
+    monkeypatch.setattr(exposures, "MOST_PHOTOS", 4)
+    trainer = Trainer(scene, config, "cpu")
+    assert len(present(trainer.exposures).log_gains) <= 4 < len(scene.train)
+    assert torch.equal(present(trainer.views.gains), expected) and expected.shape == (len(scene.train), 3)
+    trainer.run()
+
+
+@pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
+def test_no_exposures_where_none_are_wanted(tmp_path, change):
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60)))
+    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
+    config = Config(iterations=2, max_surfels=40, texture=texture, **change)
+    assert Trainer(scene, config, "cpu").finish().exposures is None
+    # A background that is known is no photo's business.
+    known = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
+    plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
+    assert Trainer(known, plain, "cpu").finish().exposures is None
+    assert Trainer(scene, plain, "cpu").finish().exposures is not None
+
+
+def test_the_benchmark_tells_spread_and_errors():
+    """Gains that follow the camera's position are predicted; the test views' own are those that were put in."""
+    course = 0.2 * torch.sin(torch.linspace(0, 3, 16))[:, None].expand(16, 3)
+    cameras, photos, points = photographs(course)
+    views = [View(c, p, None, f"{i}", None, x) for i, (c, p, x) in enumerate(zip(cameras, photos, points, strict=True))]
+    train = [view for i, view in enumerate(views) if i % 4 != 2]
+    test = views[2::4]
+    found = compare(train, test)
+    kept = torch.stack([course[i] for i in range(16) if i % 4 != 2])
+    torch.testing.assert_close(torch.as_tensor(found["spread"]).float(), kept.std(0), atol=0.01, rtol=0)
+    expected = (course[2::4] - kept.mean(0)).square().mean().sqrt().item()
+    assert found["ignored"] == pytest.approx(expected, abs=0.01)
+    assert found["predicted"] < 0.2 * found["ignored"]
+    assert found["edge"] == pytest.approx(1.0, abs=0.03)

@@ -1,0 +1,399 @@
+"""The model: `Model.render` is what `nexwarp render` writes, rendering changes nothing, and files hold all of it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.cameras.camera import resized
+from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.cli import main as cli
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.buffers import load_buffers, render_buffers
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
+from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.train.config import Config
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_finite
+
+FIELDS = ("image", "plain", "textured", "ids", "depths", "weights", "alpha")
+LAZY = ("expected_depth", "median_depth", "top_depth", "normals")
+OPTIONS = nw.RenderOptions(max_hits=3, background=(0.2, 0.5, 0.9), sh_degree=2)
+FALLOFF = (-0.3, -0.2, 0.4)
+PARAMETERS = {"means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN"}
+
+
+def cameras_of(device: torch.device | str = "cpu") -> list[nw.Camera]:
+    """Three cameras of different places and sizes."""
+    first = make_camera(random_scene(1, device=device))
+    found = [dataclasses.replace(first, viewmat=first.viewmat.detach())]
+    for shift, (width, height) in ((0.3, (31, 18)), (-0.5, (23, 40))):
+        viewmat = found[0].viewmat.clone()
+        viewmat[0, 3] += shift
+        found.append(resized(dataclasses.replace(found[0], viewmat=viewmat), width, height))
+    return found
+
+
+def full_model(device: torch.device | str = "cpu", falloff: tuple[float, float, float] | None = FALLOFF) -> nw.Model:
+    """A model with all that a model may have; exposures, falloff and detail limits all change its pictures."""
+    surfels = make_surfels(random_scene(40, device=device))
+    cameras = cameras_of()
+    log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1]])
+    exposures = Exposures.of(log_gains, cameras, falloff).to(device)
+    generator = torch.Generator().manual_seed(5)
+    # Around the depths of 2 to 5 that the surfels have.
+    depths = 2.5 + torch.rand(2, len(surfels), generator=generator)
+    limits = DetailLimits(*(depths / cameras[0].focal * torch.tensor([[1.0], [1.2]])).to(device))
+    return nw.Model(surfels, make_texture(device=device), exposures, limits, OPTIONS, {"near": 0.01, "iteration": 7})
+
+
+def assert_same(one: nw.Rendering, other: nw.Rendering, names: tuple[str, ...] = FIELDS + LAZY) -> None:
+    for name in names:
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
+    """The rendering of a model's surfels and texture by `nexwarp.model.render`, with the given parts only."""
+    options = model.options
+    return nw.render(
+        model.surfels,
+        model.texture,
+        camera,
+        options.max_hits,
+        options.background,
+        options.sh_degree,
+        options.low_pass,
+        options.clamp_texture,
+        **parts,
+    )
+
+
+def picture(file: Path) -> torch.Tensor:
+    with Image.open(file) as image:
+        return torch.from_numpy(np.array(image))
+
+
+# What is rendered
+
+
+@pytest.mark.parametrize("saved", ["photos", "mean"])
+@pytest.mark.parametrize("flags", [[], ["--buffers"], ["--exposure", "mean"], ["--exposure", "mean", "--buffers"]])
+def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
+    """To the bit, with exposures, vignetting and detail limits, and the buffers too; by default as the model says."""
+    run, cameras = tmp_path / "run", cameras_of()
+    create_run(run, SceneSource(str(tmp_path / "scene")), Config(), "cpu")
+    full = full_model()
+    full.options = full.options.changed(exposure=saved)
+    full.save(run)
+    names = [f"{i}.png" for i in range(len(cameras))]
+    save_cameras(run / "cameras.json", {"train": {}, "test": dict(zip(names, cameras, strict=True))})
+    assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 0
+    model = nw.load(run)
+    changes: RenderChanges = {"exposure": "mean"} if "mean" in flags else {}
+    for name, camera in zip(names, cameras, strict=True):
+        with torch.no_grad():
+            out = model.render(camera, **changes)
+        assert torch.equal(picture(run / "renders" / "test" / name), to_uint8(out.image)), name
+        assert out.image.std() > 0.05
+        if "--buffers" in flags:
+            stored = load_buffers(run / "renders" / "test" / f"{Path(name).stem}.exr")
+            for field in FIELDS + LAZY:
+                assert torch.equal(getattr(stored, field), getattr(out, field)), field
+
+
+@pytest.mark.parametrize("falloff", [None, FALLOFF])
+def test_options_take_the_exposure_and_the_limits_away(
+    falloff: tuple[float, float, float] | None, device: torch.device
+) -> None:
+    model, camera = full_model(device, falloff), cameras_of(device)[0]
+    exposures, limits = model.exposures, model.detail_limits
+    assert_same(model.render(camera), pure(model, camera, exposures=exposures, detail_limits=limits))
+    assert_same(model.render(camera, exposure="mean"), pure(model, camera, detail_limits=limits))
+    assert_same(model.render(camera, detail_limits=False), pure(model, camera, exposures=exposures))
+    bare: RenderChanges = {"exposure": "mean", "detail_limits": False}
+    assert_same(model.render(camera, **bare), pure(model, camera))
+    images = [
+        model.render(camera).image,
+        model.render(camera, exposure="mean").image,
+        model.render(camera, detail_limits=False).image,
+        model.render(camera, **bare).image,
+    ]
+    for i, one in enumerate(images):
+        for other in images[i + 1 :]:
+            assert (one - other).abs().max() > 0.01
+    # As options of the model, the same.
+    model.options = model.options.changed(**bare)
+    assert torch.equal(model.render(camera).image, images[-1])
+    assert torch.equal(model.render(camera, exposure="photos", detail_limits=True).image, images[0])
+
+
+def test_the_mean_exposure_is_the_picture_without_gains(device: torch.device) -> None:
+    model, camera = full_model(device), cameras_of(device)[0]
+    assert model.exposures is not None
+    factors = model.exposures.factors(camera)
+    assert factors.shape == (camera.height, camera.width, 3) and factors.std() > 0.05
+    assert torch.equal(model.render(camera).image, model.render(camera, exposure="mean").image * factors)
+
+
+def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
+    model, camera = full_model(device), cameras_of(device)[0]
+    before = model.options
+    out = model.render(camera, max_hits=0, background=(1.0, 0.0, 0.0), sh_degree=0, low_pass=True, exposure="mean")
+    expected = nw.render(
+        model.surfels, None, camera, 0, (1.0, 0.0, 0.0), 0, low_pass=True, detail_limits=model.detail_limits
+    )
+    assert_same(out, expected)
+    assert model.options is before
+    behind = torch.tensor([1.0, 0.0, 0.0], device=device)
+    red = model.render(camera, background=behind, exposure="mean").image
+    assert torch.equal(red, model.render(camera, background=(1.0, 0.0, 0.0), exposure="mean").image)
+
+
+def test_many_cameras_are_rendered_as_one_is(device: torch.device) -> None:
+    model, cameras = full_model(device), cameras_of(device)
+    for given in (cameras, tuple(cameras)):
+        outs = model.render(given, max_hits=2)
+        assert isinstance(outs, list) and len(outs) == len(cameras)
+        for out, camera in zip(outs, cameras, strict=True):
+            assert_same(out, model.render(camera, max_hits=2))
+            assert out.image.shape == (camera.height, camera.width, 3)
+    assert model.render([]) == []
+
+
+def test_the_bare_model_is_its_surfels_alone(device: torch.device) -> None:
+    model, camera = full_model(device), cameras_of(device)[0]
+    bare = model.bare(max_hits=1)
+    assert bare.surfels is model.surfels and bare.options == OPTIONS.changed(max_hits=1)
+    assert bare.texture is bare.exposures is bare.detail_limits is None
+    assert_same(bare.render(camera), nw.render(model.surfels, None, camera, 1, OPTIONS.background, OPTIONS.sh_degree))
+
+
+def test_a_camera_elsewhere_is_brought_to_the_model(device: torch.device) -> None:
+    model = full_model(device)
+    assert_same(model.render(cameras_of()[0]), model.render(cameras_of(device)[0]))
+
+
+# What rendering leaves as it was
+
+
+def test_rendering_changes_nothing(device: torch.device) -> None:
+    """Parts, parameters and buffers stay, and the same inputs give the same bits."""
+    model, cameras = full_model(device), cameras_of(device)
+    parts = dict(vars(model)["_modules"])
+    before = {name: x.clone() for name, x in model.state_dict().items()}
+    first = model.render(cameras)
+    render_buffers(model, cameras[0])
+    model.render(cameras[1], exposure="mean", detail_limits=False, max_hits=0)
+    again = model.render(cameras)
+    for one, other in zip(first, again, strict=True):
+        assert_same(one, other)
+    assert all(vars(model)["_modules"][name] is part for name, part in parts.items())
+    assert model.options is OPTIONS and all(parameter.grad is None for parameter in model.parameters())
+    assert model.state_dict().keys() == before.keys()
+    for name, x in model.state_dict().items():
+        assert torch.equal(x, before[name]), name
+
+
+def test_surfels_hold_parameters_only() -> None:
+    model = full_model()
+    model.render(cameras_of()[0])
+    for surfels in (model.surfels, nw.Surfels(model.surfels.state_dict())):
+        assert {name for name, _ in surfels.named_parameters()} == PARAMETERS == surfels.state_dict().keys()
+        assert not list(surfels.buffers()) and not list(surfels.children())
+    assert {name.partition(".")[0] for name in model.state_dict()} == {
+        "surfels",
+        "texture",
+        "exposures",
+        "detail_limits",
+    }
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch, low_pass: bool) -> None:
+    """Depths and normals take one more walk along the lists that are there, and none where nobody reads them."""
+    calls: list[str] = []
+
+    def counting(name: str) -> None:
+        original = getattr(ops, name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            calls.append(name)
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(ops, name, counted)
+
+    stages = ["project", "intersect_tiles", "collect", "compose"]
+    for name in (*stages, "surface"):
+        counting(name)
+    model, camera = full_model(), cameras_of()[0]
+    out = model.render(camera, low_pass=low_pass)
+    assert calls == stages
+    for _ in range(2):
+        for name in LAZY:
+            assert getattr(out, name).abs().max() > 0, name
+    assert calls == [*stages, "surface"]
+    calls.clear()
+    buffers = render_buffers(model, camera, low_pass=low_pass)
+    assert calls == [*stages, "surface"]
+    for name in LAZY:
+        assert torch.equal(getattr(buffers, name), getattr(out, name)), name
+
+
+# Gradients
+
+
+def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None:
+    """They reach the camera, the surfels, the texture and the background through exposures and detail limits."""
+    camera, found = make_camera(random_scene(1, device=device)), []
+    for through_model in (True, False):
+        model = full_model(device)
+        assert model.texture is not None
+        model.texture.half_precision = False
+        behind = torch.tensor(OPTIONS.background, device=device, requires_grad=True)
+        if through_model:
+            out = model.render(camera, background=behind)
+        else:
+            model.options = OPTIONS
+            out = nw.render(
+                model.surfels,
+                model.texture,
+                camera,
+                OPTIONS.max_hits,
+                behind,
+                OPTIONS.sh_degree,
+                exposures=model.exposures,
+                detail_limits=model.detail_limits,
+            )
+        leaves: dict[str, torch.Tensor] = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
+        leaves |= dict(model.surfels.named_parameters())
+        gradients = torch.autograd.grad(out.image.square().sum(), list(leaves.values()))
+        found.append(dict(zip(leaves, gradients, strict=True)))
+    for name, gradient in found[0].items():
+        assert_finite(gradient, name)
+        assert gradient.abs().max() > 0, name
+        if device.type == "cpu":
+            assert torch.equal(gradient, found[1][name]), name
+
+
+def test_a_model_can_be_trained() -> None:
+    """Its parameters are those of the surfels and the texture; exposures and detail limits are constants."""
+    model, camera = full_model(), cameras_of()[0]
+    names = {name for name, _ in model.named_parameters()}
+    assert {name.partition(".")[0] for name in names} == {"surfels", "texture"}
+    target = torch.full((camera.height, camera.width, 3), 0.5)
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
+    losses = []
+    for _ in range(8):
+        optimizer.zero_grad()
+        loss = (model.render(camera).image - target).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.9 * losses[0]
+
+
+# Copies and files
+
+
+def test_state_dicts_hold_exposures_and_limits(device: torch.device) -> None:
+    """Loaded into a model with another falloff, which has rendered already, they give the same bits."""
+    model, camera = full_model(device), cameras_of(device)[0]
+    other = full_model(device, (-0.1, -0.9, 0.2))
+    with torch.no_grad():
+        for x in (*other.surfels.parameters(), *other.parameters()):
+            x.mul_(0.9)
+    assert other.exposures is not None and other.detail_limits is not None
+    other.exposures.log_gains.mul_(0.5)
+    other.detail_limits.farthest.mul_(0.5)
+    expected = model.render(camera)
+    assert (other.render(camera).image - expected.image).abs().max() > 0.05
+    state = {name: x.clone() for name, x in model.state_dict().items()}
+    assert {"exposures.falloff", "exposures.log_gains", "detail_limits.nearest", "detail_limits.farthest"} <= set(state)
+    other.load_state_dict(state)
+    assert_same(other.render(camera), expected)
+    even = full_model(device, None)
+    even.render(camera)
+    even.load_state_dict(state)
+    assert_same(even.render(camera), expected)
+    back = full_model(device)
+    back.load_state_dict(full_model(device, None).state_dict())
+    assert_same(back.render(camera), full_model(device, None).render(camera))
+
+
+def test_a_folder_and_a_file_load_the_same(tmp_path: Path) -> None:
+    model, camera = full_model(), cameras_of()[0]
+    folder = model.save(tmp_path / "new" / "run")
+    file = model.save(tmp_path / "mine.safetensors")
+    assert folder == tmp_path / "new" / "run" / "model.safetensors" and file == tmp_path / "mine.safetensors"
+    assert folder.read_bytes() == file.read_bytes()
+    loaded = [nw.load(path) for path in (folder.parent, folder, file, str(file))]
+    for each in loaded:
+        assert each.options == OPTIONS and each.meta["iteration"] == 7
+        assert each.state_dict().keys() == model.state_dict().keys()
+        assert_same(each.render(camera), loaded[0].render(camera))
+    for name, x in model.state_dict().items():
+        assert not name.startswith("texture.") or x.dtype == torch.float32
+        exact = x.half().float() if name.startswith("texture.") and name != "texture.resolutions" else x
+        assert torch.equal(loaded[0].state_dict()[name], exact), name
+    again = nw.load(loaded[0].save(tmp_path / "again.safetensors"))
+    assert again.options == OPTIONS and again.meta == loaded[0].meta
+    for name, x in again.state_dict().items():
+        assert torch.equal(x, loaded[0].state_dict()[name]), name
+
+
+def test_models_move_as_a_whole(device: torch.device) -> None:
+    model = full_model().to(device)
+    assert model.device == model.surfels.device and model.device.type == device.type
+    assert {x.device.type for x in model.state_dict().values()} == {device.type}
+    double = full_model().to(torch.float64)
+    assert {x.dtype for x in double.state_dict().values()} == {torch.float64}
+    camera = cameras_of()[0].to(torch.float64)
+    image = full_model().render(cameras_of()[0]).image
+    torch.testing.assert_close(double.render(camera).image.float(), image, atol=1e-3, rtol=0)
+
+
+# What is refused
+
+
+def test_parts_that_do_not_fit_are_named() -> None:
+    model = full_model()
+    surfels, texture = model.surfels, model.texture
+    bad: list[tuple[str, type[Exception], tuple[Any, ...]]] = [
+        ("surfels", TypeError, (surfels.state_dict(), texture)),
+        ("texture", TypeError, (surfels, surfels)),
+        ("exposures", TypeError, (surfels, texture, {"max_hits": 2})),
+        ("detail_limits", TypeError, (surfels, texture, None, torch.ones(len(surfels)))),
+        ("detail_limits", ValueError, (surfels, texture, None, DetailLimits(torch.ones(3), torch.ones(3)))),
+        ("options", TypeError, (surfels, texture, None, None, {"max_hits": 2})),
+    ]
+    for name, error, arguments in bad:
+        with pytest.raises(error, match=rf"^{name}: expected"):
+            nw.Model(*arguments)
+
+
+def test_changes_that_are_no_options_are_named() -> None:
+    model, camera = full_model(), cameras_of()[0]
+    bad: list[tuple[type[Exception], dict[str, Any]]] = [
+        (TypeError, {"hits": 2}),
+        (TypeError, {"max_hits": 2.0}),
+        (ValueError, {"max_hits": 9}),
+        (ValueError, {"exposure": "bright"}),
+        (TypeError, {"detail_limits": 1}),
+        (TypeError, {"low_pass": "no"}),
+        (ValueError, {"sh_degree": -1}),
+    ]
+    for error, changes in bad:
+        with pytest.raises(error, match=rf"^{next(iter(changes))}: expected"):
+            model.render(camera, **changes)
+    others: list[Any] = ["camera", None, camera.viewmat, ["camera"]]
+    for other in others:
+        with pytest.raises(TypeError, match=r"^camera: expected a nexwarp\.Camera"):
+            model.render(other)

@@ -1,0 +1,291 @@
+"""Model files: what comes back is what went in, damage is one clear line."""
+
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from safetensors import safe_open
+
+import nexwarp as nw
+from nexwarp.model.detail_limits import NEVER, DetailLimits
+from nexwarp.model.exposures import Exposures
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import FORMAT_VERSION, LATER_OPTIONS, MODEL_FILE, save_model
+from nexwarp.model.options import RenderOptions
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from tests.model_file_support import META, OPTIONS, make_model, refused, rewrite
+from tests.scenes import make_camera, make_surfels, random_scene
+from tests.tolerances import assert_close
+
+
+class Bomb:
+    """What a pickle must never get to do."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.marker,))
+
+
+def test_loaded_model_renders_the_same_image(tmp_path):
+    model = make_model()
+    file = save_model(tmp_path, model)
+    assert file == tmp_path / MODEL_FILE and os.listdir(tmp_path) == [MODEL_FILE]
+    first, second = nw.load(tmp_path), nw.load(file)
+    camera = make_camera(random_scene(24))
+    with torch.no_grad():
+        images = [m.render(camera).image for m in (model, first, second)]
+    assert torch.equal(images[1], images[2])
+    assert images[0].std() > 0.05
+    assert_close(images[1], images[0], kind="value", name="image", precision=torch.float16)
+
+
+def test_surfels_come_back_exactly_and_the_texture_in_half_precision(tmp_path):
+    model = make_model()
+    loaded = nw.load(save_model(tmp_path, model))
+    for name, value in model.surfels.state_dict().items():
+        assert torch.equal(loaded.surfels.state_dict()[name], value), name
+    assert model.texture is not None and loaded.texture is not None
+    for name, value in model.texture.state_dict().items():
+        now = loaded.texture.state_dict()[name]
+        assert now.dtype == torch.float32
+        assert torch.equal(now, value if name == "resolutions" else value.half().float()), name
+    assert loaded.texture.config == model.texture.config
+
+
+@pytest.mark.parametrize("name", ["footprints", "far_footprints"])
+def test_detail_limits_come_back_exactly(tmp_path: Path, name: str) -> None:
+    """One may be there without the other, as in files from before there were two; the other then limits nothing."""
+    model = make_model()
+    assert nw.load(save_model(tmp_path, model)).detail_limits is None
+    limits = DetailLimits(*torch.rand(2, len(model.surfels)))
+    model.detail_limits = limits
+    file = save_model(tmp_path, model)
+    loaded = nw.load(file).detail_limits
+    assert loaded is not None
+    assert torch.equal(loaded.nearest, limits.nearest) and torch.equal(loaded.farthest, limits.farthest)
+    double = nw.load(file).to(torch.float64).detail_limits
+    assert double is not None and double.farthest.dtype == torch.float64
+    other = "far_footprints" if name == "footprints" else "footprints"
+    rewrite(file, lambda tensors, _: tensors.pop(other))
+    alone = nw.load(file).detail_limits
+    assert alone is not None
+    if name == "footprints":
+        assert torch.equal(alone.nearest, limits.nearest) and (alone.farthest == NEVER).all()
+    else:
+        assert (alone.nearest == 0).all() and torch.equal(alone.farthest, limits.farthest)
+    rewrite(file, lambda tensors, _: tensors.update({name: torch.rand(len(model.surfels) + 1)}))
+    with pytest.raises(ValueError, match=rf"expected the tensors of a nexwarp model \({name}: expected shape"):
+        nw.load(file)
+
+
+@pytest.mark.parametrize("stored", [(), ("footprints",), ("footprints", "far_footprints")])
+def test_a_file_of_version_0_1_renders_as_before(tmp_path: Path, stored: tuple[str, ...]) -> None:
+    """Its metadata has no `exposure` and `detail_limits`; it may hold the nearest limits alone, or none."""
+    scene = random_scene(24)
+    camera = make_camera(scene)
+    model = make_model()
+    limits = torch.full((24,), 3.5 / camera.focal), torch.full((24,), 3.0 / camera.focal)
+    model.detail_limits = DetailLimits(*limits)
+    model.exposures = Exposures.of(torch.tensor([[0.3, 0.0, -0.2]]), [camera], (-0.3, -0.2, 0.4))
+    file = save_model(tmp_path, model)
+
+    def age(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> None:
+        for key in LATER_OPTIONS:
+            del meta[key]
+        for name in {"footprints", "far_footprints"}.difference(stored):
+            del tensors[name]
+
+    rewrite(file, age)
+    loaded = nw.load(file)
+    assert loaded.options == OPTIONS and loaded.exposures is not None
+    nearest = limits[0] if "footprints" in stored else torch.zeros(24)
+    farthest = limits[1] if "far_footprints" in stored else torch.full((24,), NEVER)
+    expected = nw.render(
+        loaded.surfels,
+        loaded.texture,
+        camera,
+        background=OPTIONS.background,
+        clamp_texture=True,
+        exposures=loaded.exposures,
+        detail_limits=DetailLimits(nearest, farthest) if stored else None,
+    )
+    assert torch.equal(loaded.render(camera).image, expected.image)
+    assert (loaded.detail_limits is None) == (not stored)
+
+
+def some_exposures(falloff: torch.Tensor | None = None) -> Exposures:
+    """Random exposures of five photos."""
+    log_gains, positions, directions, coefficients = torch.rand(4, 5, 3)
+    return Exposures(log_gains, positions, directions, coefficients, torch.rand(3), torch.rand(2), falloff)
+
+
+def test_exposures_come_back_exactly(tmp_path):
+    model = make_model()
+    assert nw.load(save_model(tmp_path, model)).exposures is None
+    model.exposures = some_exposures(torch.rand(3))
+    loaded = nw.load(save_model(tmp_path, model))
+    assert loaded.exposures is not None
+    for name, value in model.exposures.tensors().items():
+        assert torch.equal(loaded.exposures.tensors()[name], value), name
+    double = loaded.to(torch.float64).exposures
+    assert double is not None and double.lengths.dtype == torch.float64
+    model.exposures.positions = torch.rand(4, 3)
+    with pytest.raises(ValueError, match=r"expected the tensors of a nexwarp model \(positions: expected shape"):
+        nw.load(save_model(tmp_path, model))
+
+
+@pytest.mark.parametrize("largest", [0.0, -1.0, float("nan")])
+def test_a_falloff_that_cannot_be_is_refused(tmp_path, largest):
+    model = make_model()
+    model.exposures = some_exposures()
+    assert model.exposures.falloff.tolist() == [0.0, 0.0, 1.0]  # as in files from before there was one
+    model.exposures.falloff = torch.tensor([0.1, 0.1, largest])
+    with pytest.raises(ValueError, match=r"\(falloff: expected a largest squared tangent > 0, got "):
+        nw.load(save_model(tmp_path, model))
+
+
+def test_saving_what_was_loaded_changes_nothing(tmp_path):
+    file = save_model(tmp_path, make_model())
+    written = file.read_bytes()
+    save_model(tmp_path, nw.load(tmp_path))
+    again = file.read_bytes()
+    assert safetensors.torch.load(again).keys() == safetensors.torch.load(written).keys()
+    for name, tensor in safetensors.torch.load(written).items():
+        assert torch.equal(safetensors.torch.load(again)[name], tensor), name
+
+
+def test_meta_survives(tmp_path):
+    loaded = nw.load(save_model(tmp_path, make_model()))
+    assert {name: loaded.meta[name] for name in META} == META
+    assert loaded.meta["format_version"] == FORMAT_VERSION and "COLMAP" in str(loaded.meta["frame"])
+    assert loaded.options == OPTIONS
+
+
+@pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0, "low_pass": True}])
+def test_options_survive(tmp_path: Path, changes: dict[str, Any]) -> None:
+    model = Model(make_surfels(random_scene(3)), None, options=OPTIONS.changed(**changes), meta=META)
+    loaded = nw.load(save_model(tmp_path, model))
+    assert loaded.options == model.options
+    assert not {field.name for field in fields(RenderOptions)} & loaded.meta.keys()
+
+
+@pytest.mark.parametrize("count", [1, 700])
+def test_file_is_as_large_as_accounted(tmp_path, count):
+    """60 float32 a surfel, L T F half-precision features, a half-precision MLP (recipe.md 3.8), and a header."""
+    scene = random_scene(count)
+    texture = nw.NeuralTexture(levels=8, table_size=2**12, max_resolution=64.0)
+    size = save_model(tmp_path, Model(make_surfels(scene), texture, options=OPTIONS, meta=META)).stat().st_size
+    mlp = 2 * (16 * 64 + 64 * 64 + 64 * 48)
+    accounted = 60 * 4 * count + 8 * 2**12 * 2 * 2 + mlp
+    assert 0 < size - accounted < 4096
+
+
+def test_missing_model(tmp_path):
+    refused(FileNotFoundError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="or a run folder with")
+    refused(FileNotFoundError, nw.load, tmp_path / "no", names=tmp_path / "no", match="or a run folder with")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model at all", b"\xff" * 64, b"{}" * 100])
+def test_file_of_another_kind(tmp_path, content):
+    (tmp_path / MODEL_FILE).write_bytes(content)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
+def test_truncated_model(tmp_path, share):
+    file = save_model(tmp_path, make_model())
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(share * len(whole))])
+    refused(ValueError, nw.load, file, names=file, match="expected a safetensors file")
+
+
+def test_safetensors_of_another_program(tmp_path):
+    file = tmp_path / MODEL_FILE
+    safetensors.torch.save_file({"x": torch.zeros(3)}, file)
+    refused(ValueError, nw.load, file, names=file, match="no nexwarp metadata")
+
+
+@pytest.mark.parametrize("header", ["{", "[]", "3", '"text"'])
+def test_damaged_metadata(tmp_path, header):
+    file = tmp_path / MODEL_FILE
+    safetensors.torch.save_file({"x": torch.zeros(3)}, file, {"nexwarp": header})
+    refused(ValueError, nw.load, file, names=file, match="metadata")
+
+
+@pytest.mark.parametrize("name", ["surfels.means", "surfels.shN", "texture.grid", "texture.mlp.0.weight"])
+def test_missing_tensor(tmp_path, name):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, _: tensors.pop(name))
+    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+
+
+@pytest.mark.parametrize("name", ["surfels.means", "surfels.raw_gammas", "texture.grid", "texture.mlp.2.weight"])
+def test_tensors_that_do_not_fit(tmp_path, name):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda tensors, _: tensors.update({name: tensors[name][..., :1].contiguous()}))
+    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+
+
+@pytest.mark.parametrize("key", ["texture", "max_hits", "background", "sh_degree", "low_pass", "clamp_texture"])
+def test_missing_metadata(tmp_path, key):
+    file = save_model(tmp_path, make_model())
+    rewrite(file, lambda _, meta: meta.pop(key))
+    refused(ValueError, nw.load, file, names=file, match=key)
+
+
+def test_nothing_is_unpickled(tmp_path):
+    marker = tmp_path / "exploded"
+    content = pickle.dumps(Bomb(marker))
+    (tmp_path / MODEL_FILE).write_bytes(content)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+    torch.save({"x": Bomb(marker)}, tmp_path / MODEL_FILE)
+    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
+    folder = tmp_path / "checkpoint"
+    save_checkpoint(tmp_path, {"x": torch.zeros(1)}, {})
+    (folder / "tensors.safetensors").write_bytes(content)
+    refused(ValueError, load_checkpoint, tmp_path, names=folder, match="expected a whole checkpoint")
+    assert not marker.exists()
+    pickle.loads(content)  # the bomb does work
+    assert marker.exists()
+
+
+def update_meta(key: str, value: object) -> Callable[[dict[str, torch.Tensor], dict[str, Any]], None]:
+    return lambda _, meta: meta.update({key: value})
+
+
+def test_models_that_cannot_render_are_refused(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    texture = nw.NeuralTexture(levels=2, table_size=2**4, width=8)
+    model = nw.Model(make_surfels(random_scene(3)), texture)
+    for key, value in (
+        ("max_hits", "two"),
+        ("max_hits", 9),
+        ("background", [0, 0]),
+        ("low_pass", 1),
+        ("sh_degree", None),
+        ("near", "far"),
+        ("smooth_sh", "smooth"),
+        ("smooth_sh", -0.1),
+        ("exposure", "bright"),
+        ("detail_limits", "no"),
+    ):
+        rewrite(save_model(tmp_path, model), update_meta(key, value))
+        with pytest.raises(ValueError, match=key):
+            nw.load(tmp_path)
+    path = save_model(tmp_path, model)
+    with safe_open(path, "pt") as file:
+        header = file.metadata()
+    tensors = load_file(path)
+    tensors["surfels.means"][1, 2] = float("nan")
+    save_file(tensors, path, header)
+    with pytest.raises(ValueError, match=r"means: expected values from -1e\+16 to 1e\+16, got nan at index \(1, 2\)"):
+        nw.load(tmp_path)

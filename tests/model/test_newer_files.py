@@ -1,0 +1,234 @@
+"""Files of newer versions: unknown keys and tensors are passed over, an unknown format version is one clear line.
+
+And files with too many entries, which are refused before each entry is looked at.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cameras.cameras_file import load_cameras, save_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path
+from nexwarp.data import Scene
+from nexwarp.io.json_files import write_json
+from nexwarp.model.model_file import save_model
+from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.config import Config
+from nexwarp.train.trainer import Trainer
+from tests.model.test_bounds import tiny_camera, tiny_model
+from tests.model_file_support import refused, rewrite
+from tests.scenes import make_camera, random_scene
+from tests.trainer_support import assert_same_state, small, trained
+
+ANYTHING = {"new": [1, {"a": None}], "x": "text", "": 0}
+WRONG_VERSIONS = (True, False, 1.0, "1", 0, -1, None, [1], 1.5)
+
+
+def change_json(file: Path, change: Callable[[Any], object]) -> None:
+    data = json.loads(file.read_bytes())
+    change(data)
+    file.write_text(json.dumps(data))
+
+
+# Unknown keys and tensors
+
+
+def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) -> None:
+    model = tiny_model()
+    expected = nw.load(save_model(tmp_path / "old", model))
+    file = save_model(tmp_path / "new", model)
+
+    def extend(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> None:
+        meta["brightness"] = ANYTHING
+        meta["texture"]["activation"] = "sine"
+        for name in ("surfels.roughness", "exposures.curve", "texture.mlp.6.weight", "texture.bias", "lights"):
+            tensors[name] = torch.full((2, 3), torch.nan, dtype=torch.float64)
+        tensors["labels"] = torch.zeros(5, dtype=torch.int64)
+
+    rewrite(file, extend)
+    loaded = nw.load(file)
+    assert loaded.state_dict().keys() == expected.state_dict().keys()
+    assert all(torch.equal(x, expected.state_dict()[name]) for name, x in loaded.state_dict().items())
+    assert loaded.options == expected.options and loaded.meta["brightness"] == ANYTHING
+    with torch.no_grad():
+        assert torch.equal(loaded.render(tiny_camera()).image, expected.render(tiny_camera()).image)
+
+
+def test_a_run_with_unknown_keys_reads_the_same(tmp_path: Path) -> None:
+    create_run(tmp_path, SceneSource("demo", downscale=2), Config(seed=3), "cpu")
+    source, config, _ = read_run(tmp_path)
+
+    def extend(data: Any) -> None:
+        for part in (data, data["scene"], data["config"], *(data["config"][x] for x in ("losses", "texture"))):
+            part |= ANYTHING
+
+    change_json(tmp_path / "config.json", extend)
+    assert read_run(tmp_path)[:2] == (source, config)
+    assert config.seed == 3 and source.downscale == 2
+    write_json(tmp_path / "metrics.json", {"psnr": 20.0, **ANYTHING})
+    assert read_metrics(tmp_path)["psnr"] == 20.0
+
+
+def test_cameras_with_unknown_keys_load_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "cameras.json"
+    save_cameras(file, {"train": {"a": make_camera(random_scene(2))}, "test": {}})
+
+    def extend(data: Any) -> None:
+        data["train"]["a"] |= ANYTHING
+        data |= ANYTHING
+
+    before = load_cameras(file)
+    change_json(file, extend)
+    after = load_cameras(file)
+    assert after.keys() == before.keys() and torch.equal(after["train"]["a"].viewmat, before["train"]["a"].viewmat)
+
+
+def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: Path, tiny_scene: Scene) -> None:
+    config = small(iterations=4)
+    done = trained(tiny_scene, config)
+    tensors, state = done.snapshot()
+    for name in ("surfels.roughness", "texture.bias", "adam.surfels.means.memory", "adam.lights.exp_avg", "lights"):
+        tensors[name] = torch.zeros(2, 3, dtype=torch.float32)
+    tensors["labels"] = torch.zeros(5, dtype=torch.int64)
+    state |= ANYTHING | {"config": state["config"] | ANYTHING}
+    save_checkpoint(tmp_path, tensors, state)
+    resumed = Trainer(tiny_scene, config, "cpu")
+    resumed.restore(tmp_path)
+    assert_same_state(resumed, done)
+
+
+# Format versions
+
+
+def model_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
+    file = save_model(tmp_path, nw.Model(tiny_model().surfels, None))
+    rewrite(file, lambda _, meta: meta.update(format_version=version))
+    return file, lambda: nw.load(file)
+
+
+def config_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
+    create_run(tmp_path, SceneSource("demo"), Config(), "cpu")
+    change_json(tmp_path / "config.json", lambda data: data.update(format_version=version))
+    return tmp_path / "config.json", lambda: read_run(tmp_path)
+
+
+def metrics_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
+    write_json(tmp_path / "metrics.json", {"psnr": 20.0, "format_version": version})
+    return tmp_path / "metrics.json", lambda: read_metrics(tmp_path)
+
+
+def cameras_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
+    write_json(tmp_path / "cameras.json", {"train": {}, "test": {}, "format_version": version})
+    return tmp_path / "cameras.json", lambda: load_cameras(tmp_path)
+
+
+def checkpoint_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
+    tmp_path.mkdir()
+    save_checkpoint(tmp_path, {"x": torch.zeros(1)}, {})
+    change_json(tmp_path / "checkpoint" / "state.json", lambda data: data.update(format_version=version))
+    return tmp_path / "checkpoint", lambda: load_checkpoint(tmp_path)
+
+
+KINDS = {model_version: 2, config_version: 1, metrics_version: 1, cameras_version: 1, checkpoint_version: 1}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_known_versions_are_read(tmp_path: Path, kind: Callable[..., Any]) -> None:
+    newest = KINDS[kind]
+    known = "1" if newest == 1 else f"1 to {newest}"
+    for number, version in enumerate(WRONG_VERSIONS):
+        file, read = kind(tmp_path / str(number), version)
+        refused(ValueError, read, names=file, match=f"expected format version {known}, got {version!r}")
+    file, read = kind(tmp_path / "newer", newest + 1)
+    wrote = "a newer nexwarp wrote the file, update nexwarp to read it"
+    message = f"expected format version {known}, got {newest + 1}; {wrote}"
+    refused(ValueError, read, names=file, match=message)
+
+
+# Files with too many entries
+
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MANY = 150_000
+
+
+def repeated(text: str, count: int) -> str:
+    return ",".join([text] * count)
+
+
+def write_frames(folder: Path, count: int) -> Path:
+    frames = repeated(json.dumps({"file_path": "images/1.png", "transform_matrix": POSE}), count)
+    file = folder / "transforms.json"
+    file.write_text(f'{{"camera_angle_x": 0.7, "w": 8, "h": 6, "frames": [{frames}]}}')
+    return file
+
+
+def many_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
+    return write_frames(folder, MANY), lambda: nw.load_scene(folder)
+
+
+def duplicate_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
+    from PIL import Image
+
+    (folder / "images").mkdir()
+    Image.new("RGB", (8, 6)).save(folder / "images" / "1.png")
+    return write_frames(folder, 29_000), lambda: nw.load_scene(folder)
+
+
+def long_path(folder: Path) -> tuple[Path, Callable[[], object]]:
+    entries = repeated(json.dumps({"camera_to_world": [x for row in POSE for x in row], "fov": 50}), MANY)
+    file = folder / "path.json"
+    file.write_text(f'{{"render_width": 8, "render_height": 6, "camera_path": [{entries}]}}')
+    return file, lambda: load_camera_path(file)
+
+
+def many_cameras(folder: Path) -> tuple[Path, Callable[[], object]]:
+    camera = {"viewmat": POSE, "K": [[9, 0, 4], [0, 9, 3], [0, 0, 1]], "width": 8, "height": 6, "near": 0.1}
+    file = folder / "cameras.json"
+    entries = repeated(f'"a": {json.dumps(camera)}', MANY)
+    file.write_text(f'{{"train": {{{entries}}}, "test": {{}}}}')
+    return file, lambda: load_cameras(file)
+
+
+def many_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
+    file = save_model(folder, tiny_model())
+    entries = {f"x{i}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}
+    header = json.dumps({"__metadata__": {"nexwarp": "{}"}, **entries}).encode()
+    file.write_bytes(len(header).to_bytes(8, "little") + header)
+    return file, lambda: nw.load(file)
+
+
+def many_checkpoint_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
+    save_checkpoint(folder, {}, {})
+    many_tensors(folder)[0].rename(folder / "checkpoint" / "tensors.safetensors")
+    return folder / "checkpoint", lambda: load_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (many_frames, "expected at most 500,000 lists and objects, got 900,"),
+        (duplicate_frames, "expected each photo once, got 1.png twice"),
+        (long_path, "camera_path: expected at most 30,000 cameras, got 150,000"),
+        (many_cameras, "expected at most 500,000 lists and objects, got 1,500,003"),
+        (many_tensors, "expected a safetensors header of at most 1,048,576 bytes"),
+        (many_checkpoint_tensors, "expected a safetensors header of at most 1,048,576 bytes"),
+    ],
+)
+def test_too_many_entries_are_refused_at_once(tmp_path: Path, make: Callable[..., Any], match: str) -> None:
+    file, read = make(tmp_path)
+    begun = time.process_time()
+    refused(ValueError, read, names=file, match=match)
+    assert time.process_time() - begun < 2.0
+
+
+def test_a_few_tensors_more_are_no_matter(tmp_path: Path) -> None:
+    file = save_model(tmp_path, tiny_model())
+    rewrite(file, lambda tensors, _: tensors.update({f"x{i}": torch.zeros(1) for i in range(1000)}))
+    assert len(nw.load(file).surfels) == 12

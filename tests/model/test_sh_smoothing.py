@@ -1,0 +1,228 @@
+"""Smooth SH: training views keep theirs, other directions get the smoothest that fit; in closed form."""
+
+import math
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import look_at
+from nexwarp.data import Scene, View, write_demo
+from nexwarp.model.surfels import Surfels
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH, seen_directions, smooth_sh
+from nexwarp.train.presets import preset
+from nexwarp.train.trainer import Trainer
+from tests.reference.sh import basis as sh_basis
+from tests.scenes import make_surfels, random_scene
+from tests.tolerances import assert_close
+
+SIDE = 24
+CONSTANT = 0.28209479177387814  # the harmonic of degree 0
+ROUGHNESS = torch.tensor([(degree * (degree + 1) / 12) ** 2 for degree in range(4) for _ in range(2 * degree + 1)])
+
+
+def view(position: list[float], mask: torch.Tensor | None = None) -> View:
+    K = torch.tensor([[30.0, 0.0, SIDE / 2], [0.0, 30.0, SIDE / 2], [0.0, 0.0, 1.0]])
+    camera = Camera(look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])), K, SIDE, SIDE)
+    return View(camera, torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8), mask, "view.png")
+
+
+def around(angles: list[float]) -> list[View]:
+    return [view([4 * math.sin(angle), 0.5 * angle, -4 * math.cos(angle)]) for angle in angles]
+
+
+def blob(device: torch.device) -> Surfels:
+    """A surfel in the middle, seen from all sides but its edge, and one behind all cameras."""
+    generator = torch.Generator().manual_seed(3)
+    surfels = Surfels.from_activated(
+        torch.tensor([[0.0, 0.0, 0.0], [0.0, 300.0, 0.0]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        torch.full((2, 2), 0.4),
+        torch.full((2,), 0.9),
+        torch.ones(2, 2),
+        0.2 * torch.randn(2, 16, 3, generator=generator),
+    )
+    return surfels.to(device)
+
+
+def colors(surfels: Surfels, views: list[View], sh: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+    """(V, N, 3), of SH alone, without the offset and the limit at 0 that colours have."""
+    offset = 10.0
+    found = []
+    for v in views:
+        raised = ops.plain_colors((sh[0] + offset, sh[1]), surfels.means, v.camera.position.to(surfels.device), 3)
+        found.append(raised - 0.5 - CONSTANT * offset)
+    return torch.stack(found).detach()
+
+
+def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.device) -> None:
+    """Weights are the derivatives of the picture's sum by the surfels' colours; pixels beyond the mask do not count."""
+    scene = random_scene(20, device=device)
+    surfels = make_surfels(scene)
+    mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    mask[:, : SIDE // 2] = True
+    views = [*around([0.0, 0.7]), view([0.5, -0.5, -4.0], mask)]
+    found, total = (x.float() for x in seen_directions(nw.Model(surfels, None), views))
+    row, column = torch.triu_indices(16, 16)
+    expected, expected_total = torch.zeros_like(found), torch.zeros_like(total)
+    for v in views:
+        camera = v.camera.to(device)
+        counts = torch.ones(SIDE, SIDE, 1, device=device) if v.mask is None else v.mask[..., None].to(device)
+        surfels.sh0.grad = None
+        out = nw.render(surfels, None, camera, max_hits=0)
+        (out.plain * counts)[..., 0].sum().backward()
+        shown = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, 3)[:, 0] > 0
+        assert surfels.sh0.grad is not None
+        weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / CONSTANT, torch.nan)
+        basis = torch.stack([colors(surfels, [v], one(k, surfels))[0, :, 0] for k in range(16)], dim=1)
+        expected += weights[:, None] * basis[:, row] * basis[:, column]
+        expected_total += weights
+    known = expected_total.isfinite()
+    assert known.sum() > 10 and (expected_total[known] > 0).any()
+    assert_close(total[known], expected_total[known], kind="value", name="weights")
+    assert_close(found[known], expected[known], kind="value", name="products")
+
+
+def one(k: int, surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
+    sh = torch.zeros(len(surfels), 16, 3, device=surfels.device)
+    sh[:, k] = 1.0
+    return sh[:, :1].contiguous(), sh[:, 1:].contiguous()
+
+
+@pytest.mark.parametrize("strength", [MIN_STRENGTH, 1e-3, 10.0])
+def test_coefficients_are_those_of_ridge_regression(device: torch.device, strength: float) -> None:
+    """A minimum of what the module's docstring says, by least squares over its terms, not by their normal equations."""
+    surfels, views = blob(device), around([-0.6, -0.2, 0.1, 0.5])
+    before = surfels.sh.detach().clone()
+    weights = torch.stack([seen_directions(nw.Model(surfels, None), [v])[1][0] for v in views]).cpu()
+    directions = torch.stack([-v.camera.position for v in views]).double()
+    basis = sh_basis(torch.nn.functional.normalize(directions, dim=1), 3)  # the surfel is in the world's middle
+    seen = (weights / weights.sum()).sqrt()[:, None] * basis
+    terms = torch.cat([seen, strength**0.5 * torch.diag(ROUGHNESS.double().sqrt())])
+    targets = torch.cat([seen @ before[0].double().cpu(), torch.zeros(16, 3, dtype=torch.float64)])
+    expected = torch.linalg.lstsq(terms, targets, driver="gelsd").solution
+    found = torch.cat(smooth_sh(nw.Model(surfels, None), views, strength), dim=1)[0].double().cpu()
+    assert torch.equal(surfels.sh, before)
+    # Harmonics of float32: what their last bits tell of unseen directions grows as strength falls.
+    assert (found - expected).abs().max() < 1e-4 < (found - before[0].double().cpu()).abs().max()
+
+
+def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch.device) -> None:
+    """Coefficients of which views tell nothing go: what is left is the same whatever these were."""
+    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
+    learnt = (surfels.sh0.detach().clone(), surfels.shN.detach().clone())
+    smooth = smooth_sh(nw.Model(surfels, None), views, 0.01)
+    assert (colors(surfels, views, smooth) - colors(surfels, views, learnt))[:, 0].abs().max() < 0.02
+    far = around([math.pi])
+    assert (colors(surfels, far, smooth) - colors(surfels, far, learnt))[:, 0].abs().max() > 0.05
+    # Add what no view sees, to coefficients of the null space of what they do see.
+    basis = torch.stack([colors(surfels, views, one(k, surfels))[:, 0, 0] for k in range(16)], dim=1).double()
+    hidden = torch.linalg.svd(basis)[2][3:].sum(0).to(surfels.sh0)
+    with torch.no_grad():
+        surfels.sh0.add_(hidden[None, :1, None])
+        surfels.shN.add_(hidden[None, 1:, None])
+    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
+    for a, b in zip(smooth, again, strict=True):
+        assert (a - b)[0].abs().max() < 1e-3 < hidden.abs().max()
+
+
+def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device: torch.device) -> None:
+    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
+    sh0, shN = smooth_sh(nw.Model(surfels, None), views, MAX_STRENGTH)
+    assert shN.abs().max() < 1e-5
+    learnt = colors(surfels, views, (surfels.sh0, surfels.shN))[:, 0]
+    flat = colors(surfels, views, (sh0, shN))[0, 0]
+    assert ((flat > learnt.amin(0) - 1e-4) & (flat < learnt.amax(0) + 1e-4)).all()  # a mean of what views show
+    with torch.no_grad():
+        surfels.sh0.copy_(sh0)
+        surfels.shN.zero_()
+    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
+    assert_close(again[0], sh0, kind="value", name="sh0")
+    assert again[1].abs().max() < 1e-6
+
+
+def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.device) -> None:
+    surfels, views = blob(device), around([-0.5, 0.5])  # one view alone is told by one colour
+    sh0, shN = smooth_sh(nw.Model(surfels, None), views, 0.01)
+    assert torch.equal(sh0[1], surfels.sh0[1]) and not shN[1].any() and shN[0].abs().max() > 1e-3
+    empty = Surfels({name: x[:0] for name, x in surfels.state_dict().items()})
+    assert [x.shape for x in smooth_sh(nw.Model(empty, None), views, 0.01)] == [(0, 1, 3), (0, 15, 3)]
+    flat = Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
+    for a, b in zip(smooth_sh(nw.Model(flat, None), views, 0.01), (flat.sh0, flat.shN), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_degrees_that_are_not_rendered_take_no_part(device: torch.device, degree: int) -> None:
+    """As if the surfels had no others; what they have above stays."""
+    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
+    count = (degree + 1) ** 2
+    less = Surfels({name: x[:, : count - 1] if name == "shN" else x for name, x in surfels.state_dict().items()})
+    sh0, shN = smooth_sh(nw.Model(surfels, None, options=nw.RenderOptions(sh_degree=degree)), views, 0.01)
+    for a, b in zip((sh0, shN[:, : count - 1]), smooth_sh(nw.Model(less, None), views, 0.01), strict=True):
+        assert_close(a, b, kind="value", name="degrees")
+    assert torch.equal(shN[:, count - 1 :], surfels.shN[:, count - 1 :])
+
+
+def test_many_surfels_are_seen_and_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    surfels, views = make_surfels(random_scene(50, device=device)), around([0.0, 0.4])
+    told: list[tuple[int, int]] = []
+    whole = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
+    assert told == [(1, 2), (2, 2)]
+    monkeypatch.setattr("nexwarp.train.finish.sh_smoothing.SOLVED", 7 * 16**2)
+    monkeypatch.setattr("nexwarp.train.finish.sh_smoothing.PRODUCTS", 20 * 16 * 17 // 2)
+    told.clear()
+    parts = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
+    assert told == [(done, 6) for done in range(1, 7)]  # 20, 20 and 10 surfels
+    for a, b in zip(parts, whole, strict=True):
+        assert_close(a, b, kind="value", name="parts")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("smooth") / "demo"
+    return nw.load_scene(write_demo(folder, width=48, height=36, views=12, points=200))
+
+
+@pytest.mark.usefixtures("one_torch_thread", "few_places")
+def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.device) -> None:
+    """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
+    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
+    config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
+    asked, other = Trainer(scene, config, device), Trainer(scene, config, device)
+    # At any one step there may be no graph: where lists turn out too short, the next step drops it.
+    replayed: list[bool] = []
+
+    def observe(_: nw.StepReport) -> None:
+        if asked.graphs is not None:
+            replayed.extend(stage.graph is not None for stage in asked.graphs.stages.values())
+
+    asked.run(observe, until=30)
+    assert any(replayed) == (device.type == "cuda")
+    model = asked.finish()
+    assert model.meta["smooth_sh"] == 0.01 and model.surfels is not asked.surfels
+    assert model.detail_limits is not None
+    assert not torch.equal(model.surfels.shN, asked.surfels.shN)
+    kept = {name: x.clone() for name, x in model.surfels.state_dict().items()}
+    asked.run()
+    other.run()
+    for (name, a), (_, b) in zip(asked._named_parameters(), other._named_parameters(), strict=True):
+        assert torch.equal(a, b), name
+    for name, x in model.surfels.state_dict().items():
+        assert torch.equal(x, kept[name]), name
+
+
+@pytest.mark.usefixtures("one_torch_thread", "few_places")
+def test_presets_without_it_keep_what_was_learnt(scene: Scene) -> None:
+    assert preset("paper").smooth_sh == 0.0 and preset("default").smooth_sh == 0.01
+    trainer = Trainer(scene, Config(iterations=20, max_surfels=200, smooth_sh=0.0), "cpu")
+    trainer.run()
+    model = trainer.finish()
+    kept, learnt = (surfels.shN.unique(dim=0) for surfels in (model.surfels, trainer.surfels))  # in whichever order
+    assert torch.equal(kept, learnt) and model.meta["smooth_sh"] == 0.0
+    for value in (-1.0, 1e-7, 2 * MAX_STRENGTH, math.nan):
+        with pytest.raises(ValueError, match="smooth_sh"):
+            Config(smooth_sh=value)

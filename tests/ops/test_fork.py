@@ -1,0 +1,147 @@
+"""A process that was forked from one that has rendered and trained renders and differentiates as its parent does."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.subprocesses import python_path
+
+ROOT = Path(__file__).parents[2]
+SECONDS = 60  # after which a child hangs
+
+PARENT = """
+import multiprocessing, os, signal, sys, threading, warnings
+
+warnings.simplefilter("ignore")  # Python 3.12 and later warn of a fork while there are threads
+import torch
+
+import nexwarp as nw
+from nexwarp.kernels import launch
+from tests.render_support import loss
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+
+launch.set_num_threads(3)
+torch.set_num_threads(3)  # so that OpenMP has threads, which do not survive a fork
+scene = random_scene(200, width=160, height=120)
+surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture()
+
+
+def results():
+    surfels.zero_grad()
+    texture.zero_grad()
+    out = nw.render(surfels, texture, camera, 2)
+    loss(out).backward()
+    total = torch.ones(2_000_000).exp().sum() + (torch.ones(400, 400) @ torch.ones(400, 400)).sum()  # torch's own loops
+    return [out.image.detach(), surfels.means.grad.clone(), texture.grid.grad.clone(), total]
+
+
+def child():
+    signal.alarm(SECONDS)
+    found = results()
+    assert launch.get_num_threads() == 3
+    assert all(torch.equal(a, b) for a, b in zip(found[:3], expected)), "other bits than in the parent"
+    print("child", os.getpid() != parent, flush=True)
+
+
+parent, expected = os.getpid(), results()
+""".replace("SECONDS", str(SECONDS))
+
+FORK = """
+number = os.fork()
+if number == 0:
+    child()
+    os._exit(0)
+assert os.waitpid(number, 0)[1] == 0
+"""
+
+MULTIPROCESSING = """
+process = multiprocessing.get_context("fork").Process(target=child)
+process.start()
+process.join()
+assert process.exitcode == 0
+"""
+
+# Another thread renders all the time, and holds the lock of Warp's sorts when the fork comes.
+BUSY = """
+stop = threading.Event()
+
+
+def render():
+    while not stop.is_set():
+        with torch.no_grad():
+            nw.render(own, None, camera, 2)
+
+
+own = make_surfels(scene)
+thread = threading.Thread(target=render)
+thread.start()
+for _ in range(5):
+    number = os.fork()
+    if number == 0:
+        child()
+        os._exit(0)
+    assert os.waitpid(number, 0)[1] == 0
+stop.set()
+thread.join()
+"""
+
+AFTER = """
+assert torch.get_num_threads() == 3
+assert all(torch.equal(a, b) for a, b in zip(results(), expected)), "the parent renders otherwise after the fork"
+print("parent")
+"""
+
+CUDA = """
+import os, signal, sys, warnings
+
+warnings.simplefilter("ignore")
+import torch
+
+import nexwarp as nw
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+
+scene = random_scene(20, device="cuda")
+surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(device="cuda")
+nw.render(surfels, texture, camera).image.sum().item()
+number = os.fork()
+if number == 0:
+    signal.alarm(SECONDS)
+    try:
+        nw.render(surfels, texture, camera)
+    except RuntimeError as error:
+        print(str(error).replace("\\n", " "), flush=True)
+        os._exit(0)
+    os._exit(1)
+assert os.waitpid(number, 0)[1] == 0
+""".replace("SECONDS", str(SECONDS))
+
+
+def run(script: str) -> str:
+    environment = os.environ | python_path(ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3 * SECONDS
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not hasattr(signal, "alarm"), reason="no fork here")
+
+
+def test_a_forked_process_renders_as_its_parent():
+    lines = run(PARENT + FORK + MULTIPROCESSING + AFTER).splitlines()
+    assert lines[-3:] == ["child True", "child True", "parent"]
+
+
+@pytest.mark.slow
+def test_a_process_forked_beside_a_thread_that_renders_does_not_hang():
+    assert run(PARENT + BUSY + AFTER).count("child True") == 5
+
+
+@pytest.mark.cuda
+def test_a_rendering_on_cuda_after_a_fork_says_so():
+    assert "Cannot re-initialize CUDA in forked subprocess" in run(CUDA)

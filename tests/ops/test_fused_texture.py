@@ -1,0 +1,274 @@
+"""The fused texturing kernels agree with the reference, on a CPU, which emulates a warp, and on CUDA."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.machine import deterministic
+from nexwarp.native.fused_texture import FEATURES, OUTPUTS, logical_feature, logical_output
+from nexwarp.ops import fused_texture
+from nexwarp.ops._interop import graph_is_kept
+from tests.reference import hashgrid, sh
+from tests.tolerances import assert_close
+
+NAMES = ("positions", "depths", "grid", "first matrix", "second matrix", "third matrix")
+
+
+def rounded(x: torch.Tensor) -> torch.Tensor:
+    """Round to half precision, and differentiate as if not."""
+    return x + (x.half().double() - x).detach()
+
+
+class Case(NamedTuple):
+    """Points of an image, and a texture whose table is exact in half precision."""
+
+    shape: fused_texture.Shape
+    leaves: list[torch.Tensor]  # positions, depths, grid, matrices
+    directions: torch.Tensor
+    resolutions: torch.Tensor
+    focal: torch.Tensor
+    signal: torch.Tensor
+    clamp: bool
+
+    def reference(self) -> torch.Tensor:
+        """Return the colours (n, 3) in float64, with the roundings to half precision that both computations do.
+
+        A hidden value near 0 would otherwise pass its ReLU in one and not in the other, which is no error of either.
+        """
+        positions, depths, grid, *weights = (x.double() for x in self.leaves)
+        seen = depths > 0
+        focal, resolutions = self.focal.item(), self.resolutions.double()
+        layer = rounded(hashgrid.encode(positions[seen], depths[seen], grid, resolutions, focal))
+        *hidden, last = map(rounded, weights)
+        for matrix in hidden:
+            layer = rounded(torch.relu(layer @ matrix.T))
+        coefficients = (layer @ last.T).unflatten(1, (-1, 3))
+        directions = self.directions.double().repeat_interleave(self.shape.hits, 0)[seen]
+        found = sh.evaluate(coefficients, directions, 3)
+        colors = 0.1 + torch.zeros_like(positions).index_put((seen.nonzero()[:, 0],), found)
+        return colors.clamp_min(0.0) if self.clamp else colors
+
+    def texture(self, *, half: bool, fused: bool) -> torch.Tensor:
+        """Return the colours (n, 3) of `ops.texture`."""
+        positions, depths, grid, *weights = self.leaves
+        return ops.texture(
+            positions,
+            depths,
+            grid,
+            weights,
+            self.resolutions,
+            self.focal,
+            directions=self.directions,
+            offset=0.1,
+            clamp=self.clamp,
+            half=half,
+            image=(self.shape.height, self.shape.width),
+            fused=fused,
+        )
+
+
+def make_case(
+    device: torch.device, features: int, degree: int, clamp: bool, size: tuple[int, int, int], table: int = 2**10
+) -> Case:
+    width, height, hits = size
+    count = width * height * hits
+    texture = nw.NeuralTexture(FEATURES // features, table, features, 4.0, 64.0, sh_degree=degree)
+    # Neighbouring pixels see neighbouring points, as on a surface: warps whose lanes share cells, and others.
+    x, y, k = torch.meshgrid(*(torch.arange(n) for n in (width, height, hits)), indexing="xy")
+    positions = torch.stack([x / 40.0, y / 40.0, k + torch.rand(x.shape) / 50], dim=-1).reshape(-1, 3) - 0.3
+    depths = 0.5 + 3 * torch.rand(count)
+    depths[torch.rand(count) < 0.2] = 0.0
+    directions = torch.nn.functional.normalize(torch.randn(width * height, 3), dim=1)
+    # Hidden layers of random matrices shrink what they are given.
+    weights = [1.5 * matrix.detach() for matrix in texture.mlp.parameters()]
+    grid = torch.empty_like(texture.grid.detach()).uniform_(-1, 1).half().float()
+    leaves = [x.to(device).requires_grad_() for x in (positions, depths, grid, *weights)]
+    signal = 1e-4 * torch.randn(count, 3)
+    given = [x.to(device) for x in (directions, texture.resolutions, torch.tensor([60.0]), signal)]
+    return Case(fused_texture.Shape(*size), leaves, given[0], given[1], given[2], given[3], clamp)
+
+
+def fused_on_cpu(case: Case, again: bool = False) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return colours and gradients as the kernels' CPU branch computes them."""
+    positions, depths, grid, *weights = (x.detach() for x in case.leaves)
+    points = (positions, depths, case.directions, grid.half())
+    inputs = fused_texture.Inputs(*points, weights, case.resolutions, case.focal, case.shape)
+    colors, kept = fused_texture.forward(inputs, 0.1, case.clamp, True)
+    features = kept.encoded.clone()
+    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True, again)
+    assert grad_points is not None and torch.equal(features, kept.encoded) is again
+    return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
+
+
+def assert_agree(
+    colors: torch.Tensor, gradients: list[torch.Tensor], expected: torch.Tensor, references: list[torch.Tensor]
+) -> None:
+    assert_close(colors, expected, kind="value", name="colours", precision=torch.float16)
+    for name, gradient, reference in zip(NAMES, gradients, references, strict=True):
+        assert_close(gradient, reference, kind="gradient", name=name, precision=torch.float16)
+
+
+@pytest.mark.parametrize(
+    ("features", "degree", "clamp", "size"),
+    [
+        (4, 3, False, (19, 5, 2)),
+        pytest.param(2, 2, True, (37, 1, 3), marks=pytest.mark.slow),
+        pytest.param(4, 1, True, (8, 2, 1), marks=pytest.mark.slow),
+        pytest.param(2, 0, False, (9, 7, 1), marks=pytest.mark.slow),
+    ],
+)
+def test_emulated_kernels_agree_with_the_reference(
+    features: int, degree: int, clamp: bool, size: tuple[int, int, int]
+) -> None:
+    case = make_case(torch.device("cpu"), features, degree, clamp, size)
+    expected = case.reference()
+    references = torch.autograd.grad(expected, case.leaves, case.signal)
+    assert_agree(*fused_on_cpu(case), expected, list(references))
+
+
+def test_gradients_may_overwrite_the_features() -> None:
+    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
+    for name, one, other in zip(NAMES, fused_on_cpu(case)[1], fused_on_cpu(case, again=True)[1], strict=True):
+        assert torch.equal(one, other), name
+
+
+def test_a_backward_pass_knows_whether_it_may_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch tells whether the graph is kept; a torch that cannot tell counts as keeping it."""
+    told: list[bool] = []
+
+    class Ask(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: torch.autograd.function.FunctionCtx, x: torch.Tensor) -> torch.Tensor:
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx: torch.autograd.function.FunctionCtx, grad: torch.Tensor) -> torch.Tensor:
+            told.append(graph_is_kept())
+            return grad
+
+    x = torch.ones(1, requires_grad=True)
+    y = Ask.apply(x).sum()
+    for keep in (True, False):
+        y.backward(retain_graph=keep)
+    monkeypatch.delattr(torch._C._autograd, "_get_current_graph_task_keep_graph", raising=False)
+    Ask.apply(x).sum().backward()
+    assert told == [True, False, True] or (torch.__version__ < "2.5" and told == [True] * 3)
+
+
+def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
+    together = fused_on_cpu(case)[1]
+    monkeypatch.setattr(fused_texture, "GROUP_BYTES", 2**14)
+    assert len(fused_texture.level_groups(8, 2**14)) == 5
+    for name, apart, one in zip(NAMES, fused_on_cpu(case)[1], together, strict=True):
+        assert_close(apart, one, kind="value", name=name)
+
+
+CUDA_SIZES = [(200, 130, 2), (37, 1, 3), (129, 66, 1), (40, 30, 8)]
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """How often the fused kernels were used: one number a call of the forward pass."""
+    calls: list[int] = []
+    forward = fused_texture.forward
+
+    def spy(inputs: fused_texture.Inputs, *options: bool) -> tuple[torch.Tensor, fused_texture.Kept]:
+        calls.append(len(inputs.positions))
+        return forward(inputs, *options)
+
+    monkeypatch.setattr(fused_texture, "forward", spy)
+    yield calls
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("size", CUDA_SIZES, ids=str)
+@pytest.mark.parametrize(("features", "degree", "clamp"), [(4, 3, False), (2, 2, True), (4, 1, True), (2, 0, False)])
+def test_fused_and_layered_agree(
+    features: int, degree: int, clamp: bool, size: tuple[int, int, int], counted: list[int]
+) -> None:
+    case = make_case(torch.device("cuda"), features, degree, clamp, size, 2**16)
+    exact = case.reference()
+    references = list(torch.autograd.grad(exact, case.leaves, case.signal))
+    for fused in (False, True):
+        colors = case.texture(half=True, fused=fused)
+        gradients = list(torch.autograd.grad(colors, case.leaves, case.signal))
+        assert_agree(colors, gradients, exact, references)
+    assert len(counted) == 1
+    with torch.no_grad():
+        assert torch.equal(case.texture(half=True, fused=True), colors)
+    colors = case.texture(half=True, fused=True)
+    for keep in (True, False):
+        again = torch.autograd.grad(colors, case.leaves, case.signal, retain_graph=keep)
+        assert_agree(colors, list(again), exact, references)
+
+
+@pytest.mark.cuda
+def test_what_the_fused_kernels_do_not_take_is_computed_in_layers(counted: list[int]) -> None:
+    case = make_case(torch.device("cuda"), 4, 3, False, (20, 10, 2))
+    with deterministic(True):
+        case.texture(half=True, fused=True)
+    case.directions.requires_grad_()
+    colors = case.texture(half=True, fused=True)
+    assert torch.autograd.grad(colors, case.directions, case.signal)[0].abs().max() > 0
+    assert not counted
+    with torch.no_grad():
+        case.texture(half=True, fused=True)
+    assert counted == [400]
+
+
+@pytest.mark.cuda
+def test_values_that_are_not_finite_are_passed_on() -> None:
+    """Health checks find them only if no ReLU turns them into zeros."""
+    case = make_case(torch.device("cuda"), 4, 3, False, (20, 10, 2))
+    with torch.no_grad():
+        case.leaves[2].fill_(float("nan"))
+    colors = case.texture(half=True, fused=True)
+    assert colors[case.leaves[1] > 0].isnan().all()
+    gradients = torch.autograd.grad(colors, case.leaves[3:], case.signal)
+    assert all(not gradient.isfinite().all() for gradient in gradients)
+
+
+def test_permutations_are_one_to_one() -> None:
+    for features in (2, 4):
+        assert sorted(logical_feature(c, features) for c in range(FEATURES)) == list(range(FEATURES))
+    assert sorted(logical_output(c) for c in range(OUTPUTS)) == list(range(OUTPUTS))
+
+
+@pytest.mark.parametrize(
+    ("shape", "usual"),
+    [
+        ({}, True),
+        ({"levels": 16, "features": 2}, True),
+        ({"levels": 32, "features": 1}, False),
+        ({"levels": 4, "features": 8}, False),
+        ({"levels": 16}, False),
+        ({"width": 32}, False),
+        ({"hidden_layers": 1}, False),
+        ({"hidden_layers": 3}, False),
+        *(({"sh_degree": degree}, True) for degree in range(3)),
+    ],
+    ids=str,
+)
+def test_shapes_that_the_kernels_take(shape: dict[str, int], usual: bool) -> None:
+    sizes: dict[str, Any] = {"levels": 8, "features": 4, "width": 64, "hidden_layers": 2, "sh_degree": 3} | shape
+    texture = nw.NeuralTexture(table_size=2**4, **sizes)
+    assert fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 1000) == usual
+    assert not fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 2**27)
+
+
+@pytest.mark.parametrize(
+    ("levels", "level_bytes", "groups"),
+    [
+        (8, 2**24, [(0, 4), (4, 5), (5, 6), (6, 7), (7, 8)]),
+        (16, 2**23, [(0, 8), (8, 10), (10, 12), (12, 14), (14, 16)]),
+        (8, 2**19, [(0, 8)]),
+        (1, 2**30, [(0, 1)]),
+    ],
+)
+def test_levels_of_one_launch(levels: int, level_bytes: int, groups: list[tuple[int, int]]) -> None:
+    assert fused_texture.level_groups(levels, level_bytes) == groups

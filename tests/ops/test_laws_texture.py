@@ -1,0 +1,131 @@
+"""A texture, and the jitter of its lookups, change a render by these laws, whatever the scene."""
+
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.machine import deterministic
+from nexwarp.model.render import jitter_factors
+from tests.render_support import MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+# On a CPU both forms of the kernels: see `conftest.form`.
+pytestmark = pytest.mark.usefixtures("form")
+
+
+@pytest.mark.parametrize("max_hits", [0, 2, MAX_HITS])
+def test_a_residual_texture_of_zeros_shows_the_plain_colours(max_hits: int, device: torch.device) -> None:
+    """What no photo looked at: features that the regulariser has taken to 0."""
+    scene = random_scene(device=device)
+    texture = make_texture(device=device, residual=True)
+    torch.nn.init.zeros_(texture.grid)
+    assert_alike(draw(scene, texture, max_hits=max_hits), draw(scene, max_hits=max_hits))
+    absent = draw(scene, make_texture(device=device), max_hits=0)
+    assert_alike(draw(scene, texture, max_hits=max_hits), absent, ("image", "alpha"))
+
+
+def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
+    scene = random_scene(device=device)
+    with_it, without = (draw(scene, make_texture(device=device, residual=flag)) for flag in (True, False))
+    shift = draw(scene).textured - 0.5 * without.weights.sum(-1, keepdim=True)
+    assert_close(with_it.textured, without.textured + shift, kind="value", name="textured")
+    with pytest.raises(ValueError, match=r"^clamp_texture: expected False with a residual texture, got True$"):
+        draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
+
+
+class Lookups:
+    """A texture's lookups: what `render` asks of it, and the answers."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        colors = nw.NeuralTexture.colors
+        self.positions: list[torch.Tensor] = []
+
+        def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
+            self.positions.append(positions.detach())
+            return colors(texture, positions, *arguments, **options)
+
+        monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
+
+
+@pytest.mark.parametrize("jitter", [0.5, 3.0])
+def test_jitter_moves_lookups_along_their_rays(
+    jitter: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
+    scene = random_scene(width=120, height=90, device=device)
+    texture, lookups = make_texture(device=device), Lookups(monkeypatch)
+    still = draw(scene, texture)
+    torch.manual_seed(3)
+    moved = draw(scene, texture, depth_jitter=jitter)
+    assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
+    assert torch.equal(moved.ids, still.ids)
+    camera, hit = make_camera(scene), still.ids >= 0
+    before, after = (x[hit] - camera.position.detach() for x in lookups.positions)
+    share = after.norm(dim=-1) / before.norm(dim=-1)
+    assert_close(after, before * share[:, None], kind="value", name="along the ray")
+    pixels = (share - 1) * camera.focal
+    assert len(pixels) > 5000
+    error = 5 / len(pixels) ** 0.5  # five standard deviations of what is estimated
+    assert abs(pixels.mean().item()) < error * jitter
+    assert abs(pixels.std().item() - jitter) < error * jitter
+    assert not torch.equal(moved.textured, still.textured)
+    torch.manual_seed(3)
+    assert_same(draw(scene, texture, depth_jitter=jitter), moved)
+    own = [torch.Generator(device).manual_seed(3) for _ in range(2)]
+    assert_same(*(draw(scene, texture, depth_jitter=jitter, generator=generator) for generator in own))
+    assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
+    drawn = jitter_factors(camera, 2, jitter, scene["means"].dtype, own[0].manual_seed(3))
+    assert_same(draw(scene, texture, depth_jitter=drawn), moved)
+
+
+def test_without_jitter_no_random_number_is_drawn(device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    torch.manual_seed(3)
+    expected = torch.rand((), device=device)
+    torch.manual_seed(3)
+    assert_same(draw(scene, texture, depth_jitter=0.0), draw(scene, texture))
+    assert torch.rand((), device=device) == expected
+
+
+@pytest.mark.parametrize(
+    ("jitter", "error"),
+    [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError), (torch.ones(2, 3), ValueError)],
+    ids=str,
+)
+def test_jitter_that_cannot_be_is_refused(jitter: Any, error: type[Exception], device: torch.device) -> None:
+    with pytest.raises(error, match=r"^depth_jitter: expected "):
+        draw(random_scene(device=device), make_texture(device=device), depth_jitter=jitter)
+
+
+def test_grid_can_be_written_in_place(device: torch.device) -> None:
+    scene, texture = random_scene(device=device), make_texture(device=device)
+    first = draw(scene, texture).textured
+    with torch.no_grad():
+        texture.grid.neg_()
+    assert not torch.equal(draw(scene, texture).textured, first)
+    with torch.no_grad():
+        texture.grid.neg_()
+    assert torch.equal(draw(scene, texture).textured, first)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2])
+def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None:
+    scene = random_scene(dtype=torch.float64, device=device)
+    texture = make_texture(sh_degree=sh_degree, dtype=torch.float64, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, texture, camera)
+    assert_alike(out, reference_render(twin(surfels), twin(texture), camera.to("cpu")))
+
+
+def test_pictures_without_textured_hits_have_gradients(device: torch.device) -> None:
+    """K = 0: no point is looked up, and the grid's gradient is 0, also where sums are deterministic."""
+    scene = random_scene(device=device)
+    surfels, texture = make_surfels(scene), make_texture(device=device)
+    with deterministic(device.type == "cuda"):
+        out = nw.render(surfels, texture, make_camera(scene), max_hits=0)
+        grid, sh = torch.autograd.grad(out.image.sum(), [texture.grid, surfels.sh0])
+    assert (grid == 0).all()
+    assert sh.isfinite().all() and sh.abs().max() > 0

@@ -1,0 +1,153 @@
+"""The order of blending: by distance, what a pixel shows depends on its ray alone, not on where the camera points."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nexwarp as nw
+from benchmarks.panoramas import crop, sampled, turned
+from nexwarp.data import demo_folder
+from nexwarp.errors import FormatError, SettingError
+from nexwarp.export.web.scene_data import SceneData
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model import frames
+from nexwarp.ops.tiles import Order
+from nexwarp.run.metrics import psnr
+from nexwarp.run.optics import Optics
+from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
+from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.settings import with_settings
+from tests import scenes
+from tests.render_support import (
+    BACKGROUND,
+    BUFFERS,
+    assert_gradients,
+    assert_same,
+    loss,
+    reference_render,
+    rigid_gradient,
+    twin,
+)
+from tests.tolerances import FLIPS, assert_close, assert_same_ids
+
+ORDERS: tuple[Order, ...] = ("depth", "distance")
+
+
+def wide_scene(dtype: torch.dtype, device: torch.device | str, count: int = 60) -> scenes.Scene:
+    """A view of 90 degrees, in whose corners z-depth and distance sort surfels differently."""
+    scene = scenes.random_scene(count, seed=4, width=36, height=28, dtype=dtype, device=device)
+    K = scene["K"].clone()
+    K[0, 0] = K[1, 1] = 16.0
+    return scene | {"K": K}
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_rendering_by_distance_agrees_with_the_reference(device, dtype, low_pass):
+    """Values and gradients, those of the camera included."""
+    scene = wide_scene(dtype, device)
+    surfels, camera = scenes.make_surfels(scene), scenes.make_camera(scene)
+    texture = scenes.make_texture(dtype=dtype, device=device)
+    texture.half_precision = False
+    options: dict[str, Any] = {"max_hits": 2, "background": BACKGROUND, "low_pass": low_pass, "order": "distance"}
+    out = nw.render(surfels, texture, camera, **options)
+    surfels64, texture64 = twin(surfels), twin(texture)
+    camera64 = scenes.make_camera(scene | {key: scene[key].double().cpu() for key in ("viewmat", "K")})
+    expected = reference_render(surfels64, texture64, camera64, **options)
+    loss(out).backward()
+    loss(expected).backward()
+    flips = 0.0 if dtype == torch.float64 else FLIPS
+    assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
+    for name in BUFFERS:
+        assert_close(getattr(out, name), getattr(expected, name), kind="value", name=name, allow_flips=flips)
+    assert_gradients(surfels, surfels64, dtype)
+    assert_gradients(texture, texture64, dtype)
+    moved = rigid_gradient(camera.viewmat), rigid_gradient(camera64.viewmat)
+    assert_close(*moved, kind="gradient", name="viewmat", precision=dtype)
+    by_depth = nw.render(surfels, texture, camera, **(options | {"order": "depth"}))
+    assert (by_depth.image - out.image).abs().max() > 0.01
+    assert_same(nw.render(surfels, texture, camera, max_hits=2, background=BACKGROUND, low_pass=low_pass), by_depth)
+
+
+def test_turning_the_camera_changes_no_ray(device):
+    """A camera turned by 30 degrees and given the rays of the first one sees what the first one does, by distance."""
+    scene = wide_scene(torch.float64, device)
+    camera = scenes.make_camera(scene)
+    texture = scenes.make_texture(dtype=torch.float64, device=device)
+    texture.half_precision = False
+    model = nw.Model(scenes.make_surfels(scene), texture, options=nw.RenderOptions(order="distance"))
+    away = turned(camera.viewmat.detach(), 0.5, -0.2)
+    rays = nw.RayCamera.pinhole(camera).rays @ camera.viewmat.detach()[:3, :3] @ away[:3, :3].T
+    other = nw.RayCamera(away, rays.contiguous(), camera.near, camera.focal)
+    with torch.no_grad():
+        expected, found = model.render(camera), model.render(other)
+        by_depth = model.render(camera, order="depth")
+        same = model.render(nw.RayCamera.pinhole(camera))
+    assert_same_ids(found.ids, expected.ids, name="ids")
+    for name in BUFFERS:
+        assert_close(getattr(found, name), getattr(expected, name), kind="value", name=name)
+        assert_close(getattr(same, name), getattr(expected, name), kind="value", name=name)
+    assert (by_depth.image - expected.image).abs().max() > 0.01
+
+
+@pytest.mark.cuda
+def test_captured_frames_keep_their_orders():
+    scene = wide_scene(torch.float32, "cuda")
+    model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
+    with torch.no_grad(), frames.without_graphs():
+        expected = {order: model.render(camera, order=order).image for order in ORDERS}
+    assert not torch.equal(expected["depth"], expected["distance"])
+    with torch.no_grad():
+        for _ in range(3):
+            for order in ORDERS:
+                assert torch.equal(model.render(camera, order=order).image, expected[order])
+    assert len(frames._graphs[model.surfels].frames) == 2
+
+
+def test_the_order_is_kept_in_files_and_named_where_it_is_bad(tmp_path):
+    surfels = scenes.make_surfels(scenes.random_scene(4))
+    model = nw.Model(surfels, None, options=nw.RenderOptions(order="distance"))
+    assert nw.load(model.save(tmp_path)).options.order == "distance"
+    with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
+        model.options.changed(order="near")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="order: expected depth or distance, got 1"):
+        nw.render(surfels, None, scenes.make_camera(scenes.random_scene(4)), order=1)  # type: ignore[arg-type]
+    with pytest.raises(FormatError, match="order: expected depth, which the web page draws, got distance"):
+        SceneData.of(model)
+
+
+def test_the_command_renders_by_the_order_asked_for(tmp_path):
+    scene = wide_scene(torch.float32, "cpu")
+    model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
+    camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
+    for order in ORDERS:
+        file = tmp_path / f"{order}.png"
+        RenderJob([PictureJob(file, camera, False, False)], None, 30.0, order=order).render(model)
+        expected = to_uint8(model.render(camera, order=order).image.detach())
+        assert (np.asarray(Image.open(file)) == expected.numpy()).all()
+    with pytest.raises(SettingError, match="--order: expected depth or distance, got 'near'"):
+        RenderOrder(None, views="test", order="near")
+    with pytest.raises(SettingError, match="--order: expected together with --camera pinhole, got --camera panorama"):
+        RenderOrder(None, views="test", order="distance", optics=Optics(kind="panorama"))
+    with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
+        with_settings(nw.Config(), {"order": "near"})
+
+
+@pytest.mark.slow
+def test_crops_of_a_panorama_of_the_trained_demo_are_pinhole_views():
+    """To 40 dB, at the panorama's pixel size and by distance; by z-depth they differ. Photos tell no order apart."""
+    scene = nw.load_scene(demo_folder())
+    config = with_settings(preset("default"), DEMO_SETTINGS)
+    model = nw.train(scene, config, device="cpu")
+    given, turn, width = scene.test[1].camera, (0.35, 0.1), 8192
+    with torch.no_grad():
+        camera = crop(given, turn, width)
+        found = sampled(model, given.viewmat, camera, width)
+        levels = {o: psnr(found, model.render(camera, order=o, exposure="mean").image) for o in ORDERS}
+        assert levels["distance"] > 40 > levels["depth"]
+        photos = [(v.camera, v.image / 255) for v in scene.test]
+        means = [sum([psnr(model.render(c, order=o).image, x) for c, x in photos]) / len(photos) for o in ORDERS]
+    assert abs(means[0] - means[1]) < 0.1

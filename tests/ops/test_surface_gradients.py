@@ -1,0 +1,290 @@
+"""Gradients of depths, normals and distortion: the float64 reference, differences, values by hand, and laws."""
+
+import importlib
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.kernels import launch
+from tests.narrowing import present
+from tests.ops.test_laws import awkward_scene
+from tests.reference.surface import Surface, surface
+from tests.render_support import assert_gradients, rigid_gradient, twin
+from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import FLIPS, TOLERANCES, assert_close
+
+BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals", "distortion")
+GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
+
+
+def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera, low_pass: bool) -> Surface:
+    """Hand tensors in float64 on the CPU to the reference."""
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+    means, quats, scales, opacities, gammas, viewmat = (tensors[name] for name in (*GEOMETRY, "viewmat"))
+    return surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics, low_pass)
+
+
+def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
+    """Sum of the buffers with fixed random factors."""
+    generator = torch.Generator().manual_seed(7)
+    total = getattr(out, buffers[0]).new_zeros(())
+    for name in buffers:
+        buffer = getattr(out, name)
+        total = total + (buffer * torch.randn(buffer.shape, generator=generator, dtype=torch.float64).to(buffer)).sum()
+    return total
+
+
+def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
+    if name == "layered":
+        return layered_scene(dtype=dtype, device=device)
+    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
+    if name == "specks":
+        scene["scales"] *= 0.1
+    return scene
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+@pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradients_agree_with_the_reference(
+    dtype: torch.dtype, name: str, low_pass: bool, device: torch.device
+) -> None:
+    """With respect to every parameter and the camera; of the random scene in float64 for each buffer by itself, too."""
+    scene = make_scene(name, dtype, device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    expected, viewmat = twin(surfels), camera.viewmat.detach().double().cpu().requires_grad_()
+    tensors = {key: getattr(expected, key) for key in GEOMETRY} | {"viewmat": viewmat}
+    out, right = nw.render(surfels, None, camera, low_pass=low_pass), reference(tensors, camera, low_pass)
+    leaves = (surfels, camera.viewmat), (expected, viewmat)
+    apart = dtype == torch.float64 and name == "random"
+    for buffers in (*((buffer,) for buffer in BUFFERS if apart), BUFFERS):
+        for module, matrix in leaves:
+            module.zero_grad()
+            matrix.grad = None
+        loss(out, buffers).backward(retain_graph=True)
+        loss(right, buffers).backward(retain_graph=True)
+        assert_gradients(surfels, expected, dtype)
+        turns = rigid_gradient(camera.viewmat), rigid_gradient(viewmat)
+        assert_close(*turns, kind="gradient", name=f"viewmat of {buffers}", precision=dtype)
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_gradients_of_the_reference_agree_with_differences(low_pass: bool) -> None:
+    scene = random_scene(6, seed=3, width=7, height=6, dtype=torch.float64)
+    camera = make_camera(scene)
+    inputs = [scene[name].clone().requires_grad_() for name in (*GEOMETRY, "viewmat")]
+
+    def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        out = reference(dict(zip((*GEOMETRY, "viewmat"), tensors, strict=True)), camera, low_pass)
+        return tuple(getattr(out, name) for name in BUFFERS)
+
+    assert buffers(*inputs)[-1].max() > 0.01
+    assert torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) -> None:
+    """Of the rendering itself, with respect to the raw parameters."""
+    scene = random_scene(8, seed=3, width=9, height=8, dtype=torch.float64, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    named = [(name, x) for name, x in surfels.named_parameters() if not name.startswith("sh")]
+
+    def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        given = dict(zip((name for name, _ in named), tensors, strict=True))
+        out = torch.func.functional_call(
+            _Drawn(surfels, camera, low_pass), {f"surfels.{k}": x for k, x in given.items()}
+        )
+        return tuple(out)
+
+    # Sums are in no fixed order on a GPU, so that two backward passes differ by roundings.
+    nondet_tol = TOLERANCES[torch.float64]["gradient"] if device.type == "cuda" else 0.0
+    assert torch.autograd.gradcheck(buffers, [x for _, x in named], fast_mode=True, nondet_tol=nondet_tol)
+
+
+class _Drawn(torch.nn.Module):
+    """Renders surfels whose parameters can be replaced; returns the buffers."""
+
+    def __init__(self, surfels: nw.Surfels, camera: nw.Camera, low_pass: bool) -> None:
+        super().__init__()
+        self.surfels, self.camera, self.low_pass = surfels, camera, low_pass
+
+    def forward(self) -> list[torch.Tensor]:
+        out = nw.render(self.surfels, None, self.camera, low_pass=self.low_pass)
+        return [getattr(out, name) for name in BUFFERS]
+
+
+def test_the_median_and_the_top_depth_follow_the_hit_that_they_are_taken_from(device: torch.device) -> None:
+    """A sheet across the view: moved along its normal by h, its depth changes by h; no other sheet has a gradient."""
+    scene = layered_scene(dtype=torch.float64, device=device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    out = nw.render(surfels, None, camera, max_hits=1)
+    found = []
+    for buffer in (out.median_depth, out.top_depth):
+        for x in surfels.parameters():
+            x.grad = None
+        buffer[9, 11].backward(retain_graph=True)
+        grads = dict(surfels.named_parameters())
+        moved = present(grads["means"].grad).abs().sum(-1).nonzero()[:, 0]
+        assert len(moved) == 1
+        assert not any(present(x.grad).any() for name, x in grads.items() if "opacities" in name or "gammas" in name)
+        found.append(int(moved))
+    assert found[1] == int(out.ids[9, 11, 0])
+
+
+def test_a_distortion_gradient_pulls_sheets_together(device: torch.device) -> None:
+    """Weights 0.5, 0.25 and 0.2; the nearest and the farthest of three sheets are pulled to the one between."""
+    scene = random_scene(3, width=12, height=9, dtype=torch.float64, device=device)
+    z = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64, device=device)
+    scene |= {
+        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64, device=device).expand(3, 4).clone(),
+        "scales": torch.full((3, 2), 100.0, dtype=torch.float64, device=device),
+        "opacities": torch.tensor([0.5, 0.5, 0.8], dtype=torch.float64, device=device),
+        "gammas": torch.full((3, 2), 50.0, dtype=torch.float64, device=device),
+        "viewmat": torch.eye(4, dtype=torch.float64, device=device),
+    }
+    surfels = make_surfels(scene)
+    out = nw.render(surfels, None, make_camera(scene))
+    pairs = 0.5 * 0.25 * 1 + 0.5 * 0.2 * 3 + 0.25 * 0.2 * 2
+    assert_close(out.distortion, torch.full_like(out.distortion, pairs), kind="value", name="distortion")
+    out.distortion[4, 6].backward()
+    expected = torch.tensor([-0.5 * 0.45, 0.25 * (0.5 - 0.2), 0.2 * 0.75], dtype=torch.float64)
+    assert_close(present(surfels.means.grad)[:, 2], expected, kind="gradient", name="means")
+
+
+def test_distortion_vanishes_where_all_hits_have_one_depth(device: torch.device) -> None:
+    scene = layered_scene(1, dtype=torch.float64, device=device)
+    out = nw.render(make_surfels(scene), None, make_camera(scene))
+    assert out.alpha.any() and not out.distortion.any()
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_awkward_surfels_have_finite_gradients(low_pass: bool, device: torch.device) -> None:
+    """Behind, at, around and across the camera, edge-on, enormous and tiny."""
+    scene = awkward_scene(device)
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    loss(nw.render(surfels, None, camera, low_pass=low_pass)).backward()
+    for name, x in surfels.named_parameters():
+        assert x.grad is None or x.grad.isfinite().all(), name
+    assert present(camera.viewmat.grad).isfinite().all()
+
+
+def test_gradients_add_to_those_of_the_image(device: torch.device) -> None:
+    """One backward pass of a sum gives the sum of the gradients."""
+    scene = random_scene(dtype=torch.float64, device=device)
+    parts: list[list[torch.Tensor]] = []
+    for image, depth in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+        surfels = make_surfels(scene)
+        out = nw.render(surfels, None, make_camera(scene))
+        (image * out.image.square().sum() + depth * loss(out)).backward()
+        parts.append([present(x.grad) for x in surfels.parameters()])
+    for a, b, both in zip(*parts, strict=True):
+        assert_close(both, a + b, kind="gradient", name="sum")
+
+
+def test_the_first_use_may_be_without_gradients(device: torch.device) -> None:
+    """What is kept for later uses has the gradients of the rendering, whoever asked first."""
+    scene = random_scene(dtype=torch.float64, device=device)
+    out = nw.render(make_surfels(scene), None, make_camera(scene))
+    with torch.no_grad():
+        assert out.median_depth.any()
+    assert all(getattr(out, name).requires_grad for name in BUFFERS)
+    with torch.no_grad():
+        out = nw.render(make_surfels(scene), None, make_camera(scene))
+    assert not any(getattr(out, name).requires_grad for name in BUFFERS)
+
+
+def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a rendering nor its backward pass launches a kernel of the surface."""
+    launched: list[str] = []
+    module = importlib.import_module("nexwarp.ops.surface")
+    plain = module.launch_walk
+
+    def noted(*given: Any) -> None:
+        launched.append("walk")
+        plain(*given)
+
+    monkeypatch.setattr(module, "launch_walk", noted)
+    scene = random_scene()
+    surfels = make_surfels(scene)
+    out = nw.render(surfels, make_texture(), make_camera(scene))
+    out.image.sum().backward(retain_graph=True)
+    assert not launched
+    (out.normals.sum() + out.expected_depth.sum()).backward()
+    assert len(launched) == 2
+
+
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_sums_in_fixed_point_are_those_of_floats(low_pass: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = random_scene(150, seed=3, width=61, height=45)
+    results = []
+    with launch.cpu_form("scalar"):
+        for fixed in (False, True):
+            module = importlib.import_module("nexwarp.ops.collect")
+            monkeypatch.setattr(module, "sums_in_fixed_point", lambda like, fixed=fixed: fixed)
+            surfels = make_surfels(scene)
+            loss(nw.render(surfels, None, make_camera(scene), low_pass=low_pass)).backward()
+            results.append({name: present(x.grad) for name, x in surfels.named_parameters() if x.grad is not None})
+    for name, plain in results[0].items():
+        assert_close(results[1][name], plain, kind="gradient", name=name)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_gradients_repeat_bit_for_bit(low_pass: bool) -> None:
+    """Thousands of overlapping surfels: with torch's deterministic algorithms all bits repeat."""
+    scene = random_scene(4000, width=400, height=300, device=torch.device("cuda"))
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    found = []
+    torch.use_deterministic_algorithms(True)
+    try:
+        for _ in range(5):
+            out = nw.render(surfels, None, camera, low_pass=low_pass)
+            geometry = [x for name, x in surfels.named_parameters() if not name.startswith("sh")]
+            found.append(torch.autograd.grad(loss(out), [*geometry, camera.viewmat]))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("low_pass", [False, True])
+def test_cuda_agrees_with_the_cpu(low_pass: bool) -> None:
+    """Thousands of surfels, in float32: values and gradients."""
+    results = []
+    for device in ("cpu", "cuda"):
+        scene = random_scene(3000, seed=5, width=200, height=150, device=device)
+        surfels = make_surfels(scene)
+        out = nw.render(surfels, None, make_camera(scene), low_pass=low_pass)
+        # Not the distortion: at a tie of depths its gradient jumps.
+        loss(out, ("expected_depth", "blended_normals")).backward()
+        results.append((out, surfels))
+    (cpu, one), (cuda, two) = results
+    for name in BUFFERS:
+        assert_close(getattr(cuda, name), getattr(cpu, name), kind="value", name=name, allow_flips=FLIPS)
+    for (name, a), (_, b) in zip(one.named_parameters(), two.named_parameters(), strict=True):
+        if a.grad is not None:
+            assert_close(present(b.grad), a.grad, kind="gradient", name=name)
+
+
+@pytest.mark.usefixtures("restore_launch_threads")
+def test_short_lists_have_the_same_gradients(device: torch.device) -> None:
+    """Where lists lack entries the walk goes over all surfels. They are for CUDA: a CPU's threads would add at once."""
+    launch.set_num_threads(1)
+    scene = random_scene(60, width=70, height=40, dtype=torch.float64, device=device)
+    found = []
+    for room in (None, 3):
+        surfels, camera = make_surfels(scene), make_camera(scene)
+        pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+        shape = surfels.activated()
+        projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
+        tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=room)
+        hits = ops.collect(projection, tiles, pinhole)
+        loss(ops.surface(projection, tiles, hits, pinhole, camera.viewmat)).backward()
+        found.append([x.grad for name, x in surfels.named_parameters() if not name.startswith("sh")])
+    for a, b in zip(*found, strict=True):
+        assert_close(present(b), present(a), kind="gradient", name="short lists")

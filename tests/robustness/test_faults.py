@@ -1,0 +1,283 @@
+"""A disk that is full or fails, at every single write: one clear line, nothing lost that was saved, nothing half."""
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cli import main as cli
+from nexwarp.data import write_demo
+from nexwarp.errors import NexwarpError, StorageError
+from nexwarp.io.pictures import load_exr
+from nexwarp.run.folder import check_room, read_metrics, read_run
+from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from tests.faults import Disk, failing
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+# Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
+# short command.
+SMALL = Config(
+    exposures=False,
+    smooth_sh=0.0,
+    footprints=False,
+    texture=TextureConfig(levels=2, table_size=2**6, width=8),
+    densify=DensifyConfig(every=2),
+    sh_degree=1,
+)
+FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
+FULL, BROKEN = errno.ENOSPC, errno.EIO
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=4, points=100)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "tiny"
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 0
+    return run
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def whole_checkpoints(run: Path) -> list[int]:
+    """Iterations of the checkpoints that are there; none may be damaged."""
+    folders = [run / name for name in ("checkpoint", "checkpoint.old", "checkpoint.older")]
+    return [_read_checkpoint(folder)[1]["iteration"] for folder in folders if folder.is_dir()]
+
+
+def check_whole(folder: Path) -> None:
+    """Fail if any file below a folder is half-written, or a temporary one."""
+    for name in files(folder):
+        file = folder / name
+        assert ".tmp" not in name, name
+        if file.suffix == ".json":
+            json.loads(file.read_bytes())
+        elif file.name == "model.safetensors":
+            nw.load(file)
+        elif file.suffix == ".exr":
+            load_exr(file)
+    whole_checkpoints(folder)
+
+
+def one_line(capsys: pytest.CaptureFixture[str], *words: str) -> None:
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
+    assert all(word in err for word in words), err
+
+
+def every_fault(run: Path, command: list[str]) -> Iterator[Disk]:
+    """Disks that fail one request of a command after the other; each is yielded in place of the command's own.
+
+    A full disk fails all that follow, too; a broken one that one alone.
+    """
+    with failing(Disk(run)) as counted:
+        assert cli.main(command) == 0
+    yield from (
+        Disk(run, fatal, number, number == FULL) for fatal in range(len(counted.requests)) for number in (FULL, BROKEN)
+    )
+
+
+# Training
+
+
+def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, capsys):
+    """What was saved stays, whatever fails; with --resume, on a disk that works again, the end is the same."""
+    expected = (trained / "model.safetensors").read_bytes()
+    run = tmp_path / "run"
+    command = ["train", str(scene), "--run", str(run), *FLAGS]
+    disks = every_fault(run, command)
+    count = 0
+    for disk in disks:
+        shutil.rmtree(run, ignore_errors=True)
+        capsys.readouterr()
+        with failing(disk):
+            code = cli.main(command)
+        assert disk.fatal is not None
+        where = disk.requests[disk.fatal]
+        assert code == 2, where
+        one_line(capsys, os.strerror(disk.number))
+        if not run.exists():
+            assert disk.fatal < 8, where  # the config
+            count += 1
+            continue
+        check_whole(run)
+        kept = whole_checkpoints(run)
+        saved = [r for r in disk.requests[: disk.fatal] if r == "rename checkpoint"]
+        assert len(kept) >= min(len(saved), 2) and (not saved or kept[0] >= len(saved)), where
+        if disk.fatal % 3 == 0 or not kept:
+            assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--resume"]) == 0, where
+            assert (run / "model.safetensors").read_bytes() == expected, where
+            check_whole(run)
+        count += 1
+    assert count > 100
+
+
+def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_path, capsys):
+    """A checkpoint is three times as large."""
+    run = tmp_path / "run"
+    command = ["train", str(scene), "--run", str(run), *FLAGS]
+    with failing(Disk(run)) as counted:
+        assert cli.main(command) == 0
+    second = [i for i, r in enumerate(counted.requests) if r.startswith("write .tensors")][1]
+    shutil.rmtree(run)
+    capsys.readouterr()
+    with failing(Disk(run, second, FULL)):
+        assert cli.main(command) == 2
+    one_line(capsys, "No space left", "training stops at iteration 2", "the current model is saved", "--resume")
+    assert nw.load(run).meta["iteration"] == 2
+    assert whole_checkpoints(run) == [1]
+
+
+def test_a_disk_without_room_is_refused_before_training(trained, scene, tmp_path, monkeypatch, capsys):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2**20))
+    command = ["train", str(scene), "--run", str(tmp_path / "new" / "run"), *FLAGS]
+    assert cli.main(command) == 2
+    one_line(capsys, str(tmp_path / "new" / "run"), "of free disk space", "got 1 MiB", "--max-surfels")
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(StorageError, match="of free disk space"):
+        check_room(tmp_path, 2**20 + 1)
+    check_room(tmp_path, 2**20)
+
+
+def test_a_read_only_folder_is_refused_before_training(scene, tmp_path, capsys):
+    run = tmp_path / "run"
+    with failing(Disk(run, 0, errno.EROFS, lasting=True)):
+        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 2
+    one_line(capsys, str(run), "Read-only file system")
+    assert not run.exists()
+
+
+# Other commands
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["eval", "{run}", "--device", "cpu"],
+        ["export", "{run}", "--out", "{run}/out"],
+        ["export", "{run}", "--format", "cameras", "--out", "{run}/out"],
+        ["render", "{run}", "--set", "test", "--buffers", "--device", "cpu"],
+    ],
+    ids=["eval", "export", "cameras", "render"],
+)
+def test_other_commands_survive_every_fault(trained, tmp_path, capsys, arguments):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    command = [argument.format(run=run) for argument in arguments]
+    before = files(run)
+    disks = list(every_fault(run, command))
+    assert len(disks) >= 8
+    after = files(run)
+    for disk in disks:
+        shutil.rmtree(run)
+        shutil.copytree(trained, run)
+        capsys.readouterr()
+        with failing(disk):
+            assert cli.main(command) == 2, disk.requests
+        one_line(capsys, os.strerror(disk.number))
+        check_whole(run)
+        now = files(run)
+        assert before.keys() <= now.keys() <= after.keys()
+        assert all(now[name] in (before.get(name), after[name]) for name in now)
+
+
+# Files that are read back
+
+
+def lengths(content: bytes) -> list[int]:
+    """Of a truncated file: nothing, around the header and its length, halves, all but the end."""
+    size = len(content)
+    header = 8 + int.from_bytes(content[:8], "little") if size > 8 else 0
+    wanted = {
+        0,
+        1,
+        7,
+        8,
+        9,
+        16,
+        header - 1,
+        header,
+        header + 1,
+        size // 4,
+        size // 2,
+        3 * size // 4,
+        size - 8,
+        size - 2,
+    }
+    return sorted(length for length in wanted | {size - 1} if 0 <= length < size)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("model.safetensors", nw.load),
+        ("config.json", lambda file: read_run(file.parent)),
+        ("cameras.json", load_cameras),
+        ("metrics.json", lambda file: read_metrics(file.parent)),
+        ("checkpoint/state.json", lambda file: load_checkpoint(file.parents[1])),
+        ("checkpoint/tensors.safetensors", lambda file: load_checkpoint(file.parents[1])),
+    ],
+)
+def test_truncated_files_are_refused(trained, tmp_path, name, read: Callable[[Path], Any]):
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoint.old")
+    file = run / name
+    content = file.read_bytes()
+    read(file)
+    whole = content.rstrip() if name.endswith(".json") else content  # the last line's end is not missed
+    for length in sorted({*lengths(whole), *range(0, len(whole), max(len(whole) // 100, 1))}):
+        file.write_bytes(content[:length])
+        with pytest.raises(NexwarpError) as caught:
+            read(file)
+        assert isinstance(caught.value, ValueError) and "\n" not in str(caught.value)
+        assert str(caught.value).startswith(str(run)), caught.value
+
+
+@pytest.mark.parametrize("name", ["config.json", "cameras.json", "metrics.json"])
+@pytest.mark.parametrize("content", [b"[" * 200_000, b"\xff\xfe", b"null", b"3", b'"x"', b"[[1, 2]]", b'{"a": 1e999}'])
+def test_json_of_another_shape_is_refused(trained, tmp_path, capsys, name, content):
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    (run / name).write_bytes(content)
+    command = {"config.json": "info", "cameras.json": "render", "metrics.json": "info"}[name]
+    flags = ["--device", "cpu"] if command == "render" else []
+    code = cli.main([command, str(run), *flags])
+    err = capsys.readouterr().err
+    if name == "metrics.json" and code == 0:
+        assert content == b'{"a": 1e999}'  # facts that it does not know
+        return
+    assert code == 2 and str(run / name) in err and err.count("\n") == 1, err
+
+
+def test_flipped_bits_of_a_checkpoint_never_pass(trained, tmp_path):
+    """A few hundred places in the tensors, of a real one; test_checkpoint.py flips every byte of a small one."""
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoint.old")
+    generator = torch.Generator().manual_seed(0)
+    for name in ("tensors.safetensors", "state.json"):
+        file = run / "checkpoint" / name
+        content = file.read_bytes()
+        for place in torch.randint(len(content), (150,), generator=generator).tolist():
+            flipped = bytearray(content)
+            flipped[place] ^= 1 << (place % 8)
+            file.write_bytes(flipped)
+            with pytest.raises(NexwarpError, match="expected a whole checkpoint"):
+                load_checkpoint(run)
+        file.write_bytes(content)
+    load_checkpoint(run)

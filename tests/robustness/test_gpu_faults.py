@@ -1,0 +1,385 @@
+"""Faults of a GPU: too little memory, a fault that ends the context, NaN out of a kernel. On a CPU they are played."""
+
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.cli import main as cli
+from nexwarp.errors import DivergedError, OutOfMemoryError
+from nexwarp.machine import deterministic
+from nexwarp.model.buffers import PASSES, render_buffers
+from nexwarp.train import graphs as step_graphs
+from nexwarp.train import trainer as trainer_module
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.relocation import least_contributing
+from nexwarp.train.teachers import Teachers
+from nexwarp.train.trainer import Trainer
+from tests.faults import Allocator, allocating, failing_gpu
+from tests.narrowing import present
+from tests.render_support import BACKGROUND, assert_same, loss
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.trainer_support import assert_same_state, small
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
+FLAGS = [
+    "--iterations",
+    "3",
+    "--max-surfels",
+    "24",
+    "--checkpoint-every",
+    "1",
+    "--deterministic",
+    "--set",
+    "cuda_graphs=false",
+]
+STEPS = 4  # of a training that lacks memory: a round of density control is the third
+FAULTS = [
+    "CUDA error: device-side assert triggered\nCUDA kernel errors might be asynchronously reported",
+    "CUDA error: an illegal memory access was encountered\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1",
+    "Warp CUDA error 719: unspecified launch failure (in function wp_cuda_launch_kernel)",
+]
+
+
+@pytest.fixture(autouse=True)
+def fixed_order(device: torch.device) -> Iterator[None]:
+    """On CUDA without atomics, whose order differs from one launch to the next."""
+    with deterministic(device.type == "cuda"):
+        yield
+
+
+def chosen(count: int, device: torch.device) -> list[int]:
+    """Some of `count` requests, the first and the last among them: few on the CPU, where the default run has them."""
+    most = 60 if device.type == "cuda" else 12
+    return sorted({0, count - 1, *random.Random(0).sample(range(count), min(count, most))})
+
+
+# Memory, rendering
+
+
+def test_a_rendering_that_lacks_memory_can_be_repeated(device):
+    scene = random_scene(40, device=device)
+    model, camera = nw.Model(make_surfels(scene), make_texture(device=device)), make_camera(scene)
+    expected = render_buffers(model, camera)  # compiles, and fills the caches
+    with allocating(Allocator()) as counted:
+        render_buffers(model, camera)
+    assert counted.requests > 20
+    failed = 0
+    for fatal in chosen(counted.requests, device):
+        try:
+            with allocating(Allocator(fatal)):
+                render_buffers(model, camera)
+        except OutOfMemoryError as error:
+            assert "23x18" in str(error) and error.needed == "2.00 GiB"
+            failed += 1
+        except torch.OutOfMemoryError:  # depths and normals, on their first access after the rendering
+            failed += 1
+        assert_same(render_buffers(model, camera), expected, PASSES)
+    assert failed > 10
+
+
+def test_gradients_that_lack_memory_can_be_repeated(device):
+    scene = random_scene(40, device=device)
+    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
+
+    def gradients() -> list[torch.Tensor]:
+        for x in (*surfels.parameters(), *texture.parameters(), camera.viewmat):
+            x.grad = None
+        loss(nw.render(surfels, texture, camera, background=BACKGROUND)).backward()
+        return [present(x.grad).clone() for x in (*surfels.parameters(), *texture.parameters(), camera.viewmat)]
+
+    expected = gradients()
+    with allocating(Allocator()) as counted:
+        gradients()
+    for fatal in chosen(counted.requests, device):
+        with pytest.raises((OutOfMemoryError, torch.OutOfMemoryError)), allocating(Allocator(fatal)):
+            gradients()
+        assert all(torch.equal(a, b) for a, b in zip(gradients(), expected, strict=True)), fatal
+
+
+# Memory, training
+
+
+@pytest.mark.usefixtures("few_places")
+def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scene, device):
+    """It ends with our error or, where CUDA graphs can be given up, goes on; the end has the bits of no fault."""
+    config = small(deterministic=True)
+    expected, run = Trainer(tiny_scene, config, device), Trainer(tiny_scene, config, device)
+    start = run.snapshot()
+    with allocating(Allocator()) as counted:
+        expected.run(until=STEPS)
+    failed = 0
+    for fatal in chosen(counted.requests, device):
+        run.load_snapshot(start)
+        try:
+            with allocating(Allocator(fatal)):
+                run.run(until=STEPS)
+        except OutOfMemoryError as error:
+            assert f"at iteration {run.iteration}: it needed 2.00 GiB" in str(error) and "\n" not in str(error)
+            failed += 1
+            run.load_snapshot(present(run.good))
+            run.run(until=STEPS)
+        except torch.OutOfMemoryError:
+            assert run.iteration == 0, fatal  # the first snapshot
+            run.load_snapshot(start)
+            run.run(until=STEPS)
+        assert_same_state(run, expected)
+    assert failed > 5
+
+
+@pytest.mark.parametrize(
+    ("error", "repeated"),
+    [(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True),
+     (OutOfMemoryError("out of memory", "2.00 GiB"), True),
+     (step_graphs.UpdateError("out of memory", "2.00 GiB"), False),
+     (RuntimeError("shape mismatch"), False)],
+)  # fmt: skip
+def test_a_step_is_repeated_without_graphs_only_if_it_has_updated_nothing(monkeypatch, error, repeated):
+    done: list[str] = []
+    graphs = object.__new__(step_graphs.StepGraphs)
+    graphs.chances, graphs.keeper = 3, object()  # type: ignore[assignment]  # stands for a graph
+
+    def fail(*_: Any) -> NoReturn:
+        raise error
+
+    def work(target: Any) -> Any:
+        done.append(target)
+        return target
+
+    monkeypatch.setattr(graphs, "_run", fail)
+    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
+    if repeated:
+        assert graphs.run("target", work, None) == "target"  # type: ignore[arg-type]
+        assert done == ["cleared", "target"] and graphs.chances == 2
+    else:
+        with pytest.raises(type(error)):
+            graphs.run("target", work, None)  # type: ignore[arg-type]
+        assert not done
+
+
+@pytest.mark.parametrize(
+    ("error", "kept", "repeated"),
+    [(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True, True),
+     (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), False, False),
+     (RuntimeError("shape mismatch"), True, False)],
+)  # fmt: skip
+def test_a_teacher_that_lacks_memory_renders_again_without_graphs_if_there_are_any(
+    tiny_scene, monkeypatch, error, kept, repeated
+):
+    """The memory of a training's graphs may be what its teachers' renderings lack."""
+    config = small(iterations=8)
+    trainer = Trainer(tiny_scene, config, "cpu", teachers=[Trainer(tiny_scene, config, "cpu").finish()])
+    teachers, render = present(trainer.teachers), Teachers.target
+    done: list[str] = []
+    graphs = object.__new__(step_graphs.StepGraphs)
+    graphs.chances, graphs.keeper = 3, object() if kept else None  # type: ignore[assignment]  # stands for a graph
+
+    def render_once_in_vain(*given: Any) -> Any:
+        done.append("rendered")
+        if done == ["rendered"]:
+            raise error
+        return render(*given)
+
+    number = next(number for number in range(1, 8) if teachers.teaches(number))
+    expected = trainer._target(0, number, []).photo
+    monkeypatch.setattr(Teachers, "target", render_once_in_vain)
+    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
+    trainer.graphs = graphs
+    if repeated:
+        assert torch.equal(trainer._target(0, number, []).photo, expected)
+        assert done == ["rendered", "cleared", "rendered"] and graphs.chances == 2
+    else:
+        with pytest.raises(type(error)):
+            trainer._target(0, number, [])
+        assert done == ["rendered"]
+
+
+def test_relocation_that_lacks_memory_is_repeated_without_graphs(tiny_scene, monkeypatch):
+    """It renders all training views, for which the memory of the graphs may be missing; the training is the same."""
+    densify = DensifyConfig(every=3, relocate=0.2, prune_opacity=0.0, fraction=0.2)
+    config = small(iterations=120, max_surfels=50, densify=densify)
+    expected, trainer = Trainer(tiny_scene, config, "cpu"), Trainer(tiny_scene, config, "cpu")
+    expected.run(until=33)
+    done: list[str] = []
+
+    def find_once_in_vain(*given: Any) -> Any:
+        done.append("looked")
+        if done == ["looked"]:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return least_contributing(*given)
+
+    graphs = object.__new__(step_graphs.StepGraphs)
+    graphs.chances, graphs.keeper = 3, object()  # type: ignore[assignment]  # stands for a graph
+    monkeypatch.setattr(graphs, "run", lambda target, work, _: work(target))
+    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
+    monkeypatch.setattr(trainer_module, "least_contributing", find_once_in_vain)
+    monkeypatch.setattr(trainer, "_graph_key", lambda: None)
+    trainer.graphs = graphs
+    trainer.run(until=33)
+    assert done == ["looked", "cleared", "looked"] and graphs.chances == 2
+    trainer.graphs = None
+    assert_same_state(trainer, expected)
+
+
+def test_an_update_that_lacks_memory_is_told_apart(tiny_scene, monkeypatch, device):
+    trainer = Trainer(tiny_scene, small(cuda_graphs=False), device)
+
+    def fail(*_: Any) -> NoReturn:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    monkeypatch.setattr(trainer.optimizer, "step", fail)
+    with pytest.raises(step_graphs.UpdateError):
+        trainer.step()
+    with pytest.raises(OutOfMemoryError, match=r"^out of (GPU )?memory at iteration 2: it needed 2\.00 GiB"):
+        trainer.run()
+
+
+# Memory, for real
+
+
+@contextmanager
+def little_memory(device: torch.device) -> Iterator[None]:
+    """Leave nothing of the GPU's memory for the block: no new segment, and no place in those that there are."""
+    torch.cuda.synchronize(device)
+    torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(device).total_memory
+    held: list[torch.Tensor] = []
+    torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved(device) + 2**20) / total, device)
+    try:
+        for size in (2**24, 2**21, 2**20 + 2**9, 2**20, 2**12, 2**9):
+            while True:
+                try:
+                    held.append(torch.empty(size, dtype=torch.uint8, device=device))
+                except torch.OutOfMemoryError:
+                    break
+        yield
+    finally:
+        held.clear()
+        torch.cuda.set_per_process_memory_fraction(1.0, device)
+        torch.cuda.empty_cache()
+
+
+@pytest.mark.cuda
+def test_a_gpu_that_is_full_refuses_a_rendering_and_then_gives_the_same_bits():
+    device = torch.device("cuda", torch.cuda.current_device())
+    scene = random_scene(40, device=device)
+    model = nw.Model(make_surfels(scene), make_texture(device=device))
+    camera = make_camera(scene, width=1024, height=768)
+    with torch.no_grad():
+        expected = model.render(camera)
+        with little_memory(device):
+            for _ in range(3):
+                with pytest.raises(OutOfMemoryError, match=r"^out of memory: an image of 1024x768 pixels with K = 2"):
+                    model.render(camera)
+        assert_same(model.render(camera), expected)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("cuda_graphs", [False, True])
+def test_a_gpu_that_is_full_ends_a_training_that_then_goes_on(tiny_scene, cuda_graphs):
+    device = torch.device("cuda", torch.cuda.current_device())
+    config = small(deterministic=True, cuda_graphs=cuda_graphs)
+    expected, run = Trainer(tiny_scene, config, device), Trainer(tiny_scene, config, device)
+    expected.run(until=8)
+    run.run(until=5)
+    state = run.snapshot()
+    with little_memory(device), pytest.raises(OutOfMemoryError, match=r"^out of GPU memory at iteration "):
+        run.run(until=8)
+    run.load_snapshot(state)
+    run.run(until=8)
+    assert_same_state(run, expected)
+
+
+# A fault that ends the GPU's context
+
+
+def train(scene: Path, run: Path, device: torch.device, *flags: str) -> int:
+    return cli.main(["train", str(scene), "--run", str(run), "--device", device.type, *FLAGS, *flags])
+
+
+def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(tiny_folder, tmp_path, capsys, device):
+    whole = tmp_path / "whole"
+    with failing_gpu(None, "") as launches:
+        assert train(tiny_folder, whole, device) == 0
+    expected = (whole / "model.safetensors").read_bytes()
+    places = random.Random(1).sample(range(len(launches) // 10, len(launches)), 12 if device.type == "cuda" else 3)
+    for fatal, message in zip(sorted(places), FAULTS * 4, strict=False):
+        run = tmp_path / f"run{fatal}"
+        capsys.readouterr()
+        with failing_gpu(fatal, message):
+            assert train(tiny_folder, run, device) == 3
+        line = (
+            f"nexwarp: error: the GPU failed ({message.splitlines()[0]}); --resume continues from the last checkpoint\n"
+        )
+        assert capsys.readouterr().err == line
+        assert not list(run.rglob("*.tmp*"))
+        if (run / "model.safetensors").exists():  # a fault of the evaluation
+            assert (run / "model.safetensors").read_bytes() == expected, fatal
+        assert train(tiny_folder, run, device, "--resume") == 0
+        assert (run / "model.safetensors").read_bytes() == expected, fatal
+
+
+def test_a_fault_of_the_gpu_is_told_of_any_command(tiny_folder, tmp_path, capsys, device):
+    run = tmp_path / "run"
+    assert train(tiny_folder, run, device) == 0
+    capsys.readouterr()
+    with failing_gpu(5, FAULTS[1]):
+        assert cli.main(["render", str(run), "--set", "test", "--device", device.type]) == 3
+    line = "nexwarp: error: the GPU failed (CUDA error: an illegal memory access was encountered)\n"
+    assert capsys.readouterr().err == line
+
+
+# NaN out of a kernel
+
+
+def poisoned(trainer: Trainer, iterations: range, monkeypatch: pytest.MonkeyPatch, *, once: bool) -> list[int]:
+    """Let the composition return a NaN in some iterations; list them."""
+    original: Callable[..., tuple[torch.Tensor, torch.Tensor]] = ops.compose
+    found: list[int] = []
+
+    def compose(*arguments: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        image, textured = original(*arguments)
+        if trainer.iteration in iterations and not (once and found):
+            found.append(trainer.iteration)
+            bad = torch.ones_like(image)
+            bad[3, 5] = float("nan")
+            image = image * bad
+        return image, textured
+
+    monkeypatch.setattr(ops, "compose", compose)
+    return found
+
+
+@pytest.mark.usefixtures("few_places")
+def test_a_nan_of_a_kernel_takes_training_back_once(tiny_scene, monkeypatch, device):
+    trainer = Trainer(tiny_scene, small(cuda_graphs=False, iterations=60), device)
+    found = poisoned(trainer, range(22, 23), monkeypatch, once=True)
+    warnings: list[str] = []
+    trainer.run(warn=warnings.append, until=30)
+    assert found == [22] and trainer.iteration == 30 and trainer.rate_factor == 0.5
+    (line,) = warnings
+    assert "going back to iteration 18 with half the learning rates" in line
+    trainer.check()
+
+
+@pytest.mark.usefixtures("few_places")
+def test_a_kernel_that_keeps_giving_nan_ends_training_in_its_last_good_state(tiny_scene, monkeypatch, device):
+    trainer = Trainer(tiny_scene, small(cuda_graphs=False, iterations=60), device)
+    poisoned(trainer, range(22, 100), monkeypatch, once=False)
+    warnings: list[str] = []
+    with pytest.raises(DivergedError, match=r"^iteration 22: the loss '\w+' is nan.* training gives up$"):
+        trainer.run(warn=warnings.append)
+    assert len(warnings) == 1 and trainer.iteration == 18
+    trainer.check()
+    with torch.no_grad():
+        image = trainer.model().render(trainer.views.cameras[0].crop(0, 0, 2, 2)).image
+    assert bool(torch.isfinite(image).all())

@@ -1,0 +1,138 @@
+"""SIGKILL at random moments and in each stage of the finishing; what is resumed ends as if nothing had happened.
+
+`python -m benchmarks.kills` does the same to the demo, as often as one likes.
+"""
+
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from benchmarks.kills import Kills, kill_and_resume
+from nexwarp.cli import main as cli
+from nexwarp.data import write_demo
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.train import presets
+from nexwarp.train.checkpoint import has_checkpoint
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.finish import auto_exposure
+from nexwarp.train.finish.finish import FinishObserver
+from nexwarp.train.trainer import Trainer
+from tests.exposed import expose_photos
+from tests.subprocesses import python_path
+
+ROOT = Path(__file__).parents[2]
+FLAGS = ["--iterations", "20", "--max-surfels", "100", "--checkpoint-every", "1"]
+# Stages of the finishing, and numbers of views after which a kill comes; the last is that of all training views.
+STAGES = ("smoothing SH", "measuring detail limits", "predicting auto exposure")
+VIEWS = (1, 4, 8)
+PLACES = 12  # of predicted exposures, so that the last stage takes no longer than the others
+KILL_AT = "NEXWARP_TEST_KILL_AT"  # of a subprocess: "views stage"
+
+SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
+
+Moment = float | tuple[str, int]  # a share of the training's time, or a stage and how many views of it are done
+
+
+def main() -> None:
+    """The command line, whose default preset is a small one; it may kill itself in a stage of the finishing."""
+    auto_exposure.PLACES = PLACES
+    presets.PRESETS["default"] = SMALL
+    if KILL_AT in os.environ:
+        count, stage = os.environ[KILL_AT].split(" ", 1)
+        finish = Trainer.finish
+
+        def finish_or_die(trainer: Trainer, observe: FinishObserver) -> Model:
+            def watch(name: str, done: int, total: int) -> None:
+                if (name, done) == (stage, int(count)):
+                    os.kill(os.getpid(), signal.SIGKILL)
+                observe(name, done, total)
+
+            return finish(trainer, watch)
+
+        Trainer.finish = finish_or_die  # type: ignore[method-assign,assignment]
+    sys.exit(cli.main())
+
+
+@pytest.fixture(autouse=True)
+def small_preset(monkeypatch):
+    monkeypatch.setattr(auto_exposure, "PLACES", PLACES)
+    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+
+
+def moments(count: int) -> list[Moment]:
+    """When to kill: in the stages of the finishing in turns, at most once each, and at random moments."""
+    generator = random.Random(0)
+    stages = [(stage, views) for views in VIEWS for stage in STAGES][: (count + 1) // 2]
+    return [*stages, *(generator.uniform(0.0, 1.0) for _ in range(count - len(stages)))]
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("device", "count"),
+    [
+        ("cpu", 2),
+        pytest.param("cpu", 20, marks=pytest.mark.slow),
+        pytest.param("cuda", 5, marks=pytest.mark.cuda),
+    ],
+)
+def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, device: str, count: int) -> None:
+    scene = write_demo(tmp_path / "scene", width=48, height=36, views=10, points=200)
+    expose_photos(scene)  # else nothing predicts an auto exposure
+    flags = ["--device", device, *(["--deterministic"] if device == "cuda" else [])]
+    arguments = ["train", str(scene), *FLAGS, *flags]
+    command = [sys.executable, "-c", "from tests.robustness.test_kills import main; main()", *arguments]
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start(run: Path, moment: Moment) -> subprocess.Popen[bytes]:
+        environment = os.environ | python_path(ROOT)
+        if isinstance(moment, tuple):
+            environment[KILL_AT] = f"{moment[1]} {moment[0]}"
+        silent = subprocess.DEVNULL
+        processes.append(subprocess.Popen([*command, "--run", str(run)], env=environment, stdout=silent, stderr=silent))
+        return processes[-1]
+
+    def resume(run: Path, moment: Moment) -> int:
+        if isinstance(moment, tuple):
+            assert processes[-1].returncode == -signal.SIGKILL, moment
+            assert not (run / MODEL_FILE).exists() and has_checkpoint(run), moment
+        return cli.main(["train", str(scene), "--run", str(run), "--device", device, "--resume"])
+
+    begun = time.perf_counter()
+    assert cli.main([*arguments, "--run", str(tmp_path / "whole")]) == 0
+    expected, length = (tmp_path / "whole" / MODEL_FILE).read_bytes(), time.perf_counter() - begun
+    kills = []
+    for number, moment in enumerate(moments(count)):
+        seconds = math.inf if isinstance(moment, tuple) else moment * length
+        run = tmp_path / f"run{number}"
+        starting, resuming = partial(start, moment=moment), partial(resume, moment=moment)
+        kills.append(kill_and_resume(starting, resuming, run, seconds, expected))
+    assert all(kill.same for kill in kills), kills
+    assert sum(kill.seconds == math.inf for kill in kills) == min((count + 1) // 2, len(STAGES) * len(VIEWS))
+
+
+def test_a_kill_is_waited_for(tmp_path):
+    """A training that ends before its moment is an error only when it began nothing."""
+
+    def start(run: Path) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
+
+    begun = time.perf_counter()
+    with pytest.raises(RuntimeError, match="ended by itself, with exit code 7"):
+        kill_and_resume(start, lambda _: 0, tmp_path / "run", 60.0, b"")
+    assert time.perf_counter() - begun < 30
+
+
+def test_the_command_is_given_the_device_and_the_sums():
+    alone, on_gpu = Kills().command(), Kills(device="cuda", deterministic=True, iterations=600).command()
+    assert "--device=cpu" in alone and "--deterministic" not in alone
+    assert "--device=cuda" in on_gpu and "--deterministic" in on_gpu and "--iterations=600" in on_gpu

@@ -1,0 +1,376 @@
+"""What a finished run gives, driven from the command line: pictures, paths, videos, passes, files for others."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nexwarp as nw
+from nexwarp.cameras.camera import resized
+from nexwarp.cameras.cameras_file import load_cameras, save_cameras
+from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path
+from nexwarp.cameras.paths import ellipse, interpolate, spiral
+from nexwarp.cli import main as cli
+from nexwarp.export.surfels_ply import load_surfels_ply
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.buffers import load_buffers
+from nexwarp.model.exposures import Exposures
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import save_model
+from nexwarp.model.options import RenderOptions
+from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.opened import open_model
+from nexwarp.run.render_job import RenderOrder
+from nexwarp.train.config import Config
+from tests.cameras.test_paths import ring, row
+from tests.scenes import make_surfels, make_texture, random_scene
+
+TRAIN, TEST = ["b.png", "c.jpg", "d.png", "e.png"], ["a.png", "sub/f.png"]
+OPTIONS = RenderOptions(background=(0.1, 0.2, 0.3))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of random surfels about the point that the cameras look at."""
+    run = tmp_path_factory.mktemp("outputs") / "run"
+    torch.manual_seed(0)
+    scene = random_scene(40)
+    scene["means"] = scene["means"] - scene["means"].mean(0) + torch.tensor([1.0, -2.0, 0.3])
+    create_run(run, SceneSource(str(run.parent / "scene"), "images_2"), Config(), "cpu")
+    save_model(run, Model(make_surfels(scene), make_texture(), options=OPTIONS))
+    cameras = [each.to(torch.float32) for each in ring(6)]
+    sets = {"train": dict(zip(TRAIN, cameras[1:5], strict=True)), "test": dict(zip(TEST, cameras[::5], strict=True))}
+    save_cameras(run / "cameras.json", sets)
+    return run
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
+
+
+def command(*arguments: object) -> int:
+    words = [str(argument) for argument in arguments]
+    return cli.main([*words, "--device", "cpu"] if words[0] == "render" else words)
+
+
+def files(folder: Path) -> set[str]:
+    return {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file()}
+
+
+def picture(file: Path) -> torch.Tensor:
+    with Image.open(file) as image:
+        return torch.from_numpy(np.array(image))
+
+
+def rendered(run: Path, camera: nw.Camera) -> torch.Tensor:
+    model = nw.load(run)
+    with torch.no_grad():
+        return to_uint8(model.render(camera).image)
+
+
+# Still views
+
+
+@pytest.mark.parametrize(("views", "names"), [("test", TEST), ("train", TRAIN), ("all", TRAIN + TEST)])
+def test_still_views(run: Path, views: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("render", run, "--set", views) == 0
+    group = {name: "train" if name in TRAIN else "test" for name in names}
+    assert files(run / "renders") == {f"{group[n]}/{n.rsplit('.')[0]}.png" for n in names}
+    assert f"{len(names)} pictures in {run / 'renders'}" in capsys.readouterr().out
+    camera = load_cameras(run / "cameras.json")[group[names[-1]]][names[-1]]
+    mine = picture(run / "renders" / group[names[-1]] / f"{names[-1].rsplit('.')[0]}.png")
+    assert mine.equal(rendered(run, camera)) and mine.float().std() > 5
+
+
+def test_sizes(run: Path) -> None:
+    camera = load_cameras(run / "cameras.json")["test"]["a.png"]
+    for flags, size in ((["--size", "80x20"], (80, 20)), (["--scale", "1.5"], (96, 72)), (["--scale", "0.01"], (1, 1))):
+        assert command("render", run, "--set", "test", *flags) == 0
+        assert picture(run / "renders" / "test" / "a.png").equal(rendered(run, resized(camera, *size)))
+
+
+def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = load_cameras(run / "cameras.json")
+    model = nw.load(run)
+    log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
+    model.exposures = Exposures.of(log_gains, list(cameras["train"].values()))
+    save_model(run, model)
+    assert command("info", run) == 0
+    assert "0.67 to 1.35 times the photos' mean" in capsys.readouterr().out
+    assert command("render", run, "--set", "test", "--buffers") == 0
+    assert torch.equal(picture(run / "renders/test/a.png"), rendered(run, cameras["test"]["a.png"]))
+    exposed = load_buffers(run / "renders/test/a.exr")
+    assert command("render", run, "--set", "test", "--buffers", "--exposure", "mean") == 0
+    mean, gains = load_buffers(run / "renders/test/a.exr"), model.exposures.gains(cameras["test"]["a.png"])
+    assert (gains - 1).abs().max() > 0.05
+    for name in ("image", "plain", "textured", "colors", "background"):
+        torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
+    # The model of the caller is as it was.
+    order = RenderOrder(path=None, views="test", exposure="mean")
+    order.prepare(open_model(run)).render(model)
+    assert model.exposures is not None
+    assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))
+
+
+# Paths
+
+
+def test_paths_are_those_of_the_runs_cameras(run: Path) -> None:
+    sets = load_cameras(run / "cameras.json")
+    train = list(sets["train"].values())
+    by_name = [(sets["train"] | sets["test"])[name] for name in sorted(TRAIN + TEST)]
+    for name, path in (("ellipse", ellipse(train, 4)), ("interpolate", interpolate(by_name, 4))):
+        assert command("render", run, "--path", name, "--frames", "4") == 0
+        folder = run / "renders" / name
+        assert files(folder) == {f"{i:04d}.png" for i in range(4)}
+        for i in (0, 3):
+            assert picture(folder / f"{i:04d}.png").equal(rendered(run, path[i]))
+    assert not (run / "renders" / "test").exists()
+
+
+def test_spiral(run: Path) -> None:
+    cameras = [each.to(torch.float32) for each in row(5)]
+    save_cameras(run / "cameras.json", {"train": {str(i): each for i, each in enumerate(cameras)}, "test": {}})
+    assert command("render", run, "--path", "spiral", "--frames", "3") == 0
+    assert picture(run / "renders" / "spiral" / "0002.png").equal(rendered(run, spiral(cameras, 3)[2]))
+
+
+def test_a_shorter_path_leaves_no_frames_of_a_longer_one(run: Path) -> None:
+    for count in (3, 2):
+        assert command("render", run, "--path", "ellipse", "--frames", count) == 0
+    assert files(run / "renders" / "ellipse") == {"0000.png", "0001.png"}
+
+
+def test_a_path_from_a_file(run: Path, tmp_path: Path) -> None:
+    """nerfstudio's, with its size; and the frames of a transforms.json, all in the size of the first."""
+    path = [resized(each, 40, 30) for each in interpolate(ring(3), 2)]
+    save_camera_path(tmp_path / "flight.json", path, fps=5)
+    assert command("render", run, "--path", tmp_path / "flight.json") == 0
+    folder = run / "renders" / "path_flight"
+    assert files(folder) == {"0000.png", "0001.png"}
+    near = load_cameras(run / "cameras.json")["train"]["b.png"].near
+    assert picture(folder / "0001.png").equal(
+        rendered(run, load_camera_path(tmp_path / "flight.json", near).cameras[1])
+    )
+    assert command("export", run, "--format", "cameras") == 0
+    assert command("render", run, "--path", run / "export" / "transforms.json") == 0
+    camera = load_cameras(run / "cameras.json")["test"]["a.png"]
+    difference = picture(run / "renders" / "path_transforms" / "0000.png").int() - rendered(run, camera).int()
+    assert difference.abs().max() <= 1 and len(files(run / "renders" / "path_transforms")) == 6
+
+
+# Videos
+
+
+def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
+    video = tmp_path / "new" / "out.mp4"
+    assert command("render", run, "--video", video, "--frames", "6", "--fps", "12", "--scale", "2") == 0
+    assert f"0.50 s of video in {video}" in capsys.readouterr().out
+    assert [f.name for f in video.parent.iterdir()] == ["out.mp4"]
+    assert files(run / "renders") == {f"ellipse/{i:04d}.png" for i in range(6)}
+    with av.open(str(video)) as container:
+        (stream,) = container.streams.video
+        decoded = [torch.from_numpy(f.to_ndarray(format="rgb24")) for f in container.decode(stream)]
+        assert len(decoded) == 6 and stream.average_rate == 12
+    for i, mine in enumerate(decoded):
+        frame = picture(run / "renders" / "ellipse" / f"{i:04d}.png")
+        assert mine.shape == frame.shape == (96, 128, 3)
+        # Of noise, 4:2:0 keeps the brightness alone.
+        error = (mine.float() - frame.float()) @ torch.tensor([0.2126, 0.7152, 0.0722])
+        assert error.abs().mean() < 2.0
+
+
+def test_video_takes_its_rate_from_the_file(run: Path, tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
+    save_camera_path(tmp_path / "flight.json", interpolate(ring(3), 3), fps=5)
+    for flags, rate in (([], 5), (["--fps", "10"], 10)):
+        assert command("render", run, "--path", tmp_path / "flight.json", "--video", tmp_path / "a.mkv", *flags) == 0
+        with av.open(str(tmp_path / "a.mkv")) as container:
+            assert container.streams.video[0].average_rate == rate
+
+
+# Passes
+
+
+def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
+    assert command("render", run, "--set", "test", "--buffers") == 0
+    assert files(run / "renders") == {f"test/{n}.{s}" for n in ("a", "sub/f") for s in ("png", "exr")}
+    buffers = load_buffers(run / "renders" / "test" / "sub" / "f.exr")
+    total = buffers.plain + (buffers.weights[..., None] * buffers.colors).sum(2)
+    total = total + (1 - buffers.alpha)[..., None] * buffers.background
+    assert (total - buffers.image).abs().max() <= 1e-5
+    assert buffers.background.tolist() == torch.tensor(OPTIONS.background).tolist()
+    assert to_uint8(buffers.image).equal(picture(run / "renders" / "test" / "sub" / "f.png"))
+    shutil.rmtree(run / "renders")
+    assert command("render", run, "--path", "ellipse", "--frames", "2", "--buffers") == 0
+    assert files(run / "renders") == {f"ellipse/000{i}.{s}" for i in range(2) for s in ("png", "exr")}
+    shutil.rmtree(run / "renders")
+    assert command("render", run, "--frames", "1", "--buffers") == 0
+    exr = {name for name in files(run / "renders") if name.endswith(".exr")}
+    assert exr == {"test/a.exr", "test/sub/f.exr"} and (run / "renders" / "ellipse" / "0000.png").is_file()
+
+
+# Exports
+
+
+def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("export", run) == 0
+    assert files(run / "export") == {"surfels.ply", "splats.ply"}
+    assert capsys.readouterr().out.split() == [str(run / "export" / n) for n in ("surfels.ply", "splats.ply")]
+    after = load_surfels_ply(run / "export" / "surfels.ply").state_dict()
+    for name, x in nw.load(run).surfels.state_dict().items():
+        assert after[name].equal(x), name
+    assert command("export", run, "--format", "ply", "--out", tmp_path / "a" / "b") == 0
+    assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
+
+
+def test_exported_splats_end_at_degree_3(run: Path) -> None:
+    model = nw.load(run)
+    raw = model.surfels.state_dict()
+    generator = torch.Generator().manual_seed(0)
+    model.surfels = nw.Surfels(raw | {"shN": torch.randn(len(model.surfels), 48, 3, generator=generator)})
+    exported = []
+    for degree in (6, 3):
+        model.options = model.options.changed(sh_degree=degree)
+        model.save(run)
+        assert command("export", run) == 0
+        exported.append((run / "export" / "splats.ply").read_bytes())
+    assert exported[0] == exported[1]
+    assert load_surfels_ply(run / "export" / "surfels.ply").shN.shape[1] == 48
+
+
+def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def exported(*options: str) -> bytes:
+        assert command("export", run, *options) == 0
+        return (run / "export" / "splats.ply").read_bytes()
+
+    whole = exported("--max-extent", "inf")
+    assert len(exported("--max-extent", "0.5")) > len(whole)
+    (run / "cameras.json").unlink()
+    assert exported("--max-extent", "0.5") == whole, "a training that was broken off leaves none"
+    capsys.readouterr()
+    assert command("export", run, "--max-extent", "0") == 2
+    assert capsys.readouterr().err == "nexwarp: error: --max-extent: expected more than 0, got 0\n"
+
+
+def test_export_cameras(run: Path) -> None:
+    assert command("export", run, "--format", "cameras") == 0
+    assert files(run / "export") == {"transforms.json", "camera_path.json"}
+    sets = load_cameras(run / "cameras.json")
+    before = {f"images_2/{name}": c for group in sets.values() for name, c in group.items()}
+    near = next(iter(before.values())).near
+    after = load_transforms(run / "export" / "transforms.json", near)
+    path = load_camera_path(run / "export" / "camera_path.json", near).cameras
+    assert list(after) == sorted(before) and len(path) == len(before)
+    for (name, mine), along in zip(after.items(), path, strict=True):
+        for each in (mine, along):
+            assert (each.viewmat - before[name].viewmat).abs().max() <= 1e-6
+            assert each.K.equal(before[name].K)
+            assert (each.width, each.height, each.near) == (64, 48, near)
+    data = json.loads((run / "export" / "transforms.json").read_text())
+    assert data["train_filenames"] == [f"images_2/{n}" for n in TRAIN]
+    assert data["test_filenames"] == [f"images_2/{n}" for n in TEST]
+
+
+# Bad input
+
+
+@pytest.fixture
+def refuses(run: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
+    """Expect one line and exit code 2, and nothing new in the run's folder nor beside it."""
+
+    def check(arguments: list[object], *words: str) -> None:
+        before = files(run.parent)
+        capsys.readouterr()
+        assert command(arguments[0], run, *arguments[1:]) == 2
+        err = capsys.readouterr().err
+        assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
+        assert all(word in err for word in words), err
+        assert files(run.parent) == before and not (run / "renders").exists() and not (run / "export").exists()
+
+    return check
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--path", "elipse"], ["--path: expected ellipse, interpolate, spiral or a file ending in .json", "'elipse'"]),
+        (["--path", "no.json"], ["no.json: no such file"]),
+        (["--set", "val"], ["--set: expected test, train or all, got 'val'"]),
+        (["--path", "ellipse", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
+        (["--video", "a.mp4", "--frames", "0"], ["--frames: expected at least 1", "got 0"]),
+        (["--frames", "-1"], ["--frames: expected at least 0, got -1"]),
+        (["--set", "test", "--frames", "5"], ["--frames: expected together with --path or --video"]),
+        (["--fps", "30"], ["--fps: expected together with --video"]),
+        (["--video", "a.mp4", "--fps", "0"], ["--fps: expected more than 0"]),
+        (["--video", "a.avi"], ["--video: a.avi: expected a video ending in .mp4"]),
+        (["--size", "100"], ["--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100'"]),
+        (["--size", "0x10"], ["--size: expected WIDTHxHEIGHT"]),
+        (["--size", "99999x10"], ["--size: expected WIDTHxHEIGHT"]),
+        (["--scale", "0"], ["--scale: expected a number above 0, got 0"]),
+        (["--scale", "nan"], ["--scale: expected a number above 0, got nan"]),
+        (["--scale", "1000"], ["--scale: expected at most 16384 pixels a side, got 64000x48000"]),
+        (["--exposure", "auto"], ["--exposure: expected photos or mean, got 'auto'"]),
+        (["--scale", "2", "--size", "9x9"], ["--size, --scale: expected at most one"]),
+    ],
+)
+def test_bad_render_options(refuses: Callable[..., None], flags: list[str], words: list[str]) -> None:
+    refuses(["render", *flags], *words)
+
+
+def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
+    path = run.parent / "flight.json"
+    path.write_text("{")
+    refuses(["render", "--path", path], str(path), "expected JSON")
+    save_camera_path(path, ring(2))
+    refuses(["render", "--path", path, "--frames", "3"], "--frames: expected no value with", "got 3")
+    data = json.loads(path.read_text())
+    data["camera_path"][1]["camera_to_world"] = [0.0] * 15 + [1.0]
+    path.write_text(json.dumps(data))
+    refuses(["render", "--path", path], f"{path}: camera_path[1]: camera_to_world: expected an invertible pose")
+
+
+def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> None:
+    around = {str(i): each.to(torch.float32) for i, each in enumerate(ring(24, height=0.6))}
+    save_cameras(run / "cameras.json", {"train": around, "test": {}})
+    refuses(["render", "--path", "spiral"], "--path spiral: cameras: expected cameras that face one way")
+    save_cameras(run / "cameras.json", {"train": {"0": around["0"]}, "test": {"1": around["1"]}})
+    refuses(["render"], "--path ellipse: cameras: expected two or more", "--frames 0 renders the still views alone")
+
+
+def test_targets_that_cannot_be_written(refuses: Callable[..., None], run: Path) -> None:
+    (run.parent / "file").touch()
+    refuses(["render", "--frames", "2", "--video", run.parent / "file" / "a.mp4"], "file")
+    (run.parent / "folder.mp4").mkdir()
+    refuses(["render", "--frames", "2", "--video", run.parent / "folder.mp4"], "folder.mp4: expected a file to write")
+    for kind in ("ply", "cameras"):
+        refuses(["export", "--format", kind, "--out", run.parent / "file"], "file")
+
+
+def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:
+    refuses(
+        ["export", "--format", "obj"], "--format: expected one of ply, mesh, compact, cameras, web, glb, spz, got 'obj'"
+    )
+    (run / "cameras.json").write_text("{}")
+    refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")
+    refuses(["render", "--set", "test"], "cameras.json: expected test views to render, found none")
+    (run / "cameras.json").unlink()
+    refuses(["export", "--format", "cameras"], "cameras.json: expected the run's cameras")
+    (run / "model.safetensors").unlink()
+    refuses(["export"], "model.safetensors")
+    (run / "config.json").unlink()
+    refuses(["export"], "expected a run folder or a model, found no config.json")
+
+
+@pytest.mark.parametrize("words", [["render"], ["export"]])
+def test_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exited:
+        cli.main([*words, "--help"])
+    assert exited.value.code == 0 and "docs/outputs.md" in capsys.readouterr().out

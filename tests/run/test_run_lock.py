@@ -1,0 +1,195 @@
+"""One training or evaluation at a time writes to a run folder; a dead one holds nothing."""
+
+import errno
+import fcntl
+import importlib.util
+import os
+import re
+import signal
+import subprocess
+import sys
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from nexwarp.cli import main as cli
+from nexwarp.errors import RunError, StorageError
+from nexwarp.run import lock
+from nexwarp.run.lock import locked_run
+from tests.subprocesses import python_path
+
+ROOT = Path(__file__).parents[2]
+
+HOLD = """
+import os, sys, time
+from pathlib import Path
+from nexwarp.run.lock import locked_run
+with locked_run(Path(sys.argv[1])):
+    child = os.fork()
+    if child:
+        print(child, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def holder(tmp_path_factory) -> Iterator[tuple[Path, subprocess.Popen[str], int]]:
+    """A run folder, the process that holds its lock, and a child that it has forked meanwhile."""
+    run = tmp_path_factory.mktemp("held") / "run"
+    environment = os.environ | python_path(ROOT)
+    command = [sys.executable, "-W", "ignore", "-c", HOLD, str(run)]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        try:
+            yield run, process, child
+        finally:
+            process.kill()
+            os.kill(child, signal.SIGKILL)
+
+
+def refused_by(run: Path) -> str:
+    with pytest.raises(RunError) as caught, locked_run(run):
+        pytest.fail("two hold the lock")
+    return str(caught.value)
+
+
+def test_commands_name_the_process_that_is_at_work(holder, tmp_path, capsys):
+    """Nothing is written, whatever the command; what only reads, or writes files of its own, needs no lock."""
+    run, process, _ = holder
+    scene = ["train", "demo", "--run", str(run), "--iterations", "2", "--device", "cpu"]
+    before = [f.name for f in run.iterdir()]
+    assert before == ["run.lock"]
+    assert cli.main(scene) == 2
+    line = capsys.readouterr().err
+    expected = re.escape(f"nexwarp: error: {run}: expected a run folder that no other process writes to, but process ")
+    since = r"since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d[+-]\d\d:\d\d, does; wait until it ends, or give another run folder\n"
+    assert re.fullmatch(rf"{expected}{process.pid} on \S+, {since}", line), line
+    (run / "config.json").write_text('{"scene": {"path": "demo", "downscale": 1}, "config": {}}')
+    for command in ([*scene, "--resume"], [*scene, "--overwrite"], ["eval", str(run), "--device", "cpu"]):
+        assert cli.main(command) == 2
+        assert f"process {process.pid} on " in capsys.readouterr().err
+    assert cli.main(["info", str(run)]) == 0
+    assert sorted(f.name for f in run.iterdir()) == ["config.json", "run.lock"]
+    (run / "config.json").unlink()
+
+
+def test_a_kill_releases_the_lock_although_a_forked_child_lives(holder):
+    run, process, child = holder
+    refused_by(run)
+    process.kill()
+    process.wait()
+    os.kill(child, 0)  # it lives
+    assert (run / "run.lock").exists()
+    with locked_run(run):
+        assert f"process {os.getpid()} on " in refused_by(run)
+    assert list(run.iterdir()) == []
+
+
+def test_a_missing_folder_is_created_and_removed_if_nothing_comes_into_it(tmp_path):
+    run = tmp_path / "deep" / "run"
+    with locked_run(run):
+        assert [f.name for f in run.iterdir()] == ["run.lock"]
+    assert list(tmp_path.iterdir()) == []
+    with locked_run(run):
+        (run / "file").touch()
+    assert [f.name for f in run.iterdir()] == ["file"]
+
+
+def test_the_lock_is_free_after_an_error(tmp_path):
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError), locked_run(tmp_path):
+            raise ZeroDivisionError
+    assert not lock.held and list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_whose_file_was_deleted_meanwhile_is_taken_anew(tmp_path, monkeypatch):
+    """The holder deletes the file at its end: who has opened it before must not keep a lock that nobody sees."""
+    calls = []
+
+    def raced(number: int) -> None:
+        calls.append(number)
+        if len(calls) == 1:
+            (tmp_path / "run.lock").unlink()
+        original(number)
+
+    original = lock._lock
+    monkeypatch.setattr(lock, "_lock", raced)
+    with locked_run(tmp_path):
+        assert len(calls) == 2
+        refused_by(tmp_path)
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
+def test_a_file_system_without_locks_is_told_and_used(tmp_path, monkeypatch, number):
+    monkeypatch.setattr(lock, "_lock", failing(number))
+    told: list[str] = []
+    with locked_run(tmp_path, told.append):
+        pass
+    assert len(told) == 1 and told[0].startswith(f"{tmp_path}: its file system has no locks ({os.strerror(number)}): ")
+
+
+def failing(number: int) -> Callable[[int], None]:
+    def fail(_: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+def test_other_errors_name_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "_lock", failing(errno.EIO))
+    with pytest.raises(StorageError, match=re.escape(f"{tmp_path / 'run.lock'}: cannot be written (Input/output")):
+        with locked_run(tmp_path):
+            pass
+
+
+def test_a_link_at_the_place_of_the_lock_is_not_followed(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("years of work")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.lock").symlink_to(precious)
+    with pytest.raises(StorageError, match=r"run\.lock: cannot be written"), locked_run(tmp_path / "run"):
+        pass
+    assert precious.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("record", [b"", b"\xff\0", b"[1]", b"{" * 5000])
+def test_a_damaged_record_of_the_holder_is_another_process(tmp_path, record):
+    with locked_run(tmp_path):
+        (tmp_path / "run.lock").write_bytes(record)
+        assert "but another process does" in refused_by(tmp_path)
+
+
+def test_windows_locks_a_byte_behind_the_record(tmp_path, monkeypatch):
+    """The branch of Windows, on locks of byte ranges: these, too, are free when their file is closed."""
+    locked: dict[tuple[int, int], int] = {}
+
+    def locking(number: int, mode: int, count: int) -> None:
+        place = os.fstat(number).st_ino, os.lseek(number, 0, os.SEEK_CUR)
+        if place in locked and locked[place] != number and is_open(locked[place]):
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+        locked[place] = number
+
+    def is_open(number: int) -> bool:
+        try:
+            return fcntl.fcntl(number, fcntl.F_GETFD) >= 0
+        except OSError:
+            return False
+
+    msvcrt = types.ModuleType("msvcrt")
+    vars(msvcrt).update(locking=locking, LK_NBLCK=2)
+    monkeypatch.setitem(sys.modules, "msvcrt", msvcrt)
+    monkeypatch.setattr(sys, "platform", "win32")
+    spec = importlib.util.spec_from_file_location("lock_of_windows", lock.__file__)
+    assert spec is not None and spec.loader is not None
+    windows = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(windows)
+    with windows.locked_run(tmp_path):
+        assert {place for _, place in locked} == {windows.LOCKED_BYTE}
+        assert (tmp_path / "run.lock").stat().st_size < 1000
+        with pytest.raises(RunError, match=f"process {os.getpid()} on"), windows.locked_run(tmp_path):
+            pass
+    with windows.locked_run(tmp_path):
+        pass

@@ -1,0 +1,411 @@
+"""Density control: how a surfel is split, which ones are, what is pruned, and what becomes of Adam's moments."""
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.model.surfels import PARAMETERS
+from nexwarp.train.densify import Densifier, DensifyConfig, split_surfels
+from tests.reference.collect import rotations
+from tests.scenes import make_surfels, random_scene
+
+COPIED = ("raw_quats", "logit_opacities", "raw_gammas", "sh0", "shN")
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def make(count: int = 40, seed: int = 0, opacity: float | None = None) -> tuple[nw.Surfels, torch.optim.Adam]:
+    """Surfels of all orientations and shapes, and an Adam that has stepped once, so that it has moments."""
+    scene = random_scene(count, seed=seed)
+    if opacity is not None:
+        scene["opacities"] = torch.full((count,), opacity)
+    surfels = make_surfels(scene)
+    rates = {"log_scales": 1e-5, "logit_opacities": 1e-6}
+    groups = [{"params": [getattr(surfels, name)], "lr": rates.get(name, 1e-3), "name": name} for name in PARAMETERS]
+    optimizer = torch.optim.Adam(groups)
+    step(surfels, optimizer)
+    return surfels, optimizer
+
+
+def step(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> None:
+    """One Adam step on a loss whose gradient differs in every element."""
+    losses = [(p * torch.linspace(0.5, 1.5, p.numel()).view(p.shape)).sum() for p in surfels.parameters()]
+    torch.stack(losses).sum().backward()
+    optimizer.step()
+    optimizer.zero_grad()
+
+
+def rows_of(surfels: nw.Surfels) -> dict[str, torch.Tensor]:
+    return {name: getattr(surfels, name).detach().clone() for name in PARAMETERS}
+
+
+def moments_of(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> dict[tuple[str, str], torch.Tensor]:
+    state = optimizer.state
+    return {(name, key): state[getattr(surfels, name)][key].clone() for name in PARAMETERS for key in MOMENTS}
+
+
+def sharp_kernel(surfels: nw.Surfels, row: int, points: torch.Tensor, gamma: float = 400.0) -> torch.Tensor:
+    """exp(-(|u|^2g + |v|^2g) / 2) of a surfel at world `points` (P, 3), by an explicit rotation matrix."""
+    rotation = rotations(surfels.raw_quats[row : row + 1].detach().double())[0]
+    local = (points - surfels.means[row].detach().double()) @ rotation
+    u, v = (local[:, :2] / surfels.scales[row].detach().double()).unbind(-1)
+    return torch.exp(-(u.abs() ** (2 * gamma) + v.abs() ** (2 * gamma)) / 2)
+
+
+def densifier_of(surfels: nw.Surfels, budget: int = 10_000, **changes: Any) -> Densifier:
+    return Densifier(DensifyConfig(**changes), surfels, budget)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+# Split
+
+
+def test_children_tile_their_parent():
+    """With hard edges, parent(x) = child(x) + child(x) everywhere in its plane: no gap, no overlap."""
+    surfels, optimizer = make(12, seed=3)
+    before = nw.Surfels(rows_of(surfels))
+    chosen = torch.tensor([0, 3, 4, 9])
+    split_surfels(surfels, optimizer, chosen)
+    assert len(surfels) == 16
+    uv = 3 * torch.rand(4000, 2, dtype=torch.float64) - 1.5
+    edge = torch.minimum((uv.abs() - 1).abs().amin(1), uv.abs().amin(1))  # of the parent, and where its children meet
+    uv = uv[edge > 0.01]
+    for first, second in zip(chosen.tolist(), range(12, 16), strict=True):
+        rotation = rotations(before.raw_quats[first : first + 1].detach().double())[0]
+        offsets = (uv * before.scales[first].detach().double()) @ rotation[:, :2].T
+        points = before.means[first].detach().double() + offsets
+        whole = sharp_kernel(before, first, points)
+        halves = sharp_kernel(surfels, first, points), sharp_kernel(surfels, second, points)
+        assert 0.2 < whole.mean() < 0.8
+        torch.testing.assert_close(halves[0] + halves[1], whole, rtol=0, atol=1e-3)
+
+
+def test_children_lie_half_a_scale_along_the_longer_axis():
+    surfels, optimizer = make(20, seed=1)
+    old = rows_of(surfels)
+    chosen = torch.tensor([1, 2, 5, 7, 11, 19])
+    split_surfels(surfels, optimizer, chosen)
+    scales = old["log_scales"][chosen].exp()
+    longer = scales.argmax(1)
+    assert {0, 1} == set(longer.tolist())
+    each = torch.arange(len(chosen))
+    axis = rotations(old["raw_quats"][chosen])[each, :, longer]
+    offset = axis * scales[each, longer, None] / 2
+    children = torch.stack([surfels.means[chosen], surfels.means[20:]]).detach()
+    torch.testing.assert_close(children[0], old["means"][chosen] - offset, rtol=0, atol=1e-6)
+    torch.testing.assert_close(children[1], old["means"][chosen] + offset, rtol=0, atol=1e-6)
+    halved = scales.clone()
+    halved[each, longer] /= 2
+    for half in (surfels.scales[chosen], surfels.scales[20:]):
+        torch.testing.assert_close(half.detach(), halved, rtol=1e-6, atol=0)
+
+
+def test_split_copies_everything_else_and_leaves_others_alone():
+    surfels, optimizer = make(20, seed=1)
+    old = rows_of(surfels)
+    chosen = torch.tensor([0, 6, 13])
+    others = [i for i in range(20) if i not in chosen.tolist()]
+    split_surfels(surfels, optimizer, chosen)
+    for name in PARAMETERS:
+        assert torch.equal(getattr(surfels, name)[others], old[name][others]), name
+    for name in COPIED:
+        assert torch.equal(getattr(surfels, name)[chosen], old[name][chosen]), name
+        assert torch.equal(getattr(surfels, name)[20:], old[name][chosen]), name
+
+
+def test_children_start_without_moments_and_others_keep_theirs():
+    surfels, optimizer = make(20)
+    old = moments_of(surfels, optimizer)
+    chosen = torch.tensor([2, 3, 17])
+    others = [i for i in range(20) if i not in chosen.tolist()]
+    split_surfels(surfels, optimizer, chosen)
+    for key, moments in moments_of(surfels, optimizer).items():
+        assert len(moments) == 23, key
+        assert torch.equal(moments[others], old[key][others]) and bool((old[key][others] != 0).all()), key
+        assert not moments[chosen].any() and not moments[20:].any(), key
+
+
+def test_optimizer_follows_and_goes_on_stepping():
+    surfels, optimizer = make(30)
+    densifier = densifier_of(surfels, budget=31, prune_opacity=0.4, fraction=0.5)
+    densifier.accumulate(torch.arange(30.0))
+    split, pruned = densifier.step(surfels, optimizer, generator())
+    assert split == 1 + pruned > 1 and len(surfels) == 31
+    for group in optimizer.param_groups:
+        assert len(group["params"]) == 1 and group["params"][0] is getattr(surfels, group["name"])
+    assert set(optimizer.state) == set(surfels.parameters())
+    before = rows_of(surfels)
+    step(surfels, optimizer)
+    for name, old in before.items():
+        assert bool((getattr(surfels, name) != old).all()), name
+        assert optimizer.state[getattr(surfels, name)]["step"] == 2
+
+
+# Choice
+
+
+def test_choice_is_without_replacement_and_proportional_to_error():
+    """P(i among the first two) = p_i + sum over j of p_j p_i / (1 - p_j); zero, negative and NaN errors never."""
+    errors = torch.tensor([1.0, 2.0, 0.0, 4.0, 8.0, 0.5, float("nan"), 3.0, -1.0])
+    surfels, _ = make(len(errors))
+    densifier = densifier_of(surfels)
+    densifier.accumulate(errors)
+    p = errors.nan_to_num(0.0).clamp_min(0).double()
+    p = p / p.sum()
+    again = torch.tensor([[p[j] * p[i] / (1 - p[j]) if i != j else 0 for j in range(len(p))] for i in range(len(p))])
+    expected = p + again.sum(1)
+    draws, counts, source = 6000, torch.zeros(len(p), dtype=torch.float64), generator(1)
+    for _ in range(draws):
+        chosen = densifier._choose(2, source)
+        assert len(set(chosen.tolist())) == 2
+        counts[chosen] += 1
+    assert counts[[2, 6, 8]].tolist() == [0, 0, 0]
+    live = expected > 0
+    deviation = (counts - draws * expected)[live] / (draws * expected * (1 - expected))[live].sqrt()
+    assert deviation.abs().max() < 4.0, f"{deviation.tolist()} standard deviations off"
+    assert deviation.square().sum() < 20.0  # of 6 degrees of freedom: one in 400
+
+
+def test_one_draw_of_many_is_the_heaviest_of_few():
+    """All candidates are taken once there is room for them, and nothing else."""
+    surfels, optimizer = make(20)
+    densifier = densifier_of(surfels, fraction=1.0, prune_opacity=0.0)
+    errors = torch.zeros(20)
+    errors[[3, 8, 15]] = torch.tensor([1e-30, 1.0, 1e30])
+    densifier.accumulate(errors)
+    old = rows_of(surfels)["log_scales"]
+    assert densifier.step(surfels, optimizer, generator()) == (3, 0)
+    assert (surfels.log_scales[:20] != old).any(1).nonzero()[:, 0].tolist() == [3, 8, 15]
+
+
+def test_choice_is_deterministic_given_the_generator():
+    def run(seed: int) -> dict[str, torch.Tensor]:
+        surfels, optimizer = make(60)
+        densifier = densifier_of(surfels, fraction=0.2)
+        densifier.accumulate(torch.linspace(0, 1, 60))
+        densifier.step(surfels, optimizer, generator(seed))
+        return rows_of(surfels)
+
+    torch.manual_seed(1)
+    first = run(5)
+    torch.manual_seed(2)  # the global state has no say
+    second, other = run(5), run(6)
+    assert all(torch.equal(first[name], second[name]) for name in PARAMETERS)
+    assert not torch.equal(first["means"], other["means"])
+
+
+# Budget, prune, sums
+
+
+@pytest.mark.parametrize("budget", [20, 21, 50, 333])
+def test_budget_holds_over_many_rounds(budget):
+    surfels, optimizer = make(20, opacity=0.5)
+    densifier = densifier_of(surfels, budget=budget)
+    source = generator()
+    for _ in range(80):
+        count = len(surfels)
+        densifier.accumulate(torch.rand(count, generator=source))
+        split, pruned = densifier.step(surfels, optimizer, source)
+        assert pruned == 0 and len(surfels) == count + split
+        assert split == min(budget, math.floor(1.05 * count + 1e-9)) - count
+        assert len(surfels) <= budget and densifier.errors.shape == (len(surfels),)
+    assert len(surfels) == budget
+
+
+def test_a_budget_below_the_count_splits_nothing():
+    surfels, optimizer = make(20, opacity=0.5)
+    densifier = densifier_of(surfels, budget=7)
+    densifier.accumulate(torch.ones(20))
+    assert densifier.step(surfels, optimizer, generator()) == (0, 0) and len(surfels) == 20
+
+
+def test_prune_removes_exactly_the_transparent_ones():
+    surfels, optimizer = make(8)
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(
+            torch.tensor([0.001, 0.0049, 0.0051, 0.5, 0.99, 1e-6, 0.006, 0.004999]).double().logit().float()
+        )
+    old, moments = rows_of(surfels), moments_of(surfels, optimizer)
+    densifier = densifier_of(surfels, budget=8)
+    densifier.accumulate(torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0]))  # no error of those that stay
+    assert densifier.step(surfels, optimizer, generator()) == (0, 4)
+    kept = [2, 3, 4, 6]
+    for name in PARAMETERS:
+        assert torch.equal(getattr(surfels, name), old[name][kept]), name
+    for key, now in moments_of(surfels, optimizer).items():
+        assert torch.equal(now, moments[key][kept]), key
+    assert densifier.errors.tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize(("at_cap", "changed"), [(True, 3), (False, 0)])
+def test_prune_at_the_cap_is_a_choice(at_cap, changed):
+    surfels, optimizer = make(10, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[:3] = -8.0
+    densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap, fraction=0.5)
+    densifier.accumulate(torch.ones(10))
+    assert densifier.step(surfels, optimizer, generator()) == (changed, changed)
+    assert len(surfels) == 10 and int((surfels.logit_opacities < -7).sum()) == 3 - changed
+
+
+def addresses(surfels: nw.Surfels, optimizer: torch.optim.Adam, densifier: Densifier) -> list[int]:
+    """Of all tensors that a CUDA graph of a training step reads and writes."""
+    moments = [x for state in optimizer.state.values() for x in state.values()]
+    return [x.data_ptr() for x in (*surfels.parameters(), *moments, densifier.errors)]
+
+
+def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
+    """Tensors stay where they are; rows of others stay as they are, children start without moments."""
+    surfels, optimizer = make(20)
+    gone = [2, 11, 17]
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.linspace(1.0, 0.5, 20))
+        surfels.logit_opacities[gone[:2]] = -8.0
+    densifier = densifier_of(surfels, budget=20, fraction=0.1)  # and one for the unneeded surfel
+    parents = [4, 7, 19]
+    errors = torch.zeros(20)
+    errors[[*parents, *gone]] = 1.0
+    densifier.accumulate(errors)
+    unneeded = torch.zeros(20, dtype=torch.bool)
+    unneeded[gone[2]] = True
+    before, old, moments = addresses(surfels, optimizer, densifier), rows_of(surfels), moments_of(surfels, optimizer)
+    alone, alone_optimizer = make(20)
+    alone.load_state_dict(surfels.state_dict())
+    assert densifier.step(surfels, optimizer, generator(), unneeded) == (3, 3)
+    assert addresses(surfels, optimizer, densifier) == before and not densifier.errors.any()
+    split_surfels(alone, alone_optimizer, torch.tensor(parents))
+    others = [i for i in range(20) if i not in (*gone, *parents)]
+    for name in PARAMETERS:
+        now = getattr(surfels, name)
+        assert torch.equal(now[others], old[name][others]), name
+        assert torch.equal(now[[*parents, *gone]], getattr(alone, name)[[*parents, 20, 21, 22]]), name
+    for key, now in moments_of(surfels, optimizer).items():
+        assert torch.equal(now[others], moments[key][others]) and not now[[*parents, *gone]].any(), key
+
+
+def test_places_are_filled_before_rows_are_appended():
+    surfels, optimizer = make(20, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[[3, 8]] = -8.0
+    densifier = densifier_of(surfels, budget=21, fraction=0.2)
+    densifier.accumulate(torch.ones(20))
+    assert densifier.step(surfels, optimizer, generator()) == (3, 2)
+    assert len(surfels) == 21 and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (21,)
+
+
+@pytest.mark.parametrize(("fraction", "candidates", "split"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])
+def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, split):
+    """The fraction of the surfels and those that have an error are bounds; rows without a child are removed."""
+    surfels, optimizer = make(20)
+    gone = [1, 5, 6, 19]
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.linspace(1.0, 0.5, 20))
+        surfels.logit_opacities[gone] = -8.0
+    densifier = densifier_of(surfels, budget=20, fraction=fraction)
+    stay = [i for i in range(20) if i not in gone]
+    errors = torch.zeros(20)
+    errors[stay[:candidates]] = 1.0
+    errors[gone] = 9.0
+    densifier.accumulate(errors)
+    means = surfels.means.detach().clone()
+    assert densifier.step(surfels, optimizer, generator()) == (split, 4)
+    assert len(surfels) == 16 + split and bool((surfels.logit_opacities > 0).all())
+    assert densifier.errors.shape == (16 + split,) and all(len(p) == 16 + split for p in optimizer.state)
+    unmoved = [bool((surfels.means == mean).all(dim=1).any()) for mean in means[stay]]
+    assert unmoved.count(False) == split and not any(bool((surfels.means == x).all(dim=1).any()) for x in means[gone])
+
+
+def test_unneeded_surfels_go_first_where_the_budget_is_far():
+    surfels, optimizer = make(20, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[:5] = -1.0
+    densifier = densifier_of(surfels, budget=1000)
+    densifier.accumulate(torch.ones(20))
+    assert densifier.step(surfels, optimizer, generator(), torch.arange(20) < 5) == (0, 5)  # 5 % of 15 are none
+    assert len(surfels) == 15
+
+
+def test_a_round_that_splits_prunes_in_either_mode():
+    surfels, optimizer = make(20, opacity=0.5)
+    with torch.no_grad():
+        surfels.logit_opacities[:3] = -8.0
+    densifier = densifier_of(surfels, budget=21, prune_at_cap=False)
+    densifier.accumulate(torch.eye(20)[10])
+    assert densifier.step(surfels, optimizer, generator()) == (1, 3) and len(surfels) == 18
+
+
+def test_sums_are_reset_by_a_split_only():
+    surfels, optimizer = make(20, opacity=0.5)
+    densifier = densifier_of(surfels, budget=21)
+    densifier.accumulate(torch.ones(20))
+    densifier.accumulate(torch.arange(20.0))
+    assert densifier.errors.tolist() == [1.0 + i for i in range(20)]
+    assert densifier.step(surfels, optimizer, generator())[0] == 1
+    assert densifier.errors.tolist() == [0.0] * 21
+    densifier.accumulate(torch.ones(21))
+    assert densifier.step(surfels, optimizer, generator()) == (0, 0)
+    assert densifier.errors.tolist() == [1.0] * 21
+
+
+def test_no_error_means_no_split():
+    surfels, optimizer = make(20, opacity=0.5)
+    assert densifier_of(surfels).step(surfels, optimizer, generator()) == (0, 0)
+
+
+def test_chosen_ones_are_removed_but_never_the_most_opaque():
+    surfels, optimizer = make(5)
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.tensor([0.0, 1.0, -9.0, 2.0, 0.5]))
+    old, moments = rows_of(surfels), moments_of(surfels, optimizer)
+    densifier = densifier_of(surfels)
+    densifier.accumulate(torch.arange(5.0))
+    assert densifier.remove(surfels, optimizer, torch.zeros(5, dtype=torch.bool)) == 0
+    assert densifier.remove(surfels, optimizer, torch.tensor([True, False, False, True, True])) == 2
+    kept = [1, 2, 3]
+    assert all(torch.equal(getattr(surfels, name), old[name][kept]) for name in PARAMETERS)
+    assert all(torch.equal(now, moments[key][kept]) for key, now in moments_of(surfels, optimizer).items())
+    assert densifier.errors.tolist() == [1.0, 2.0, 3.0]
+
+
+# When
+
+
+def test_rounds_come_when_the_paper_says():
+    """Every 100 from 500 to 25,000, both ends out."""
+    surfels, _ = make(4)
+    densifier = densifier_of(surfels)
+    assert [i for i in range(30_001) if densifier.due(i)] == list(range(600, 25_000, 100))
+    assert densifier.active(24_999) and not densifier.active(25_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("every", 0), ("fraction", -0.1), ("fraction", 1.5), ("prune_opacity", 2.0)],
+)
+def test_settings_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: expected at least .*, got {value}$"):
+        dataclasses.replace(DensifyConfig(), **{name: value})
+
+
+def test_budget_must_be_positive():
+    with pytest.raises(ValueError, match=r"^max_surfels: expected at least 1, got 0$"):
+        densifier_of(make(4)[0], budget=0)
+
+
+def test_the_last_surfel_is_never_pruned() -> None:
+    """With none left, the opacity loss is the mean of nothing and no gradient can bring one back."""
+    surfels = make_surfels(random_scene(5))
+    with torch.no_grad():
+        surfels.logit_opacities.copy_(torch.tensor([-9.0, -8.0, -7.0, -8.5, -9.5]))
+    means = surfels.means.detach().clone()
+    optimizer = torch.optim.Adam([{"params": [p]} for p in surfels.parameters()])
+    densifier = Densifier(DensifyConfig(), surfels, 100)
+    _, pruned = densifier.step(surfels, optimizer, torch.Generator().manual_seed(0))
+    assert pruned == 4 and len(surfels) == 1
+    assert torch.equal(surfels.means.detach(), means[2:3])

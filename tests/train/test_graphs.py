@@ -1,0 +1,316 @@
+"""Training steps as CUDA graphs: the bits of launched steps, whatever changes on the way; launches where one fails."""
+
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from nexwarp import ops
+from nexwarp.data import Scene, View
+from nexwarp.model.surfels import Surfels
+from nexwarp.train import graphs as step_graphs
+from nexwarp.train import views as training_views
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.settings import with_settings
+from nexwarp.train.target import Target
+from nexwarp.train.trainer import Trainer
+from tests.trainer_support import assert_same_state
+
+pytestmark = pytest.mark.cuda
+
+TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
+SETTINGS: dict[str, Any] = {
+    "iterations": 120,
+    "max_surfels": 400,
+    "texture": TEXTURE,
+    "densify": DensifyConfig(every=60),  # rounds every ten steps
+    "deterministic": True,
+}
+
+
+def trained(scene: Scene, **changes: Any) -> Trainer:
+    trainer = Trainer(scene, Config(**(SETTINGS | changes)), "cuda")
+    trainer.run()
+    return trainer
+
+
+def graphs_of(trainer: Trainer) -> int:
+    assert trainer.graphs is not None
+    return sum(stage.graph is not None for stage in trainer.graphs.stages.values())
+
+
+def masked(scene: Scene) -> Scene:
+    def view(v: View) -> View:
+        mask = torch.ones(v.image.shape[:2], dtype=torch.bool)
+        mask[: len(mask) // 4] = False
+        return dataclasses.replace(v, mask=mask)
+
+    return dataclasses.replace(scene, train=[view(v) for v in scene.train])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"max_hits": 0},
+        {"max_hits": 4, "depth_jitter": 0.0},
+        {"low_pass": True, "losses.depth": 0.0},
+        {"coarse": 0.5},
+        {"refine_poses": True},
+        {"blur_poses": 3},
+        {"background": (0.1, 0.2, 0.3), "sh_every": 5_000},
+    ],
+    ids=str,
+)
+def test_graphs_give_the_bits_of_launches(tiny_scene: Scene, changes: dict[str, Any]) -> None:
+    parts = {name: x for name, x in changes.items() if "." in name}
+    config = with_settings(Config(**SETTINGS), parts)
+    changes = {name: x for name, x in changes.items() if name not in parts}
+    changes |= {part: getattr(config, part) for part in {name.split(".")[0] for name in parts}}
+    launched = trained(tiny_scene, cuda_graphs=False, **changes)
+    replayed = trained(tiny_scene, **changes)
+    assert launched.graphs is None and graphs_of(replayed) > 0
+    assert_same_state(replayed, launched)
+
+
+def test_the_first_step_after_a_round_is_captured(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds replace tensors, and nothing else of what a step launches."""
+    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    optimize = trainer._optimize
+    launched: list[int] = []
+    rounds: list[int] = []
+
+    def noted(target: Target) -> step_graphs.StepResult:
+        if not torch.cuda.is_current_stream_capturing():
+            launched.append(trainer.iteration)
+        return optimize(target)
+
+    monkeypatch.setattr(trainer, "_optimize", noted)
+    for _ in range(100):
+        count = len(trainer.surfels)
+        trainer.step()
+        if len(trainer.surfels) != count:
+            rounds.append(trainer.iteration)
+    assert len(rounds) >= 4
+    # Launched where there may be twice as many surfels, whose lists are of unknown length.
+    assert sum(iteration + 1 in launched for iteration in rounds) <= len(rounds) // 2
+
+
+@pytest.mark.parametrize("mode", ["ignore", "background"])
+def test_masks_too(tiny_scene: Scene, mode: str) -> None:
+    scene = masked(tiny_scene)
+    launched = trained(scene, cuda_graphs=False, mask_mode=mode)
+    assert_same_state(trained(scene, mask_mode=mode), launched)
+
+
+def test_teachers_too(tiny_scene: Scene) -> None:
+    """Steps with a teacher's picture have the graph of steps with photos."""
+    teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
+    for graphs in (False, True):
+        config = Config(**(SETTINGS | {"cuda_graphs": graphs}))
+        runs.append(Trainer(tiny_scene, config, "cuda", teachers=teachers))
+        runs[-1].run()
+    launched, replayed = runs
+    assert graphs_of(replayed) == 1
+    assert_same_state(replayed, launched)
+
+
+def test_each_step_has_its_own_losses(tiny_scene: Scene) -> None:
+    """They are read later, when the graph has long written others."""
+    seen: dict[bool, list[dict[str, torch.Tensor]]] = {}
+    for graphs in (False, True):
+        trainer = Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
+        seen[graphs] = [trainer.step().losses for _ in range(40)]
+    for launched, replayed in zip(seen[False], seen[True], strict=True):
+        assert {k: v.item() for k, v in launched.items()} == {k: v.item() for k, v in replayed.items()}
+
+
+def test_resuming_changes_nothing(tiny_scene: Scene, tmp_path: Any) -> None:
+    straight = trained(tiny_scene)
+    first = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    for _ in range(57):
+        first.step()
+    first.save(tmp_path)
+    second = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    second.restore(tmp_path)
+    second.run()
+    assert_same_state(second, straight)
+
+
+def test_sizes_beyond_the_first_few_are_launched(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
+    monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
+    monkeypatch.setattr(step_graphs, "FORGOTTEN", 10**6)
+    replayed = trained(tiny_scene, coarse=0.5)
+    assert replayed.graphs is not None
+    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
+    assert widths == {tiny_scene.train[0].camera.width // 2}
+    assert_same_state(replayed, launched)
+
+
+def test_sizes_of_long_ago_make_room(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
+    monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
+    monkeypatch.setattr(step_graphs, "FORGOTTEN", 20)
+    replayed = trained(tiny_scene, coarse=0.5)
+    assert replayed.graphs is not None
+    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
+    assert widths == {tiny_scene.train[0].camera.width}
+    assert_same_state(replayed, launched)
+
+
+def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
+    """Nothing else has started Warp."""
+    code = (
+        "import nexwarp as nw; from nexwarp.train.config import Config; from nexwarp.train.trainer import Trainer\n"
+        f"trainer = Trainer(nw.load_scene({str(tiny_folder)!r}), Config(max_surfels=100), 'cuda')\n"
+        "captured = 0\n"
+        "for _ in range(12):\n"
+        "    trainer.step()\n"
+        "    captured += sum(stage.graph is not None for stage in trainer.graphs.stages.values())\n"
+        "assert captured\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_photos_on_the_host_and_random_backgrounds(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training_views, "PHOTO_SHARE", 0.0)
+    scene = dataclasses.replace(tiny_scene, random_background=True)
+    launched = trained(scene, cuda_graphs=False)
+    replayed = trained(scene)
+    assert replayed.views.pool is not None and graphs_of(replayed) > 0
+    assert_same_state(replayed, launched)
+
+
+def test_going_back_changes_nothing(tiny_scene: Scene) -> None:
+    """From divergence: the steps after it are those of a launched training that goes back, too."""
+    runs = []
+    for graphs in (False, True):
+        trainer = Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
+        poisoned: list[int] = []
+
+        def poison(progress: Any, trainer: Trainer = trainer, poisoned: list[int] = poisoned) -> None:
+            if progress.iteration == 53 and not poisoned:
+                poisoned.append(1)
+                with torch.no_grad():
+                    trainer.surfels.sh0[0] = float("nan")
+
+        warnings: list[str] = []
+        trainer.run(poison, warnings.append)
+        assert poisoned and len(warnings) == 1
+        runs.append(trainer)
+    assert_same_state(runs[1], runs[0])
+
+
+def wait_in_vain() -> None:
+    """What invalidates a capture."""
+    torch.ones(1, device="cuda").item()
+
+
+def fail() -> None:
+    raise RuntimeError("no")
+
+
+def lack_memory() -> None:
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+
+@pytest.mark.parametrize("fault", [wait_in_vain, fail, lack_memory])
+def test_a_capture_that_fails_leaves_training_as_it_is(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None]
+) -> None:
+    """In the middle of a step, too: what it did to the gradients is gone."""
+    launched = trained(tiny_scene, cuda_graphs=False)
+    replayed: Any = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    real = ops.captured
+
+    calls = []
+
+    @contextmanager
+    def failing(*arguments: Any) -> Iterator[None]:
+        calls.append(1)
+        with real(*arguments):
+            yield
+            if len(calls) > 1:  # the first one is not of a step
+                fault()
+
+    monkeypatch.setattr(ops, "captured", failing)
+    if fault is lack_memory:
+        replayed.run()
+    else:
+        with pytest.warns(UserWarning, match="launched kernel by kernel, not as CUDA graphs: "):
+            replayed.run()
+    assert replayed.graphs.chances == 0 and not replayed.graphs.stages and replayed.graphs.keeper is None
+    assert_same_state(replayed, launched)
+
+
+def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: Scene) -> None:
+    launched = trained(tiny_scene, cuda_graphs=False)
+    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    optimize = trainer._optimize
+    failed: list[int] = []
+
+    def failing(target: Target) -> step_graphs.StepResult:
+        if trainer.iteration == 31 and not failed:  # the first step after a round
+            assert trainer.graphs is not None and trainer.graphs.keeper is not None  # whose memory may be missing
+            failed.append(1)
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return optimize(target)
+
+    trainer._optimize = failing  # type: ignore[method-assign]
+    trainer.run()
+    assert failed and trainer.graphs is not None and trainer.graphs.chances == step_graphs.CHANCES - 1
+    assert_same_state(trainer, launched)
+
+
+def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too little room is slow but right; the next steps have more."""
+    launched = trained(tiny_scene, cuda_graphs=False)
+    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    asked: list[ops.ListCapacity] = []
+
+    def fits(room: ops.ListCapacity) -> bool:
+        asked.append(room)
+        return len(asked) % 7 > 0
+
+    monkeypatch.setattr(ops, "fits", fits)
+    trainer.run()
+    assert len(asked) > 7
+    assert_same_state(trainer, launched)
+
+
+def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Children take the rows of pruned surfels: tensors stay where they are, and graphs stay valid."""
+    changes = {"max_surfels": 200, "densify": DensifyConfig(every=60, fraction=0.5, prune_opacity=0.09)}
+    launched = trained(tiny_scene, cuda_graphs=False, **changes)
+    trainer = Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
+    captured: list[int] = []
+    replaced: list[int] = []
+    capture, control = step_graphs._Stage.capture, Densifier.step
+
+    def noted(*given: Any) -> None:
+        captured.append(trainer.iteration)
+        capture(*given)
+
+    def counted(densifier: Densifier, surfels: Surfels, *given: Any) -> tuple[int, int]:
+        before = len(surfels)
+        found = control(densifier, surfels, *given)
+        if found[0] and before == len(surfels):
+            replaced.append(trainer.iteration)
+        return found
+
+    monkeypatch.setattr(ops, "fits", lambda room: True)  # short lists are slow but right, and no reason here
+    monkeypatch.setattr(step_graphs._Stage, "capture", noted)
+    monkeypatch.setattr(Densifier, "step", counted)
+    trainer.run()
+    assert len(replaced) > 3 and captured
+    assert not [i for i in captured if replaced[0] < i <= trainer.densifier.config.stop]
+    assert_same_state(trainer, launched)

@@ -1,0 +1,367 @@
+"""Numbers that are not finite are found, named, gone back from once, then given up; memory that does not suffice."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.cli import main as cli
+from nexwarp.data import Scene, write_demo
+from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
+from nexwarp.machine import needed_memory
+from nexwarp.train import trainer
+from nexwarp.train.checkpoint import save_checkpoint
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.health import LossLog, describe, not_finite
+from nexwarp.train.schedules import make_optimizer
+from nexwarp.train.step_losses import step_losses
+from nexwarp.train.trainer import Trainer
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+
+NAN, INF = math.nan, math.inf
+SMALL = Config(
+    iterations=40,
+    max_surfels=60,
+    texture=TextureConfig(levels=2, table_size=2**6, width=8),
+    densify=DensifyConfig(every=5),
+)
+FLAGS = ["--iterations", "40", "--max-surfels", "60", "--device", "cpu"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=6, points=100)
+
+
+@pytest.fixture(scope="module")
+def scene(folder) -> Scene:
+    return nw.load_scene(folder)
+
+
+def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
+    """Something that spoils one value of a parameter, or of its gradient, before Adam's step."""
+
+    def spoil(run: Trainer) -> None:
+        kind, _, name = where.rpartition(" ")
+        parameter = dict(run._named_parameters())[name]
+        target = parameter.grad if kind == "gradient" else parameter.data
+        assert target is not None
+        target.view(-1)[3] = value
+
+    return spoil
+
+
+def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Trainer], None]) -> list[int]:
+    """Let a fault strike before Adam's step of some iterations, each time they come; returns those it struck."""
+    struck: list[int] = []
+    trainers: list[Trainer] = []
+    init = Trainer.__init__
+
+    def remember(self: Trainer, *args: Any, **options: Any) -> None:
+        trainers.append(self)
+        init(self, *args, **options)
+
+    def strike(*_: Any) -> None:
+        if trainers[-1].iteration in iterations:
+            struck.append(trainers[-1].iteration)
+            spoil(trainers[-1])
+
+    def make(*args: Any) -> torch.optim.Optimizer:
+        optimizer = make_optimizer(*args)
+        optimizer.register_step_pre_hook(strike)
+        return optimizer
+
+    patch.setattr(Trainer, "__init__", remember)
+    patch.setattr(trainer, "make_optimizer", make)
+    return struck
+
+
+class Once(set[int]):
+    """Iterations that are met once each."""
+
+    def __contains__(self, iteration: object) -> bool:
+        there = super().__contains__(iteration)
+        self.discard(iteration)
+        return there
+
+
+# What is finite
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+@pytest.mark.parametrize("place", [0, 4999, 9999])
+def test_any_value_that_is_not_finite_is_found(device, value, place):
+    tensors = {name: torch.randn(10_000, device=device) for name in ("a", "b", "c")}
+    tensors |= {"none": torch.empty(0, 3, device=device), "large": torch.full((9000,), 3e38, device=device)}
+    assert not_finite(tensors) == []
+    tensors["b"][place] = value
+    assert not_finite(tensors) == ["b"]
+    assert describe("b", tensors["b"]) == f"b: 1 of 10,000 values, the first {value} at index ({place},)"
+    assert not_finite({}) == []
+
+
+def test_losses_are_named_by_the_first_that_is_bad():
+    log = LossLog()
+    assert log.first_bad() is None
+    for iteration in range(1, 50):
+        terms = {"l1": torch.tensor(0.1), "grid": torch.tensor(INF if iteration == 30 else 0.2)}
+        log.note(iteration, terms | ({"l1": torch.tensor(NAN)} if iteration > 30 else {}))
+    assert log.first_bad() == (30, "grid", INF)
+    assert log.first_bad() is None and not log.noted
+
+
+# Training
+
+
+@pytest.mark.parametrize("value", [NAN, INF])
+@pytest.mark.parametrize(
+    "where",
+    ["gradient surfels.means", "gradient surfels.shN", "gradient texture.grid", "parameter surfels.raw_quats"],
+)
+def test_a_fault_is_found_named_and_gone_back_from(scene, monkeypatch, where, value):
+    """Struck once at iteration 13: told by 16, the next look; back at 12, the last good state, with half the rates."""
+    struck = inject(monkeypatch, Once({13}), poison(where, value))
+    told: list[str] = []
+    run, seen = Trainer(scene, SMALL, "cpu"), []
+    run.run(lambda step: seen.append((step.iteration, run.optimizer.param_groups[0]["lr"])), told.append)
+    assert struck == [13] and len(told) == 1
+    assert where.split()[1] in told[0] and "going back to iteration 12 with half the learning rates" in told[0]
+    assert "\n" not in told[0]
+    again = [i for i, (iteration, _) in enumerate(seen) if iteration == 13]
+    assert len(again) == 2 and seen[again[1] - 1][0] <= 16
+    assert seen[again[1]][1] == pytest.approx(seen[again[0]][1] / 2)
+    assert run.iteration == 40 and run.rate_factor == 0.5
+    assert not_finite(dict(run._named_parameters())) == []
+
+
+def test_a_bad_loss_is_named_with_its_iteration(scene, monkeypatch):
+    run = Trainer(scene, SMALL, "cpu")
+    told: list[str] = []
+
+    def spoilt(*args: Any, **options: Any) -> dict[str, torch.Tensor]:
+        terms = step_losses(*args, **options)
+        if run.iteration == 14 and run.rate_factor == 1.0:
+            terms["dssim"] = terms["dssim"] * NAN
+        return terms
+
+    monkeypatch.setattr(trainer, "step_losses", spoilt)
+    run.run(warn=told.append)
+    assert len(told) == 1 and told[0].startswith("iteration 14: the loss 'dssim' is nan; "), told
+
+
+@pytest.mark.parametrize("where", ["gradient surfels.shN", "gradient texture.grid", "parameter surfels.raw_quats"])
+def test_the_first_tensor_is_named_although_others_follow(scene, monkeypatch, where):
+    inject(monkeypatch, {13}, poison(where))
+    told: list[str] = []
+    with pytest.raises(DivergedError):
+        Trainer(scene, SMALL, "cpu").run(warn=told.append)
+    what = where.replace("gradient ", "gradient of ").replace("parameter ", "")
+    assert told[0].startswith(f"iteration 13: not finite; {what}: 1 of "), told
+    assert told[0].count("surfels.") <= 2  # no other is blamed
+
+
+def test_what_happens_again_is_given_up_with_a_report(scene, monkeypatch):
+    struck = inject(monkeypatch, {22}, poison("gradient surfels.log_scales"))
+    run = Trainer(scene, SMALL, "cpu")
+    told: list[str] = []
+    with pytest.raises(DivergedError, match="halved its learning rates before, so training gives up") as caught:
+        run.run(warn=told.append)
+    assert isinstance(caught.value, (NexwarpError, RuntimeError)) and "\n" not in str(caught.value)
+    assert struck == [22] * 4 and len(told) == 1  # each time once more, to tell where it began
+    assert "iteration 22: not finite; gradient of surfels.log_scales: 1 of" in told[0]
+    report = caught.value.report
+    assert report["good_iteration"] == run.iteration == 20 and report["rate_factor"] == 0.5
+    tensors = report["tensors"]
+    assert isinstance(tensors, list) and any("surfels.log_scales" in fact for fact in tensors)
+    json.dumps(report)
+    assert not_finite(run._watched()) == []  # the trainer is in its last good state
+
+
+def test_faults_are_looked_for_every_so_often(scene, monkeypatch):
+    monkeypatch.setattr(trainer, "CHECK_EVERY", 7)
+    monkeypatch.setattr(trainer, "SNAPSHOTS", 1)
+    inject(monkeypatch, Once({15}), poison("gradient surfels.means"))
+    run, seen = Trainer(scene, SMALL, "cpu"), []
+    run.run(lambda step: seen.append(step.iteration))
+    # The look at 21 finds it before anybody is told of 21; the only state to go back to is the first.
+    assert seen == [*range(1, 21), *range(1, 41)]
+
+
+def test_a_watched_run_is_the_run_that_nobody_watches(scene):
+    watched, alone = Trainer(scene, SMALL, "cpu"), Trainer(scene, SMALL, "cpu")
+    watched.run()
+    while alone.iteration < SMALL.iterations:
+        alone.step()
+    for name, value in alone._named_parameters():
+        assert torch.equal(dict(watched._named_parameters())[name], value), name
+
+
+def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
+    run = Trainer(scene, SMALL, "cpu")
+    run.step()
+    run.save(tmp_path)
+    run.step()
+    run.densifier.errors[2] = NAN
+    with pytest.raises(DivergedError, match=r"densify\.errors"):
+        run.save(tmp_path)
+    run.restore(tmp_path)
+    assert run.iteration == 1 and not_finite(run._watched()) == []
+
+
+def test_the_lowered_rate_is_kept_over_a_resume(scene, tmp_path):
+    first, second = Trainer(scene, SMALL, "cpu"), Trainer(scene, SMALL, "cpu")
+    first.rate_factor = 0.5
+    first.step()
+    first.save(tmp_path)
+    second.restore(str(tmp_path))
+    assert second.rate_factor == 0.5
+    for one in (first, second):
+        one.step()
+    assert first.optimizer.param_groups[0]["lr"] == second.optimizer.param_groups[0]["lr"]
+    assert torch.equal(first.surfels.means, second.surfels.means)
+
+
+# The command line
+
+
+def test_the_command_line_goes_back_and_tells(folder, tmp_path, monkeypatch, capsys):
+    inject(monkeypatch, Once({13}), poison("gradient surfels.means"))
+    assert cli.main(["train", str(folder), "--run", str(tmp_path / "run"), *FLAGS]) == 0
+    out, err = capsys.readouterr()
+    assert "warning: " in out and "going back to iteration 12 with half the learning rates" in out and err == ""
+    assert nw.load(tmp_path / "run").meta["iteration"] == 40
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == list(range(1, 41))  # those of the other future are gone
+    assert all(line["loss"] is not None for line in lines)
+
+
+def test_the_command_line_gives_up_with_a_report_and_a_model(folder, tmp_path, monkeypatch, capsys):
+    run = tmp_path / "run"
+    inject(monkeypatch, {22}, poison("gradient surfels.means"))
+    assert cli.main(["train", str(folder), "--run", str(run), *FLAGS]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1
+    for word in ("surfels.means", "gives up", "the model of iteration 20", "diverged.json"):
+        assert word in err, word
+    assert json.loads((run / "diverged.json").read_text())["good_iteration"] == 20
+    assert nw.load(run).meta["iteration"] == 20
+    assert json.loads((run / "checkpoint" / "state.json").read_text())["iteration"] == 20
+
+
+# Memory
+
+
+@pytest.mark.parametrize(
+    ("error", "needed"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has ..."), "2.50 GiB"),
+        (RuntimeError("Failed to allocate 3221225472 bytes on device 'cuda:0'"), "3.00 GiB"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 5242880 bytes."), "5.00 MiB"),
+        (MemoryError(), "more than there is"),
+        (MemoryError("Unable to allocate 7.45 GiB for an array"), "7.45 GiB"),
+        (RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be reported later"), "more than there is"),
+        (RuntimeError("Warp CUDA error 2: out of memory (in function wp_alloc_device)"), "more than there is"),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"), "more than there is"),
+        (RuntimeError("std::bad_alloc"), "more than there is"),
+        (RuntimeError("shape mismatch"), None),
+        (RuntimeError("CUDA error: an illegal memory access was encountered"), None),
+        (ValueError("out of memory of the names"), None),
+        (KeyError("x"), None),
+    ],
+)
+def test_errors_of_memory_are_known(error, needed):
+    assert needed_memory(error) == needed
+
+
+def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypatch, capsys):
+    def fail(*_: Any, **__: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has 1 KiB free")
+
+    monkeypatch.setattr("nexwarp.model.model.render", fail)
+    run = Trainer(scene, dataclasses.replace(SMALL, max_surfels=48), "cpu")
+    with pytest.raises(OutOfMemoryError) as caught:
+        run.run()
+    for word in ("iteration 1", "needed 2.50 GiB", "24x18", "--max-surfels (now 48)", "--max-hits", "--downscale"):
+        assert word in str(caught.value), word
+    assert cli.main(["train", str(folder), "--run", str(tmp_path / "run"), *FLAGS]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: out of memory at iteration 1: it needed 2.50 GiB") and err.count("\n") == 1
+
+
+# Checkpoints that others made: their checksums agree
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"iteration": -1}, "iteration"),
+        ({"iteration": 10**9}, "iteration"),
+        ({"iteration": "3"}, "iteration"),
+        ({"seconds": INF}, "seconds"),
+        ({"seconds": NAN}, "seconds"),
+        ({"order": [0, 77]}, "order"),
+        ({"order": [-1]}, "order"),
+        ({"order": 5}, "order"),
+        ({"rate_factor": 1e9}, "rate_factor"),
+        ({"rate_factor": None}, "rate_factor"),
+        ({"python": [3, [1, 2], None]}, ""),
+        ({"python": 7}, ""),
+        ({"python": ["a\0b", [1, 2], None]}, r"a\\x00b"),
+        ({"numpy": ["MT19937"]}, ""),
+        ({"config": []}, ""),
+    ],
+)
+def test_states_that_cannot_be_are_refused(scene, tmp_path, changes, match):
+    run = Trainer(scene, SMALL, "cpu")
+    run.step()
+    tensors, state = run.snapshot()
+    save_checkpoint(tmp_path, tensors, state | changes)
+    with pytest.raises(CheckpointError, match=rf"does not fit \(.*{match}") as caught:
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path}: ") and str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("surfels.means", lambda x: x.half()),
+        ("surfels.means", lambda x: x[:-1]),
+        ("adam.surfels.means.exp_avg", lambda x: x.long()),
+        ("adam.surfels.means.exp_avg", lambda x: x.T.contiguous()),
+        ("texture.grid", lambda x: x[:, :1]),
+        ("densify.errors", lambda x: x[:1]),
+        ("rng.torch", lambda x: x[:7]),
+        ("rng.views", lambda x: x.float()),
+        ("rng.numpy", lambda x: x[:5]),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(scene, tmp_path, name, value):
+    run = Trainer(scene, SMALL, "cpu")
+    run.step()
+    tensors, state = run.snapshot()
+    save_checkpoint(tmp_path, tensors | {name: value(tensors[name])}, state)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+
+
+def test_a_state_of_endless_depth_is_refused(scene, tmp_path):
+    run = Trainer(scene, SMALL, "cpu")
+    run.save(tmp_path)
+    (tmp_path / "checkpoint" / "state.json").write_text("[" * 100_000)
+    with pytest.raises(CheckpointError, match="nested too deeply"):
+        Trainer(scene, SMALL, "cpu").restore(tmp_path)
+
+
+def test_a_step_that_was_told_of_keeps_no_graph(scene):
+    """An observer that holds on to it would hold the buffers of the step, too."""
+    step = Trainer(scene, SMALL, "cpu").step()
+    assert not step.image.requires_grad and not any(loss.requires_grad for loss in step.losses.values())
+    assert step.loss() > 0 and math.isfinite(step.psnr())

@@ -1,0 +1,345 @@
+"""The losses against hand-computed cases, the paper's sums written out, and finite differences."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from nexwarp.cameras.camera import visible_points
+from nexwarp.train import losses
+from nexwarp.train.losses import LossWeights
+from tests.narrowing import present, total
+from tests.tolerances import assert_close
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def images(height: int = 13, width: int = 17, dtype: torch.dtype = torch.float64) -> list[torch.Tensor]:
+    """Two similar images, apart by more than a finite difference step in every pixel."""
+    target = torch.rand(height, width, 3, dtype=torch.float64)
+    offset = (torch.randint(2, target.shape) * 2 - 1) * (0.05 + 0.2 * torch.rand_like(target))
+    return [(target + offset).to(dtype), target.to(dtype)]
+
+
+def dense_ssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """SSIM by loops over pixels and window; outside the image are zeros, which count with their weight."""
+    height, width, _ = x.shape
+    window = [math.exp(-((i - 5) ** 2) / (2 * 1.5**2)) for i in range(11)]
+    total = sum(window)
+    scores = []
+    for row in range(height):
+        for column in range(width):
+            moments = torch.zeros(5, 3, dtype=x.dtype)
+            for i in range(11):
+                for j in range(11):
+                    r, c = row + i - 5, column + j - 5
+                    if 0 <= r < height and 0 <= c < width:
+                        a, b = x[r, c], y[r, c]
+                        values = torch.stack([a, b, a * a, b * b, a * b])
+                        moments = moments + window[i] * window[j] / total**2 * values
+            mx, my, xx, yy, xy = moments
+            top = (2 * mx * my + 0.01**2) * (2 * (xy - mx * my) + 0.03**2)
+            scores.append(top / ((mx**2 + my**2 + 0.01**2) * (xx - mx**2 + yy - my**2 + 0.03**2)))
+    return torch.stack(scores).mean()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_dssim_is_the_dense_definition_with_zeros_outside(device: torch.device, dtype: torch.dtype) -> None:
+    image, target = images(5, 8)
+    image.requires_grad_()
+    expected = 1 - dense_ssim(image, target)
+    (expected_gradient,) = torch.autograd.grad(expected, image)
+    leaf = image.detach().to(device, dtype).requires_grad_()
+    actual = losses.dssim(leaf, target.to(device, dtype))
+    (gradient,) = torch.autograd.grad(actual, leaf)
+    assert_close(actual, expected, kind="value", name="dssim")
+    assert_close(gradient, expected_gradient, kind="gradient", name="gradient of dssim")
+    assert gradient.is_contiguous()
+
+
+def test_dssim_in_float32_keeps_its_digits_on_large_images(device: torch.device) -> None:
+    """A convolution in TF32 would be off by 1e-3 here."""
+    image, target = (picture.to(device) for picture in images(90, 120))
+    expected = torch.autograd.grad(losses.dssim(image.requires_grad_(), target), image)[0]
+    leaf = image.detach().float().requires_grad_()
+    actual = torch.autograd.grad(losses.dssim(leaf, target.float()), leaf)[0]
+    assert_close(actual, expected, kind="value", name="gradient of dssim")
+
+
+def test_dssim_of_an_image_with_itself_is_zero_and_stationary() -> None:
+    image = images()[0].requires_grad_()
+    loss = losses.dssim(image, image.detach())
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert abs(loss.item()) < 1e-14
+    assert gradient.abs().max() < 1e-14
+
+
+def test_dssim_of_constant_images_by_hand() -> None:
+    """Away from the border two constant images differ in luminance only: (2 a b + C1) / (a^2 + b^2 + C1)."""
+    a, b, size = 0.3, 0.7, 400
+
+    def constants(size: int) -> list[torch.Tensor]:
+        return [torch.full((size, size, 3), value, dtype=torch.float64) for value in (a, b)]
+
+    expected = 1 - (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    assert losses.dssim(*constants(size)).item() == pytest.approx(expected, abs=20 / size)
+    one = losses.dssim(*constants(1))
+    g = 1 / sum(math.exp(-(i * i) / 4.5) for i in range(-5, 6)) ** 2
+    variances = g * (1 - g) * (a * a + b * b)
+    top = (2 * g * g * a * b + 1e-4) * (2 * g * (1 - g) * a * b + 9e-4)
+    assert one.item() == pytest.approx(1 - top / ((g * g * (a * a + b * b) + 1e-4) * (variances + 9e-4)), abs=1e-13)
+
+
+def test_dssim_scales_its_gradient_and_skips_it_for_data() -> None:
+    image, target = images()
+    leaf = image.clone().requires_grad_()
+    one = torch.autograd.grad(losses.dssim(leaf, target), leaf)[0]
+    three = torch.autograd.grad(-3 * losses.dssim(leaf, target), leaf)[0]
+    assert torch.allclose(three, -3 * one, rtol=1e-12, atol=0)
+    assert not losses.dssim(image, target).requires_grad
+    with pytest.raises(ValueError, match="target: expected a tensor that needs no gradient"):
+        losses.dssim(image, leaf)
+
+
+@pytest.mark.parametrize("value", [0.0, -5.0, 1e3])
+def test_dssim_is_finite_at_absurd_images(value: float) -> None:
+    image = torch.full((20, 20, 3), value)
+    image[::3] *= 0.999
+    image.requires_grad_()
+    loss = losses.dssim(image, torch.zeros(20, 20, 3))
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert loss.isfinite() and gradient.isfinite().all()
+
+
+def test_every_gradient_against_finite_differences() -> None:
+    image, target = images(5, 4)
+    image.requires_grad_()
+    weights = (0.2 + 0.3 * torch.rand(5, 4, 2, dtype=torch.float64)).requires_grad_()
+    grid = torch.randn(3, 4, 2, dtype=torch.float64, requires_grad=True)
+    resolutions = torch.tensor([0.9, 1.4, 2.0], dtype=torch.float64)
+    opacities = torch.rand(5, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda x: losses.l1(x, target), image)
+    assert gradcheck(lambda x: losses.dssim(x, target), image)
+    assert gradcheck(lambda x: losses.image_loss(x, target, 0.3), image)
+    assert gradcheck(lambda x, w: losses.texture_loss(x, w, target), (image, weights))
+    assert gradcheck(losses.alpha_loss, weights)
+    assert gradcheck(losses.opacity_loss, opacities)
+    assert gradcheck(lambda h: losses.grid_loss(h, resolutions), grid)
+
+
+def test_image_loss_mixes_l1_and_dssim() -> None:
+    image, target = images()
+    l1, dssim = (image - target).abs().mean(), losses.dssim(image, target)
+    for weight in (0.0, 0.2, 1.0):
+        expected = (1 - weight) * l1 + weight * dssim
+        assert_close(losses.image_loss(image, target, weight), expected, kind="value", name=f"weight {weight}")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_texture_loss_is_the_papers_sum(device: torch.device, dtype: torch.dtype) -> None:
+    height, width, slots = 3, 4, 2
+    weights = torch.rand(height, width, slots, dtype=torch.float64)
+    colours = torch.rand(height, width, slots, 3, dtype=torch.float64)
+    target = torch.rand(height, width, 3, dtype=torch.float64)
+    expected = torch.zeros((), dtype=torch.float64)
+    for y in range(height):
+        for x in range(width):
+            for c in range(3):
+                blended = sum(weights[y, x, j] * colours[y, x, j, c] for j in range(slots))
+                total = sum(weights[y, x, j] for j in range(slots))
+                expected += (target[y, x, c] - blended / (total + 1e-6)).abs() / (3 * height * width)
+    textured = (weights[..., None] * colours).sum(2)
+    inputs = (tensor.to(device, dtype) for tensor in (textured, weights, target))
+    assert_close(losses.texture_loss(*inputs), expected, kind="value", name="texture loss")
+
+
+def test_texture_loss_does_not_depend_on_coverage_and_survives_none() -> None:
+    colour, target = torch.rand(4, 4, 3).double(), torch.rand(4, 4, 3).double()
+    thick, thin = (torch.full((4, 4, 1), w).double() for w in (0.9, 0.1))
+    a, b = (losses.texture_loss(w * colour, w, target) for w in (thick, thin))
+    assert a.item() == pytest.approx(b.item(), rel=2e-5)
+    zero = torch.zeros(4, 4, 1).double().requires_grad_()
+    loss = losses.texture_loss(zero * colour, zero, target)
+    assert loss.item() == pytest.approx(target.mean().item(), rel=1e-14)
+    assert torch.autograd.grad(loss, zero)[0].isfinite().all()
+
+
+def test_alpha_opacity_and_grid_by_hand() -> None:
+    weights = torch.tensor([[[0.5, 0.25], [0.0, 0.0]]])
+    assert losses.alpha_loss(weights).item() == (0.25 + 1.0) / 2
+    assert losses.opacity_loss(torch.tensor([0.25, 0.75, 0.5])).item() == 0.5
+    grid = torch.tensor([[[1.0, -2.0]], [[3.0, 0.0]]])
+    assert losses.grid_loss(grid, torch.tensor([1.0, 2.0])).item() == pytest.approx(5.0 + 9.0 / 8.0, rel=1e-6)
+
+
+def test_grid_loss_has_a_zero_gradient_at_zero() -> None:
+    grid = torch.zeros(2, 4, 2, requires_grad=True)
+    loss = losses.grid_loss(grid, torch.tensor([16.0, 256.0]))
+    assert loss.item() == 0.0
+    assert torch.autograd.grad(loss, grid)[0].eq(0.0).all()
+
+
+def arguments(slots: int = 2, with_grid: bool = True) -> dict[str, Any]:
+    image, target = images()
+    weights = 0.4 * torch.rand(13, 17, slots, dtype=torch.float64)
+    return {
+        "image": image,
+        "textured": 0.5 * weights.sum(-1, keepdim=True).expand(-1, -1, 3),
+        "weights": weights,
+        "target": target,
+        "opacities": torch.rand(9, dtype=torch.float64),
+        "grid": torch.randn(2, 8, 2, dtype=torch.float64) if with_grid else None,
+        "resolutions": torch.tensor([2.0, 4.0], dtype=torch.float64) if with_grid else None,
+    }
+
+
+def test_training_losses_are_the_papers_total() -> None:
+    given = arguments()
+    terms = losses.training_losses(**given, loss_weights=LossWeights())
+    expected = {
+        "image": losses.image_loss(given["image"], given["target"], 0.2),
+        "alpha": 0.005 * losses.alpha_loss(given["weights"]),
+        "texture": 0.5 * losses.texture_loss(given["textured"], given["weights"], given["target"]),
+        "opacity": 0.01 * losses.opacity_loss(given["opacities"]),
+        "grid": 0.01 * losses.grid_loss(given["grid"], given["resolutions"]),
+    }
+    assert set(terms) == {"l1", "dssim", "texture", "alpha", "opacity", "grid"}
+    assert_close(terms["l1"] + terms["dssim"], expected.pop("image"), kind="value", name="image")
+    for name, value in expected.items():
+        assert_close(terms[name], value, kind="value", name=name)
+
+
+@pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
+def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
+    """For the term of the weights alone: the texture's has all of them."""
+    given = arguments(slots)
+    given["weights"].requires_grad_()
+    terms = losses.training_losses(**given, loss_weights=LossWeights())
+    missing = 1 - given["weights"].detach()[..., :counted].sum(-1)
+    assert_close(terms["alpha"], 0.005 * missing.mean(), kind="value", name="alpha")
+    (grad,) = torch.autograd.grad(terms["alpha"], given["weights"], retain_graph=True)
+    assert bool((grad[..., :counted] < 0).all()) and not grad[..., counted:].any()
+    texture = 0.5 * losses.texture_loss(given["textured"], given["weights"], given["target"])
+    assert_close(terms["texture"], texture, kind="value", name="texture")
+
+
+def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def names(given: dict[str, Any], **weights: Any) -> set[str]:
+        return set(losses.training_losses(**given, loss_weights=LossWeights(**weights)))
+
+    assert names(arguments(slots=0)) == {"l1", "dssim", "opacity", "grid"}
+    assert names(arguments(with_grid=False)) == {"l1", "dssim", "texture", "alpha", "opacity"}
+    assert names(arguments(), dssim=1.0) == {"dssim", "texture", "alpha", "opacity", "grid"}
+    monkeypatch.setattr(losses, "dssim", None)
+    assert names(arguments(), dssim=0, alpha=0, texture=0, opacity=0, grid=0) == {"l1"}
+
+
+def test_wrong_inputs_name_the_argument() -> None:
+    image = torch.zeros(4, 5, 3)
+    with pytest.raises(ValueError, match=r"target: expected shape \(H=4, W=5, 3\), got \(5, 4, 3\)"):
+        losses.l1(image, image.transpose(0, 1))
+    with pytest.raises(TypeError, match=r"target: expected dtype torch\.float32, got torch\.uint8"):
+        losses.dssim(image, image.to(torch.uint8))
+    with pytest.raises(ValueError, match=r"dssim: expected at least 0 and at most 1, got 1\.5"):
+        LossWeights(dssim=1.5)
+    with pytest.raises(ValueError, match="grid: expected at least 0, got -1"):
+        LossWeights(grid=-1)
+
+
+# What does not count, what is empty, and depths
+
+
+def scene_of_losses() -> dict[str, torch.Tensor]:
+    """Inputs of `training_losses`; leaves but for the target."""
+    image, target = images()
+    shape = image.shape[:2]
+    leaves = {"image": image, "textured": 0.6 * image, "weights": torch.rand(*shape, 2, dtype=torch.float64)}
+    return {name: x.clone().requires_grad_() for name, x in leaves.items()} | {"target": target}
+
+
+def terms_of(tensors: dict[str, torch.Tensor], **options: Any) -> dict[str, torch.Tensor]:
+    factors = LossWeights(opacity=0.0, grid=0.0)
+    rest: dict[str, Any] = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
+    given: dict[str, Any] = {**tensors, **rest, **options}
+    return losses.training_losses(**given, loss_weights=factors)
+
+
+def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
+    tensors = scene_of_losses()
+    mask = torch.rand(13, 17) < 0.7
+    terms = terms_of(tensors, mask=mask)
+    total(terms.values()).backward()
+    for name in ("image", "textured", "weights"):
+        gradient = present(tensors[name].grad)
+        assert not gradient[~mask].any() and gradient[mask].any(), name
+    spoilt = {name: torch.where(mask[..., None], x, 0.1 * x) for name, x in tensors.items() if name != "weights"}
+    again = terms_of({**tensors, **spoilt, "target": tensors["target"]}, mask=mask)
+    for name in ("l1", "dssim", "texture"):
+        assert_close(again[name], terms[name], kind="value", name=name)
+
+
+def test_a_mask_that_is_true_everywhere_changes_nothing() -> None:
+    tensors = scene_of_losses()
+    plain, masked = terms_of(tensors), terms_of(tensors, mask=torch.ones(13, 17, dtype=torch.bool))
+    for name, term in plain.items():
+        assert_close(masked[name], term, kind="value", name=name)
+
+
+def test_where_nothing_is_only_the_image_counts() -> None:
+    tensors = scene_of_losses()
+    empty = torch.rand(13, 17) < 0.4
+    terms = terms_of(tensors, empty=empty)
+    expected = terms_of(tensors)
+    for name in ("l1", "dssim"):
+        assert_close(terms[name], expected[name], kind="value", name=name)
+    total(terms.values()).backward()
+    for name in ("textured", "weights"):
+        gradient = present(tensors[name].grad)
+        assert not gradient[empty].any() and gradient[~empty].any(), name
+
+
+def test_visible_points_by_hand() -> None:
+    """Those outside, behind or masked are left out."""
+    nan = float("nan")
+    pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [nan, 1.0], [2.5, 1.5], [0.0, 2.999], [1.0, 3.0]])
+    depths = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0, 5.0, 1.0])
+    places, expected = present(visible_points(pixels, depths, 4, 3))
+    assert places.tolist() == [1 * 4 + 2, 2 * 4 + 0] and expected.tolist() == [2.0, 5.0]
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    mask[1, 2] = False
+    places, expected = present(visible_points(pixels, depths, 4, 3, mask))
+    assert places.tolist() == [8] and expected.tolist() == [5.0]
+    assert visible_points(pixels, depths, 4, 3, torch.zeros(3, 4, dtype=torch.bool)) is None
+    assert visible_points(pixels, -depths.abs(), 4, 3) is None
+
+
+def test_depth_loss_by_hand() -> None:
+    """Two slots of weights 0.3 and 0.1 at depths 2 and 4: 2.5 in the mean, against 2; and a pixel without hits."""
+    depths, weights = torch.zeros(3, 4, 2), torch.zeros(3, 4, 2)
+    depths[1, 2], weights[1, 2] = torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1])
+    places, expected = torch.tensor([6, 6, 0]), torch.tensor([2.0, 2.5, 3.0])
+    assert losses.depth_loss(depths, weights, places, expected).item() == pytest.approx((0.25 + 0 + 1) / 3, abs=1e-5)
+
+
+def test_what_fills_up_points_does_not_count() -> None:
+    depths = (2 + torch.rand(3, 4, 2)).requires_grad_()
+    weights = (0.1 + 0.4 * torch.rand(3, 4, 2)).requires_grad_()
+    places, expected = torch.tensor([3, 11, 5]), torch.tensor([1.5, 4.0, 3.9])
+    found = []
+    for fill in (0, 5):
+        padded = torch.cat([places, places.new_zeros(fill)]), torch.cat([expected, expected.new_zeros(fill)])
+        loss = losses.depth_loss(depths, weights, *padded)
+        found.append([loss.detach(), *torch.autograd.grad(loss, [depths, weights])])
+    for bare, filled in zip(*found, strict=True):
+        assert torch.equal(bare, filled)
+    none = losses.depth_loss(depths, weights, places, torch.zeros(3))
+    assert none.item() == 0 and not any(x.any() for x in torch.autograd.grad(none, [depths, weights]))
+
+
+def test_depth_loss_against_finite_differences() -> None:
+    depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    places, expected = torch.tensor([0, 11, 0, 5]), torch.tensor([1.5, 4.0, 3.9, 2.0], dtype=torch.float64)
+    assert gradcheck(lambda d, w: losses.depth_loss(d, w, places, expected), [depths, weights])

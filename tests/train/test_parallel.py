@@ -1,0 +1,367 @@
+"""Several ranks train one model: on CPUs, over gloo, in 2 and 3 processes."""
+
+import dataclasses
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+from typing import cast
+
+import pytest
+import safetensors.torch
+import torch
+
+from benchmarks import scaling
+from nexwarp.cli import device
+from nexwarp.cli import main as cli
+from nexwarp.data import Scene
+from nexwarp.errors import RankError, SceneError, SettingError
+from nexwarp.machine import derived_seed
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.model.texture import NeuralTexture
+from nexwarp.train import presets
+from nexwarp.train.checkpoint import has_checkpoint
+from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
+from nexwarp.train.ranks import join, liveness
+from nexwarp.train.ranks.join import Place, first_difference, join_store
+from nexwarp.train.ranks.launch import check_count
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.trainer import Trainer
+from tests.ranks_support import (
+    CPU,
+    alone_as,
+    digest,
+    environment,
+    free_port,
+    kept_gradients,
+    printed,
+    run_ranks,
+    start_ranks,
+    wait,
+)
+from tests.scenes import make_surfels, random_scene
+from tests.tolerances import assert_close
+from tests.trainer_support import small
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+
+# The command line has no flags for the texture's shape.
+SMALL = Config(
+    exposures=False,  # which all ranks estimate alike, in most of the time of so short a training
+    texture=TextureConfig(levels=4, table_size=2**10, width=16),
+    densify=DensifyConfig(every=3),
+)
+TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "2"]
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
+
+
+def long_config(size: int, steps: int) -> Config:
+    """Rounds of density control."""
+    return small(iterations=steps * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
+
+
+def short_config() -> Config:
+    return small(iterations=24)
+
+
+@pytest.mark.parametrize(
+    ("size", "steps"), [(2, 200), (3, 60), pytest.param(3, 200, marks=pytest.mark.slow)], ids=["2", "3", "3 for long"]
+)
+def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: int) -> None:
+    """One fork of the ranks for the laws of a whole training: a process costs more than a law."""
+
+    def work(ranks: Ranks) -> object:
+        first = ParallelTrainer(scene, short_config(), CPU, ranks)
+        with kept_gradients(first) as gradients:
+            first.step()
+        if ranks.first:
+            safetensors.torch.save_file(gradients[0], tmp_path / "gradients.safetensors")
+        replica = ParallelTrainer(scene, long_config(size, steps), CPU, ranks)
+        seen: list[int] = []
+        replica.run(lambda step: seen.append(step.iteration))
+        # Straight to the end, and resumed in the middle.
+        straight = ParallelTrainer(scene, short_config(), CPU, ranks)
+        straight.run()
+        halfway = ParallelTrainer(scene, short_config(), CPU, ranks)
+        halfway.run(until=12)
+        halfway.save(tmp_path / "run")
+        resumed = ParallelTrainer(scene, short_config(), CPU, ranks)
+        torch.manual_seed(99)
+        ranks.barrier()
+        resumed.restore(tmp_path / "run")
+        resumed.run()
+        return {
+            "replica": digest(replica),
+            "surfels": len(replica.surfels),
+            "steps": len(seen),
+            "last": seen[-1],
+            "straight": digest(straight),
+            "resumed": digest(resumed),
+        }
+
+    (tmp_path / "run").mkdir()
+    found = run_ranks(size, work, tmp_path / "ranks")
+    first = found[0]
+    assert isinstance(first, dict) and all(other == first for other in found)
+    assert first["steps"] == steps and first["last"] == steps * size and first["surfels"] > 120
+    assert first["straight"] == first["resumed"]
+    # The gradient is the mean of those of the ranks' views.
+    told = safetensors.torch.load_file(tmp_path / "gradients.safetensors")
+    alone = []
+    for rank in range(size):
+        one = alone_as(rank, size, scene, short_config())
+        with kept_gradients(one) as gradients:
+            one.step()
+        alone.append(gradients[0])
+    for name, value in told.items():
+        # Each alone has weighted its loss by 1 / size.
+        assert_close(value, torch.stack([each[name] for each in alone]).sum(0), kind="gradient", name=name)
+    # One process goes on from the checkpoint of several.
+    trainer = Trainer(scene, short_config(), CPU)
+    trainer.restore(tmp_path / "run")
+    assert trainer.iteration == 12
+    trainer.run()
+    assert trainer.iteration == 24
+
+
+def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
+    """Whatever the number of ranks, views come in one order, with random numbers of their own."""
+    views = len(scene.train)
+    taken: dict[int, list[int]] = {}
+    for size in (2, 3):
+        trainers = [alone_as(rank, size, scene, small(iterations=3 * views)) for rank in range(size)]
+        for trainer in trainers:
+            trainer.targets.make = lambda index, *_: index  # type: ignore[method-assign]
+        while trainers[0].iteration < 3 * views:
+            first = trainers[0].iteration
+            chosen = [cast(int, trainer._next_target()) for trainer in trainers]
+            for offset in range(trainers[0].views_a_step):
+                taken.setdefault(first + offset, []).append(chosen[offset])
+        weights = [trainer.share for trainer in trainers]
+        assert sum(weights) == pytest.approx(1.0) and trainers[0].iteration == 3 * views
+    order = [taken[number] for number in sorted(taken)]
+    assert sorted(taken) == list(range(3 * views))
+    assert all(len(set(each)) == 1 for each in order)  # all sizes agree
+    for epoch in range(3):
+        assert sorted(each[0] for each in order[epoch * views : (epoch + 1) * views]) == list(range(views))
+    assert len({derived_seed(0, n, k) for n in range(1000) for k in range(2)}) == 2000
+
+
+def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
+    one = Trainer(scene, short_config(), CPU)
+    four = Trainer(scene, short_config(), CPU)
+    scale_for_batch(four.optimizer, 4)
+    for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
+        assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
+        assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
+    # Other rules, which a benchmark compares with it.
+    for rule, factor, betas in (
+        ("linear", 4, (0.9**4, 0.999**4)),
+        ("none", 1, (0.9, 0.999)),
+        ("rates", 2, (0.9, 0.999)),
+    ):
+        other = Trainer(scene, short_config(), CPU).optimizer
+        scale_for_batch(other, 4)
+        scaling.change_rule(other, 4, rule)
+        for before, after in zip(one.optimizer.param_groups, other.param_groups, strict=True):
+            assert after["ends"] == pytest.approx(tuple(factor * rate for rate in before["ends"]))
+            assert after["betas"] == pytest.approx(betas)
+
+
+def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    texture = NeuralTexture(levels=8, table_size=2**10, features=4, residual=True)
+    surfels = make_surfels(random_scene(24))
+    numbers = sum(x.numel() for x in (*surfels.parameters(), *texture.mlp.parameters())) + len(surfels)  # error sums
+    assert scaling.gradient_bytes(24, 2**10) == (4 * texture.grid.numel(), 4 * numbers)
+    assert scaling.main(["--simulate", "--step-ms", "10", "--surfels", "400000"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    counts, efficiencies = [int(row[0]) for row in rows], [float(row[5]) for row in rows]
+    assert counts == [1, 2, 4, 8, 16, 32, 64] and efficiencies[0] == 1.0
+    assert efficiencies == sorted(efficiencies, reverse=True) and efficiencies[3] > 2 * efficiencies[4]
+
+
+# Bad input
+
+
+def test_ranks_that_do_not_fit_are_refused_alike(scene: Scene, tmp_path: Path) -> None:
+    """All ranks raise the same error, whichever of them it is about."""
+    few = dataclasses.replace(scene, train=scene.train[:1])
+    view = scene.train[3]
+    other = dataclasses.replace(scene, train=[*scene.train[:3], dataclasses.replace(view, image=255 - view.image)])
+    same = dataclasses.replace(scene, train=scene.train[:4])
+
+    def work(ranks: Ranks) -> object:
+        told = []
+        for one, config, facts in (
+            (few, small(), {}),
+            (other if ranks.rank == 1 else same, small(), {}),
+            (same, small(seed=ranks.rank), {}),
+            (same, small(), {"code of nexwarp": f"version {ranks.rank}"}),
+            (same, small(), {"GPU": f"{ranks.rank + 1} GiB"}),
+        ):
+            try:
+                ranks.check_same(facts)
+                ParallelTrainer(one, config, CPU, ranks)
+                told.append("nothing")
+            except (RankError, SceneError) as error:
+                told.append(str(error))
+        return told
+
+    first, second = run_ranks(2, work, tmp_path / "ranks")
+    assert isinstance(first, list) and first == second
+    assert first[0] == "memory: expected at most as many ranks as training views, 1, got 2".replace(
+        "memory", str(scene.path)
+    )
+    assert first[1].startswith("rank 1: expected the same scene as rank 0, ")
+    assert first[2].startswith("rank 1: expected the same settings as rank 0, ")
+    assert first[3] == "rank 1: expected the same code of nexwarp as rank 0, version 0, got version 1"
+    assert first[4] == "rank 1: expected the same GPU as rank 0, 1 GiB, got 2 GiB"
+
+
+def test_a_missing_rank_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (environment(0, 3, free_port()) | {join.WAIT_VARIABLE: "0.3"}).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(RankError, match=r"expected 3 ranks to join at 127\.0\.0\.1:\d+ within 0 s; missing: 1, 2$"):
+        join_store(Place.of_environment())
+    assert liveness.may_speak()
+    monkeypatch.setenv("RANK", "7")
+    with pytest.raises(RankError, match="expected a rank below the number of ranks, got 7 of 3"):
+        Place.of_environment()
+    monkeypatch.setenv("RANK", "one")
+    with pytest.raises(RankError, match="RANK: expected a number in the environment, got 'one'"):
+        Place.of_environment()
+
+
+def test_differences_between_ranks_are_told() -> None:
+    assert first_difference([{"a": "1"}, {"a": "1"}]) is None
+    assert first_difference([{"a": "1"}, {}]) == "rank 1: expected the same a as rank 0, 1, got None"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
+def test_gpus_that_are_not_there_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    check_count(3, "cpu")
+    with pytest.raises(SettingError, match="--gpus: expected at least 1, got 0"):
+        check_count(0, "cpu")
+    assert cli.main(["train", "demo", "--gpus", "4"]) == 2
+    message = "error: --gpus: expected a machine with 4 GPUs, found none; --device cpu trains on CPUs instead"
+    assert capsys.readouterr().err == f"nexwarp: {message}\n"
+
+
+# The end of a rank
+
+
+@pytest.fixture
+def small_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+
+
+def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    """SIGKILL in the middle: all end within 10 s, with one line; the resumed run has the bytes of a whole one."""
+
+    def train(run: Path, *more: str) -> list[str]:
+        return ["train", str(tiny_folder), "--run", str(run), *more]
+
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    assert wait(start_ranks(2, lambda _: cli.main(train(whole, *TRAIN)), tmp_path / "a")) == [0, 0]
+    assert printed(tmp_path / "a") == [] and len(printed(tmp_path / "a", "out")) > 5
+    processes = start_ranks(2, lambda _: cli.main(train(run, *TRAIN)), tmp_path / "b")
+    until = time.monotonic() + 60
+    while not has_checkpoint(run) and time.monotonic() < until:
+        time.sleep(0.005)
+    assert processes[1].pid is not None
+    os.kill(processes[1].pid, signal.SIGKILL)
+    killed = time.monotonic()
+    assert wait(processes) == [liveness.EXIT_CODE, -signal.SIGKILL]
+    assert time.monotonic() - killed < 10
+    (line,) = printed(tmp_path / "b")
+    assert line.startswith(f"nexwarp: error: rank 1 (process {processes[1].pid} on "), line
+    assert line.endswith(") has ended unexpectedly, so all ranks end; --resume continues from the last checkpoint")
+    assert not (run / MODEL_FILE).exists()
+    resumed = start_ranks(2, lambda _: cli.main(train(run, "--device", "cpu", "--resume")), tmp_path / "c")
+    assert wait(resumed) == [0, 0] and printed(tmp_path / "c") == []
+    assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
+
+
+def test_errors_and_signals_of_one_rank_are_told_once(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    run = tmp_path / "run"
+    arguments = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--iterations", "4000"]
+    processes = start_ranks(2, lambda _: cli.main(arguments), tmp_path / "a")
+    until = time.monotonic() + 60
+    while not has_checkpoint(run) and time.monotonic() < until:
+        time.sleep(0.005)
+    assert processes[1].pid is not None
+    os.kill(processes[1].pid, signal.SIGTERM)
+    assert wait(processes) == [128 + signal.SIGTERM] * 2
+    assert printed(tmp_path / "a") == ["nexwarp: terminated; continue with --resume"]
+    # The folder exists: only rank 0 looks.
+    assert wait(start_ranks(2, lambda _: cli.main(arguments), tmp_path / "b"))[0] == 2
+    (line,) = printed(tmp_path / "b")
+    assert line.startswith(f"nexwarp: error: {run}: expected a new run folder, but it exists")
+    # An option that does not exist: each rank finds out by itself.
+    wrong = start_ranks(2, lambda _: _exit_code([*arguments, "--nonsense"]), tmp_path / "c")
+    assert wait(wrong) == [2, 2] and len(printed(tmp_path / "c")) == 1
+
+
+def test_a_scene_that_cannot_be_read_is_told_once(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    """One rank of the machine reads it for all."""
+    folder = shutil.copytree(tiny_folder, tmp_path / "scene")
+    photo = sorted((folder / "images").iterdir())[1]
+    photo.write_bytes(photo.read_bytes()[:200])
+    run = tmp_path / "run"
+    processes = start_ranks(2, lambda _: cli.main(["train", str(folder), "--run", str(run), *TRAIN]), tmp_path / "a")
+    assert wait(processes)[0] == 2
+    (line,) = printed(tmp_path / "a")
+    assert line.startswith(f"nexwarp: error: {photo}: ") and not run.exists()
+
+
+def test_ranks_that_may_not_join_are_told_once(tiny_folder: Path, tmp_path: Path) -> None:
+    """Other code on one rank, and a rank without a device of its own; nothing is written."""
+    run = tmp_path / "run"
+    arguments = ["train", str(tiny_folder), "--run", str(run), *TRAIN]
+
+    def other_code(rank: int) -> int:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(device, "code_digest", lambda: f"version {rank}")
+            return cli.main(arguments)
+
+    assert 2 in wait(start_ranks(2, other_code, tmp_path / "a"))
+    expected = "rank 1: expected the same code of nexwarp as rank 0, version 0, got version 1"
+    assert printed(tmp_path / "a") == [f"nexwarp: error: {expected}"]
+
+    def too_few(rank: int) -> int:
+        with pytest.raises(RankError, match="expected a GPU of its own") as caught:
+            Ranks.join(CPU, {}, fault="expected a GPU of its own" if rank == 1 else None)
+        if liveness.may_speak():
+            print(caught.value)
+        return liveness.end_process(2)
+
+    wait(start_ranks(2, too_few, tmp_path / "b"))
+    assert printed(tmp_path / "b", "out") == ["expected a GPU of its own"] and not run.exists()
+
+
+def test_many_gradients_are_summed_after_the_graph() -> None:
+    """61 numbers a surfel less its error are 60; the grid counts only where hits are textured."""
+    surfels, texture = make_surfels(random_scene(3)), NeuralTexture(levels=2, table_size=2**10, features=4)
+    ours = sum(x.numel() for x in texture.parameters())
+    most = (MOST_CAPTURED_BYTES // 4 - ours) // 60
+    for count, beside in ((most, False), (most + 1, True)):
+        config = Config(max_surfels=count)
+        assert sums_beside("nccl", surfels, texture, config) is beside
+        assert sums_beside("gloo", surfels, texture, config)
+    untextured = Config(max_surfels=most + 1, max_hits=0)
+    assert not sums_beside("nccl", surfels, texture, untextured)
+
+
+def _exit_code(arguments: list[str]) -> int:
+    try:
+        return cli.main(arguments)
+    except SystemExit as stop:
+        assert isinstance(stop.code, int)
+        return stop.code

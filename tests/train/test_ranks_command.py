@@ -1,0 +1,135 @@
+"""`nexwarp train --gpus N` and `torchrun`: whole commands, in processes of their own."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint
+from tests.subprocesses import python_path
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+
+ROOT = Path(__file__).parents[2]
+SMALL = "texture.levels=4 texture.table_size=1024 texture.width=16 densify.every=300".split()
+TRAIN = ["--device", "cpu", "--max-surfels", "200", *(x for s in SMALL for x in ("--set", s))]
+TORCHRUN = ["-m", "torch.distributed.run", "--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]
+
+# torchrun would take --run for an abbreviation of an option of its own.
+MODULE = ["-m", "--"]
+
+
+def start(arguments: list[str], launcher: list[str] | None = None) -> subprocess.Popen[str]:
+    command = [sys.executable, *(launcher or ["-m"]), "nexwarp", *arguments]
+    environment = os.environ | python_path(ROOT) | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+
+
+def lines(process: subprocess.Popen[str], seconds: float = 600) -> list[str]:
+    """What it printed on stderr until its end, without Warp's lines about a missing driver."""
+    _, err = process.communicate(timeout=seconds)
+    return [line for line in err.splitlines() if line and not line.startswith("Warp CUDA warning")]
+
+
+def ranks_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    children = psutil.Process(process.pid).children()
+    return sorted((c for c in children if "RANK" in c.environ()), key=lambda c: int(c.environ()["RANK"]))
+
+
+def await_checkpoint(run: Path) -> None:
+    until = time.monotonic() + 300
+    while not has_checkpoint(run) and time.monotonic() < until:
+        time.sleep(0.01)
+    assert has_checkpoint(run)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_the_command_ends_with_one_line(tiny_folder: Path, tmp_path: Path, number: signal.Signals) -> None:
+    """A rank is killed, or a signal comes to the command: all processes end within 10 s, and one line says why."""
+    run = tmp_path / "run"
+    options = ["--gpus", "3", "--iterations", "6000", "--checkpoint-every", "30"]
+    process = start(["train", str(tiny_folder), "--run", str(run), *TRAIN, *options])
+    await_checkpoint(run)
+    ranks = ranks_of(process)
+    assert len(ranks) == 3
+    begun = time.monotonic()
+    os.kill(ranks[1].pid if number == signal.SIGKILL else process.pid, number)
+    told = lines(process, 60)
+    assert time.monotonic() - begun < 10
+    assert process.returncode == 128 + number and not any(rank.is_running() for rank in ranks)
+    (line,) = told
+    if number == signal.SIGKILL:
+        assert line.startswith(f"nexwarp: error: rank 1 (process {ranks[1].pid} on ") and "--resume" in line
+    else:
+        what = "terminated" if number == signal.SIGTERM else "interrupted"
+        assert line == f"nexwarp: {what}; continue with --resume"
+    _, state = load_checkpoint(run)
+    assert state["iteration"] % 3 == 0
+
+
+def test_torchrun_restarts_a_training(tiny_folder: Path, tmp_path: Path) -> None:
+    """After the death of a rank, --max-restarts resumes by itself, to the bytes of a whole training."""
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    options = ["--iterations", "240", "--checkpoint-every", "20"]
+    launcher = [*TORCHRUN, "--nproc-per-node=2", "--max-restarts=2", *MODULE]
+    process = start(["train", str(tiny_folder), "--run", str(whole), *TRAIN, *options], launcher)
+    assert not [line for line in lines(process) if line.startswith("nexwarp:")] and process.returncode == 0
+    process = start(["train", str(tiny_folder), "--run", str(run), *TRAIN, *options], launcher)
+    await_checkpoint(run)
+    os.kill(ranks_of(process)[0].pid, signal.SIGKILL)
+    told = [line for line in lines(process) if line.startswith("nexwarp:")]
+    assert process.returncode == 0 and len(told) == 1 and "rank 0 (process" in told[0], told
+    assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
+
+
+def test_a_run_goes_on_with_any_number_of_ranks(tiny_folder: Path, tmp_path: Path) -> None:
+    """Two ranks begin, one goes on, three end; the model is as good as that of one."""
+    run, alone = tmp_path / "run", tmp_path / "alone"
+    options = ["--iterations", "600", "--checkpoint-every", "60"]
+    begun = ["train", str(tiny_folder), "--run", str(run)]
+    reached: list[int] = []
+    for count, more in ((2, [*TRAIN, *options]), (1, ["--device", "cpu", "--resume"])):
+        process = start([*begun, *more, "--gpus", str(count)])
+        before = reached[-1] if reached else 0
+        until = time.monotonic() + 300
+        while time.monotonic() < until:
+            time.sleep(0.05)
+            if has_checkpoint(run) and load_checkpoint(run)[1]["iteration"] > before:
+                break
+        process.send_signal(signal.SIGTERM)
+        assert lines(process) == ["nexwarp: terminated; continue with --resume"]
+        reached.append(load_checkpoint(run)[1]["iteration"])
+    assert 0 < reached[0] < reached[1] < 600, reached
+    process = start([*begun, "--device", "cpu", "--resume", "--gpus", "3"])
+    assert lines(process) == [] and process.returncode == 0
+    assert not lines(start(["train", str(tiny_folder), "--run", str(alone), *TRAIN, *options]))
+    told, expected = (json.loads((x / "metrics.json").read_text()) for x in (run, alone))
+    assert told["iterations"] == expected["iterations"] == 600
+    assert told["psnr"] > expected["psnr"] - 0.5, (told["psnr"], expected["psnr"])
+
+
+def test_ranks_train_teachers_first(tiny_folder: Path, tmp_path: Path) -> None:
+    """And find them again, on all ranks, when the run is resumed."""
+    run = tmp_path / "run"
+    command = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--gpus", "2", "--iterations", "40"]
+    process = start([*command, "--set", "teachers=2"])
+    assert lines(process) == [] and process.returncode == 0
+    model, metrics = (run / MODEL_FILE).read_bytes(), json.loads((run / "metrics.json").read_text())
+    assert (metrics["iterations"], metrics["teachers"]) == (40, 2)
+    assert [(run / "teachers" / name / MODEL_FILE).is_file() for name in ("1", "2")] == [True, True]
+    for name in ("checkpoint", "checkpoint.old", "teachers/2"):
+        shutil.rmtree(run / name)
+    (run / MODEL_FILE).unlink()
+    process = start([*command, "--resume"])
+    assert lines(process) == [] and process.returncode == 0
+    assert (run / MODEL_FILE).read_bytes() == model

@@ -1,0 +1,613 @@
+"""Runs that train teachers of their own first: how they are divided, and that they are what three commands give."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+import nexwarp as nw
+from benchmarks.quality.jobs import PHOTOS, THINNED, TrainingJob, config_of, group_jobs, training_photos
+from benchmarks.quality.rows import DEFAULT, PAPER, Row
+from benchmarks.quality.run import config_name, run_job, trained_with
+from benchmarks.quality.scenes import scene_of
+from benchmarks.timing import ROOT
+from nexwarp import Config, Model, Scene, Trainer
+from nexwarp.cli import main as cli
+from nexwarp.cli.staged_session import StagedSession
+from nexwarp.data import write_demo
+from nexwarp.errors import OutOfMemoryError, SettingError
+from nexwarp.run.contents import list_files
+from nexwarp.run.evaluate import METRICS
+from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
+from nexwarp.train import exposure_calibration
+from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
+from nexwarp.train.config import TextureConfig
+from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
+from nexwarp.train.presets import PRESETS, config_from_dict, preset
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.report import StepReport
+from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, teacher_count
+from tests.exposed import expose_photos
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+CPU = torch.device("cpu")
+CONFIG = Config(
+    iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)
+)
+OWN = {"count": 2, "iterations": 4, "max_surfels": 240}
+SETTINGS = ("texture.table_size=1024", "texture.levels=4", "exposures=false")
+SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS for text in ("--set", each))]
+
+
+def same(one: Model, other: Model) -> bool:
+    theirs = other.state_dict()
+    return all(torch.equal(x, theirs[name]) for name, x in one.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("changes", "photos", "count"),
+    [
+        ({}, 21, 2),
+        ({}, 44, 2),
+        ({}, 45, 0),  # photos are many
+        ({"max_surfels": 12_600}, 42, 2),
+        ({"max_surfels": 12_600}, 43, 0),  # surfels are few for them
+        ({"iterations": 60_000}, 21, 2),
+        ({"iterations": 29_999}, 21, 0),  # the run is short
+        ({"refine_poses": True}, 21, 0),
+        ({"blur_poses": 3}, 21, 0),
+        ({"teachers": 0}, 21, 0),
+        ({"teachers": 1}, 500, 1),  # what is asked for
+        ({"teachers": 3, "iterations": 100, "max_surfels": 100}, 21, 3),
+    ],
+)
+def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
+    config = dataclasses.replace(Config(), **changes)
+    assert teacher_count(config, photos) == plan_teachers(config, photos).count == count
+
+
+def test_only_the_papers_preset_does_without() -> None:
+    assert {name: plan_teachers(preset(name), 21).count for name in PRESETS} == {"default": 2, "web": 2, "paper": 0}
+
+
+def test_settings_of_a_run_from_before_there_were_teachers_have_none() -> None:
+    data = Config().as_dict()
+    assert config_from_dict(data).teachers is None
+    del data["teachers"]
+    assert config_from_dict(data).teachers == 0
+
+
+@pytest.mark.parametrize("iterations", [7, 30, 12_345, 30_000])
+@pytest.mark.parametrize("count", [1, 2, 3, 8])
+def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int) -> None:
+    config = Config(iterations=iterations, teachers=count, seed=5)
+    if iterations <= count:
+        with pytest.raises(SettingError, match="iterations: expected more than the teachers' 8, got 7"):
+            divide(config, plan_teachers(config, 20))
+        return
+    stages = divide(config, plan_teachers(config, 20))
+    lengths = [each.iterations for each in stages.teachers]
+    assert len(set(lengths)) == 1 and min(lengths) >= 1
+    assert sum(lengths) + stages.student.iterations == iterations
+    assert abs(sum(lengths) - 0.4 * iterations) < count or lengths[0] == 1
+    assert len({each.seed for each in (*stages.teachers, stages.student)}) == count + 1 and stages.student.seed == 5
+    for each in (*stages.teachers, stages.student):
+        assert each == dataclasses.replace(config, teachers=0, iterations=each.iterations, seed=each.seed)
+
+
+@pytest.mark.parametrize(
+    ("budget", "teachers"), [(60, 240), (9_999, 39_996), (10_000, 40_000), (39_999, 40_000), (40_001, 40_001)]
+)
+def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> None:
+    config = Config(max_surfels=budget, teachers=2)
+    stages = divide(config, plan_teachers(config, 20))
+    assert {each.max_surfels for each in stages.teachers} == {teachers} and stages.student.max_surfels == budget
+    # As in a run from before.
+    assert {each.max_surfels for each in divide(config, OwnTeachers(2, 10)).teachers} == {budget}
+
+
+def test_seeds_of_teachers_follow_from_the_runs() -> None:
+    def seeds(seed: int) -> list[int]:
+        return [each.seed for each in divide(Config(seed=seed), OwnTeachers(2, 10)).teachers]
+
+    assert seeds(3) == seeds(3) and not set(seeds(3)) & set(seeds(4))
+
+
+def test_settings_that_do_not_go_together_are_refused() -> None:
+    for changes in ({"refine_poses": True}, {"blur_poses": 3}):
+        with pytest.raises(ValueError, match="teachers: expected 0 or null where poses are learned, got 2"):
+            Config(teachers=2, **changes)
+    for wrong in (-1, 9):
+        with pytest.raises(ValueError, match=f"teachers: expected at least 0 and at most 8, got {wrong}"):
+            Config(teachers=wrong)
+
+
+def test_a_trainer_trains_one_model(tiny_scene: Scene) -> None:
+    with pytest.raises(ValueError, match=r"config.teachers: expected 0 or None.*nexwarp.train trains teachers first"):
+        Trainer(tiny_scene, CONFIG, CPU)
+
+
+def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Teachers, then the student with them; its callbacks count the steps of all."""
+    seen: list[int] = []
+
+    def note(step: StepReport) -> None:
+        seen.append(step.iteration)
+
+    found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
+    assert seen == [*range(1, 21)]
+    stages = divide(CONFIG, OwnTeachers(2, 4, 240))
+    files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
+    teachers = [nw.load(file) for file in files]
+    assert same(found, nw.train(tiny_scene, stages.student, device=CPU, teachers=teachers))
+    assert not same(found, nw.train(tiny_scene, stages.student, device=CPU))
+    # Models that are given take the place of its own teachers.
+    alone = dataclasses.replace(CONFIG, teachers=0)
+    given = nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
+    assert same(given, nw.train(tiny_scene, alone, device=CPU, teachers=teachers))
+
+
+@pytest.fixture(scope="module")
+def exposed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene whose photos differ in exposure; not to be changed."""
+    folder = write_demo(tmp_path_factory.mktemp("scenes") / "demo", width=48, height=36, views=24, points=400)
+    expose_photos(folder)
+    return folder
+
+
+@pytest.fixture
+def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
+    """The settings of all trainings whose exposures are estimated."""
+    seen: list[Config] = []
+
+    def calibrate(scene: Scene, config: Config) -> ExposureCalibration | None:
+        seen.append(config)
+        return calibrate_exposures(scene, config)
+
+    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", calibrate)
+    return seen
+
+
+def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
+    """Its models are those of trainings that estimate them for themselves."""
+    scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
+    found = nw.train(scene, config, device=CPU)
+    assert len(calibrations) == 1 and found.exposures is not None
+    stages = divide(config, OwnTeachers(2, 4, 240))
+    files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
+    assert same(found, nw.train(scene, stages.student, device=CPU, teachers=map(nw.load, files)))
+
+
+def test_the_command_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    small = ["--iterations", "10", *SMALL[:-2], "--set", "exposures=true", "--set", "teachers=2"]
+    assert cli.main(["train", str(exposed_folder), "--run", str(run), *small]) == 0
+    assert len(calibrations) == 1 and nw.load(run).exposures is not None
+
+
+@pytest.fixture(scope="module")
+def command(tiny_folder: Path) -> Callable[..., int]:
+    def train(run: Path, *options: str, iterations: int = 20) -> int:
+        asked = ["--iterations", str(iterations), "--set", "teachers=2", *SMALL, *options]
+        return cli.main(["train", str(tiny_folder), "--run", str(run), *asked])
+
+    return train
+
+
+@pytest.fixture(scope="module")
+def finished(command: Callable[..., int], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with two teachers of 4 iterations and a student of 12; not to be changed."""
+    run = tmp_path_factory.mktemp("runs") / "whole"
+    assert command(run) == 0
+    return run
+
+
+def model_of(run: Path) -> bytes:
+    return (run / "model.safetensors").read_bytes()
+
+
+def test_the_command_does_what_train_does(finished: Path, tiny_scene: Scene, tmp_path: Path) -> None:
+    expected = nw.train(tiny_scene, CONFIG, device=CPU)
+    assert same(nw.load(finished), nw.load(expected.save(tmp_path)))
+
+
+def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["iterations"] == 20 and metrics["teachers"] == 2 and "psnr" in metrics
+    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == OWN
+    seeds, spent = {0}, 0.0
+    for folder in (run / "teachers" / "1", run / "teachers" / "2"):
+        facts = json.loads((folder / "metrics.json").read_text())
+        assert facts["iterations"] == 4 and "psnr" not in facts and not has_checkpoint(folder)
+        config = read_run(folder)[1]
+        assert (config.iterations, config.max_surfels, config.teachers) == (4, 240, 0)
+        seeds, spent = seeds | {config.seed}, spent + facts["seconds"]
+        assert cli.main(["eval", str(folder), "--device", "cpu"]) == 0
+        assert "psnr" in json.loads((folder / "metrics.json").read_text())
+    assert len(seeds) == 3 and metrics["seconds"] > spent
+    assert not list_files(run)[1]
+
+
+@pytest.mark.parametrize("lost", ["student", "teacher 2", "all"])
+def test_a_run_resumes_in_each_stage(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], lost: str
+) -> None:
+    """With the bits of an uninterrupted one, whatever it still has to train; complete teachers stay as they are."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    for name in (*CHECKPOINTS, "renders"):
+        shutil.rmtree(run / name, ignore_errors=True)
+    for name in ("model.safetensors", "metrics.json", "metrics.jsonl", "cameras.json"):
+        (run / name).unlink()
+    first = {"student": 3, "teacher 2": 2, "all": 1}[lost]
+    for number in range(first, 3):
+        if lost == "all":
+            shutil.rmtree(run / "teachers" / str(number))
+        else:  # without the file that is written last
+            (run / "teachers" / str(number) / "metrics.json").unlink()
+    before = [(run / "teachers" / str(number) / "model.safetensors").stat().st_mtime_ns for number in range(1, first)]
+    capsys.readouterr()
+    assert command(run, "--resume") == 0
+    assert model_of(run) == model_of(finished)
+    told = capsys.readouterr().out
+    for number in (1, 2):
+        assert (f"teacher {number} of 2: 4 iterations, at most 240 surfels, seed" in told) == (number >= first)
+        assert (run / "teachers" / str(number) / "metrics.json").is_file()
+    after = [(run / "teachers" / str(number) / "model.safetensors").stat().st_mtime_ns for number in range(1, first)]
+    assert after == before
+
+
+@pytest.mark.parametrize("stop", [6, 15])
+def test_a_stopped_run_goes_on_where_it_was(
+    finished: Path, command: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
+) -> None:
+    """Whatever the stage that the signal comes in."""
+    steps: list[None] = []
+    taken: list[None] = []
+    step = Trainer.step
+
+    def killed(trainer: Trainer) -> StepReport:
+        steps.append(None)
+        if len(steps) > stop:
+            raise KeyboardInterrupt
+        return step(trainer)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "step", killed)
+        assert command(run, "--checkpoint-every", "1") == 130
+    assert not (run / "model.safetensors").exists()
+
+    def counted(trainer: Trainer) -> StepReport:
+        taken.append(None)
+        return step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", counted)
+    assert command(run, "--resume") == 0
+    assert len(taken) == 20 - stop and model_of(run) == model_of(finished)
+
+
+def test_a_longer_run_keeps_its_teachers(
+    finished: Path, command: Callable[..., int], tmp_path: Path, tiny_scene: Scene
+) -> None:
+    """All further iterations are the student's."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    teachers = [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"]
+    assert command(run, "--resume", iterations=30) == 0
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
+    assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
+    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == OWN
+    model = model_of(run)
+    (run / "model.safetensors").unlink()
+    assert command(run, "--resume", iterations=30) == 0
+    assert model_of(run) == model
+
+
+def test_other_teachers_are_refused_where_a_run_has_its_own(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    capsys.readouterr()
+    assert command(run, "--resume", "--teacher", str(finished)) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "--teacher: expected none, as the run to resume trains its own, got" in told
+
+
+def test_given_runs_take_the_place_of_own_teachers(
+    finished: Path, command: Callable[..., int], tmp_path: Path, tiny_scene: Scene
+) -> None:
+    run = tmp_path / "run"
+    assert command(run, "--teacher", str(finished)) == 0
+    assert not (run / "teachers").exists() and "own_teachers" not in read_run(run)[2]
+    expected = nw.train(tiny_scene, CONFIG, device=CPU, teachers=[nw.load(finished)])
+    assert same(nw.load(run), nw.load(expected.save(tmp_path)))
+
+
+def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    for name in ("teachers/1/notes.txt", "teachers/3/model.safetensors", "teachers/mine.txt"):
+        (run / name).parent.mkdir(exist_ok=True)
+        (run / name).write_text("mine")
+    assert sorted(list_files(run)[1]) == ["teachers/1/notes.txt", "teachers/3/", "teachers/mine.txt"]
+    assert command(run, "--overwrite", "--set", "teachers=0") == 2  # twice the same setting
+    capsys.readouterr()
+    asked = ["--run", str(run), "--iterations", "5", *SMALL, "--overwrite"]
+    assert cli.main(["train", read_run(run)[0].path, *asked]) == 0
+    left = {file.relative_to(run).as_posix() for file in (run / "teachers").rglob("*") if file.is_file()}
+    assert left == {"teachers/1/notes.txt", "teachers/3/model.safetensors", "teachers/mine.txt"}
+    assert "own_teachers" not in read_run(run)[2]
+
+
+@pytest.mark.parametrize("kind", ["foreign", "link", "file"])
+def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Nor overwritten: nothing changes."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    place = run / "teachers"
+    if kind == "foreign":  # of a run that has no teachers of its own
+        create_run(run, SceneSource("demo"), CONFIG, "cpu")
+        shutil.copytree(finished / "teachers" / "1", place / "1", dirs_exist_ok=True)
+        place = place / "1"
+    else:
+        place.rename(tmp_path / "elsewhere")
+        place.symlink_to(tmp_path / "elsewhere") if kind == "link" else place.write_text("mine")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    capsys.readouterr()
+    assert command(run, "--overwrite") == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write".replace(" ", "") in (
+        told.replace(" ", "")
+    )
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
+    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.rmtree(run / "teachers" / "2")
+    capsys.readouterr()
+    assert command(run, "--resume", iterations=30) == 2
+    told = "".join(capsys.readouterr().err.split())
+    assert f"{run}/teachers/2:expectedthecompleteteacherthatthestudentin{run}haslearnedfrom" in told
+    assert read_run(run)[1].iterations == 20 and not (run / "teachers" / "2").exists()
+    shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
+    assert command(run, "--resume") == 2
+    assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in "".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_teacher_is_not_trained_on_its_own(
+    finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    teacher = finished / "teachers" / "1"
+    for flag in ("--resume", "--overwrite"):
+        capsys.readouterr()
+        assert command(teacher, flag) == 2
+        assert "--run: expected a run of its own, got" in " ".join(capsys.readouterr().err.split())
+    assert (teacher / "model.safetensors").is_file()
+
+
+def test_checkpoints_of_a_complete_teacher_go_even_after_a_kill(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """That came between its last file and the deletion."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.copytree(run / "checkpoint", run / "teachers" / "1" / "checkpoint")
+    assert command(run, "--resume") == 0
+    assert not has_checkpoint(run / "teachers" / "1") and has_checkpoint(run)
+
+
+def test_a_longer_run_finishes_its_teachers_as_they_were(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """Although --iterations has grown before they were complete."""
+    run = tmp_path / "run"
+    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4, 240))
+    assert command(run, "--resume", iterations=30) == 0
+    for number in "12":
+        assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
+
+
+def test_an_older_run_keeps_teachers_of_its_own_budget(
+    finished: Path, command: Callable[..., int], tmp_path: Path
+) -> None:
+    """Its config.json does not say how large they are; it resumes with the teacher that is complete."""
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    source, config = read_run(finished)[:2]
+    create_run(whole, source, config, "cpu", own=OwnTeachers(2, 4))
+    data = json.loads((whole / "config.json").read_text())
+    del data["own_teachers"]["max_surfels"]
+    (whole / "config.json").write_text(json.dumps(data))
+    shutil.copytree(whole, run)
+    assert command(whole, "--resume") == 0
+    shutil.copytree(whole / "teachers" / "1", run / "teachers" / "1")
+    assert command(run, "--resume") == 0
+    assert {read_run(run / "teachers" / name)[1].max_surfels for name in "12"} == {60}
+    assert model_of(run) == model_of(whole) != model_of(finished)
+
+
+@pytest.mark.parametrize("api", [True, False])
+def test_memory_that_a_teacher_lacks_is_told_as_its_own(
+    command: Callable[..., int],
+    tiny_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    api: bool,
+) -> None:
+    """Its budget is not that of the run, so that lowering this may not help."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. And more")
+
+    monkeypatch.setattr("nexwarp.model.model.render", fail)
+    if api:
+        with pytest.raises(OutOfMemoryError) as caught:
+            nw.train(tiny_scene, CONFIG, device=CPU)
+        told = str(caught.value)
+    else:
+        assert command(tmp_path / "run") == 2
+        told = capsys.readouterr().err.removeprefix("nexwarp: error: ").strip()
+    assert told.startswith("teacher 1 of 2: out of memory at iteration 1: it needed 2.50 GiB")
+    assert "--max-surfels (now 240)" in told and told.endswith(", or do without teachers (--set teachers=0)")
+
+
+def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Of the training alone; a resumed run finds them by these."""
+    scene = dataclasses.replace(tiny_scene, test=[])
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
+    create_run(run, source, CONFIG, "cpu", own=own)
+    models = []
+    for resume in (False, True):
+        console, ranks = Console(quiet=True), Ranks.alone(CPU)
+        session = StagedSession(scene, CONFIG, own, run, source, console, ranks, resume=resume)
+        assert session.session.stage.teacher != resume
+        session.begin()
+        session.train()
+        models.append(session.finish())
+    assert same(*models) and not (run / "metrics.json").exists()
+
+
+def test_weights_and_biases_gets_the_runs_settings(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+
+    class Sink:
+        def __init__(self, run: Path, settings: dict[str, Any]) -> None:
+            given.append(settings)
+
+        def write(self, values: object, step: int) -> None: ...
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
+    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
+    create_run(run, source, CONFIG, "cpu", own=own)
+    session = StagedSession(
+        tiny_scene, CONFIG, own, run, source, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"]
+    )
+    session.train()
+    assert given == [CONFIG.as_dict()]
+
+
+def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    create_run(run, SceneSource("demo"), CONFIG, "cpu")
+    (run / "teachers" / "1").mkdir(parents=True)
+    (run / "teachers" / "1" / "model.safetensors").write_text("mine")
+    assert list_files(run) == (["config.json"], ["teachers/1/"])
+    for wrong in (
+        {"count": 2},
+        {"count": "2", "iterations": 4},
+        {"count": 9, "iterations": 4},
+        {"count": 2, "iterations": 0},
+        {"count": 2, "iterations": 4, "max_surfels": 15},
+        {"count": 2, "iterations": 4, "max_surfels": "240"},
+        {"count": 2, "iterations": 10},  # all that the run has
+        [2, 4],
+    ):
+        data = json.loads((run / "config.json").read_text()) | {"own_teachers": wrong}
+        (run / "config.json").write_text(json.dumps(data))
+        with pytest.raises(ValueError, match="own_teachers: expected"):
+            read_run(run)
+    data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
+    (run / "config.json").write_text(json.dumps(data))
+    assert read_own_teachers(run) == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
+
+
+def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
+    """The model that it draws is that of the stage that runs, and the steps count to the run's iterations."""
+    steps: list[int] = []
+
+    class Shown:
+        def between_steps(self, step: int, describe: Callable[[], str], stop: Callable[[], bool]) -> None:
+            steps.append(step)
+            drawn.append(session.trainer.model().meta["iteration"])
+
+    drawn: list[object] = []
+    console = Console(quiet=True)
+    source, run = SceneSource(str(tiny_scene.path)), tmp_path / "run"
+    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4, 240), run, source, console, Ranks.alone(CPU))
+    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4, 240))
+    session.train(Shown())  # type: ignore[arg-type]
+    assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
+
+
+def test_the_benchmark_trains_teachers_first(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
+    row = Row("two", settings={"teachers": 2})
+    job = TrainingJob(tiny_folder.name, "", "two", 60, 3, 20)
+    result = run_job(job, tiny_folder.parent, row, models=tmp_path)
+    assert result["teachers"] == {"count": 2, "surfels": 120, "max_surfels": 240}  # half of the budget
+    assert result["iterations"] == 20
+    config = config_of(job, row)
+    assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
+    for older in ({"count": 2}, {"count": 2, "surfels": 60}, {"count": 2, "max_surfels": 60}):
+        assert not trained_with(result | {"teachers": older}, config), "as large as the student"
+    unknown = dataclasses.replace(config, teachers=None, iterations=30_000, max_surfels=10_000)  # number of photos
+    found = [{}, {"teachers": {"count": 2, "max_surfels": 40_000}}, {"teachers": {"count": 2}}]
+    assert [trained_with(each | {"config": config_name(unknown)}, unknown) for each in found] == [True, True, False]
+    large = dataclasses.replace(config, max_surfels=60_000)
+    for today in ({"count": 2}, {"count": 2, "surfels": 60_000}, {"count": 2, "surfels": 9, "max_surfels": 60_000}):
+        assert trained_with({"teachers": today, "config": config_name(large)}, large), "as large as the student"
+    assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))
+    (file,) = tmp_path.iterdir()
+    expected = nw.train(scene_of(job, tiny_folder.parent), config, device=CPU)
+    assert same(nw.load(file), nw.load(expected.save(tmp_path / "expected")))
+    alone = group_jobs(
+        [job, dataclasses.replace(job, row="also")], {"two": row, "also": dataclasses.replace(row, name="also")}
+    )
+    assert [group.iterations for group in alone] == [0, 0], "stages share no first iterations"
+
+
+@pytest.mark.parametrize("variant", ["", "inner", "inner4", "arc", *THINNED])
+def test_the_benchmark_counts_training_photos(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
+    monkeypatch.setitem(PHOTOS, tiny_folder.name, 10)
+    job = TrainingJob(tiny_folder.name, variant, "default", 60, 0, 20)
+    assert training_photos(job) == len(scene_of(job, tiny_folder.parent).train)
+    assert training_photos(dataclasses.replace(job, scene="another")) is None
+
+
+@pytest.mark.parametrize("scene", PHOTOS)
+def test_the_benchmark_knows_the_number_of_photos(scene: str) -> None:
+    photos = ROOT.parent / "shared" / "data" / scene / "images"
+    if not photos.is_dir():
+        pytest.skip("needs the photos of ../shared/data")
+    assert len(list(photos.iterdir())) == PHOTOS[scene]
+
+
+def test_the_benchmark_asks_for_the_scenes_teachers() -> None:
+    counts = {
+        (scene, size): config_of(TrainingJob(scene, "", "default", size, 0, 30_000), DEFAULT).teachers
+        for scene in PHOTOS
+        for size in (10_000, 20_000, 40_000)
+    }
+    assert [scene for (scene, size), count in counts.items() if size == 10_000 and count] == ["saharov", "kitchen25"]
+    for large in (20_000, 40_000):
+        taught = [scene for (scene, size), count in counts.items() if size == large and count]
+        assert taught == ["fox", "saharov", "kitchen25"]
+    assert config_of(TrainingJob("fox", "", "paper", 40_000, 0, 30_000), PAPER).teachers == 0

@@ -1,0 +1,296 @@
+"""Training that also learns from teachers: what its steps compare with, ranks, resuming, errors, the benchmark."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from benchmarks.distillation import main, train_teachers
+from benchmarks.quality.jobs import TrainingJob, config_of
+from benchmarks.quality.rows import DEFAULT
+from benchmarks.quality.scenes import scene_of
+from nexwarp import Config, Model, Scene, Trainer
+from nexwarp.cli import main as cli
+from nexwarp.errors import CheckpointError
+from nexwarp.model.exposures import Exposures
+from nexwarp.run.evaluate import METRICS
+from nexwarp.train.checkpoint import CHECKPOINTS
+from nexwarp.train.config import TextureConfig
+from nexwarp.train.teachers import Teachers
+from tests.ranks_support import alone_as
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+CPU = torch.device("cpu")
+CONFIG = Config(
+    iterations=12,
+    max_surfels=60,
+    exposures=False,
+    background=(0.5, 0.4, 0.3),
+    skybox=0,  # its colours are of the photos
+    texture=TextureConfig(levels=4, table_size=1024),
+)
+
+
+@pytest.fixture(scope="module")
+def teachers(tiny_scene: Scene) -> list[Model]:
+    return [nw.train(tiny_scene, dataclasses.replace(CONFIG, seed=seed), device=CPU) for seed in (1, 2)]
+
+
+def learned(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Return all learned tensors."""
+    return trainer.surfels.state_dict() | {f"texture.{k}": x for k, x in trainer.texture.state_dict().items()}
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(x, other[name]) for name, x in one.items())
+
+
+def test_every_other_step_has_a_teachers_picture(tiny_scene: Scene, teachers: list[Model]) -> None:
+    config = dataclasses.replace(CONFIG, iterations=4 * len(tiny_scene.train))
+    student = Trainer(tiny_scene, config, CPU, teachers=teachers)
+    views, shown = {view.camera.viewmat: view.image / 255 for view in tiny_scene.train}, set()
+    for number in range(1, config.iterations + 1):
+        target = student._next_target()
+        assert student.iteration == number
+        photos = [photo for viewmat, photo in views.items() if torch.equal(viewmat, target.camera.viewmat)]
+        if number % 2 == 1 or number == config.iterations:  # the log's lines are of these
+            assert len(photos) == 1 and torch.allclose(target.photo, photos[0])
+            continue
+        pictures = [m.render(target.camera, background=target.background, exposure="mean").image for m in teachers]
+        alike = [torch.equal(picture, target.photo) for picture in pictures]
+        assert not photos and sum(alike) == 1
+        shown.add(alike.index(True))
+    assert shown == {0, 1}
+
+
+def test_a_picture_is_at_the_mean_exposure_on_the_steps_background(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Whatever gains and background the teacher has."""
+    exposures = Exposures.of(
+        torch.linspace(-0.7, 0.7, 3 * len(tiny_scene.train)).view(-1, 3), [view.camera for view in tiny_scene.train]
+    )
+    m = teachers[0]
+    other = Model(
+        m.surfels, m.texture, exposures, m.detail_limits, dataclasses.replace(m.options, background=(1.0, 0.0, 1.0))
+    )
+    scene = dataclasses.replace(tiny_scene, random_background=True)
+    student, behind = Trainer(scene, CONFIG, CPU, teachers=[other]), []
+    for _ in range(4):
+        _, target = student._next_target(), student._next_target()
+        assert torch.equal(target.photo, m.render(target.camera, background=target.background).image)
+        assert not torch.equal(target.photo, other.render(target.camera, background=target.background).image)
+        behind.append(torch.as_tensor(target.background))
+    assert not torch.equal(behind[0], behind[1])
+
+
+def test_a_picture_is_as_small_as_the_photo(tiny_scene: Scene, teachers: list[Model]) -> None:
+    student = Trainer(tiny_scene, dataclasses.replace(CONFIG, coarse=0.5), CPU, teachers=teachers)
+    whole = tiny_scene.train[0].camera
+    for number in range(1, 11):
+        target = student._next_target()
+        factor = 2 if number <= 6 else 1
+        assert (target.camera.width, target.camera.height) == (whole.width // factor, whole.height // factor)
+        assert target.photo.shape == (target.camera.height, target.camera.width, 3)
+        assert target.camera.K[0, 0] == pytest.approx(float(whole.K[0, 0]) / factor)
+
+
+def test_photos_and_cameras_near_each_have_their_turn_once_in_a_round(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Two numbers of a round, one for a photo and one for a teacher, for each view."""
+    views = len(tiny_scene.train)
+    student = Trainer(tiny_scene, dataclasses.replace(CONFIG, iterations=999), CPU, teachers=teachers)
+    orders = set()
+    for round_ in range(3):
+        numbers = range(2 * views * round_ + 1, 2 * views * (round_ + 1) + 1)
+        chosen = [student._next_view(number) for number in numbers]
+        assert sorted(chosen[0::2]) == sorted(chosen[1::2]) == [*range(views)]
+        orders.add(tuple(chosen[1::2]))
+    assert len(orders) == 3
+
+
+def test_choices_follow_from_seed_and_number_alone(tiny_scene: Scene, teachers: list[Model]) -> None:
+    one, other = (Teachers(teachers, tiny_scene, CONFIG, CPU) for _ in range(2))
+    numbers = [98, 4, 2, 40, 98]
+    forward = {number: one.choice(number) for number in sorted(numbers)}
+    for number in numbers:
+        index, camera, model = other.choice(number)
+        assert index == forward[number][0] and model is forward[number][2]
+        assert torch.equal(camera.viewmat, forward[number][1].viewmat)
+    seeded = Teachers(teachers, tiny_scene, dataclasses.replace(CONFIG, seed=5), CPU)
+    assert any(not torch.equal(seeded.choice(n)[1].viewmat, one.choice(n)[1].viewmat) for n in numbers)
+
+
+def test_ranks_share_the_turns_of_one_process(tiny_scene: Scene, teachers: list[Model]) -> None:
+    """Whatever their number: the target of each number is that of a training on one GPU, but for random numbers."""
+    alone = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    expected = [alone._next_target() for _ in range(12)]
+    for size in (2, 3):
+        trainers = [alone_as(rank, size, tiny_scene, CONFIG, teachers) for rank in range(size)]
+        found = [trainer._next_target() for _ in range(12 // size) for trainer in trainers]
+        for mine, theirs in zip(found, expected, strict=True):
+            assert torch.equal(mine.camera.viewmat, theirs.camera.viewmat) and torch.equal(mine.photo, theirs.photo)
+
+
+@pytest.mark.parametrize("mode", ["ignore", "background"])
+def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: list[Model], mode: str) -> None:
+    """Its gains, its points and its mask; the teacher's picture has none of them."""
+    masks = [torch.ones(view.image.shape[:2], dtype=torch.bool) for view in tiny_scene.train]
+    for mask in masks:
+        mask[0] = False
+    views = [dataclasses.replace(view, mask=mask) for view, mask in zip(tiny_scene.train, masks, strict=True)]
+    config = dataclasses.replace(CONFIG, mask_mode=mode)
+    student = Trainer(dataclasses.replace(tiny_scene, train=views), config, CPU, teachers=teachers)
+    student.views.gains = torch.full((len(views), 3), 1.5)
+    for _ in range(5):
+        of_photo, taught = student._next_target(), student._next_target()
+        assert (of_photo.counts is not None) == (mode == "ignore") and (of_photo.empty is None) == (mode == "ignore")
+        assert of_photo.exposure is not None and bool((of_photo.exposure == 1.5).all())
+        assert of_photo.expected is not None and bool(of_photo.expected.any())
+        assert taught.counts is None and taught.empty is None
+        assert taught.exposure is not None and bool((taught.exposure == 1).all())
+        assert taught.expected is not None and not taught.expected.any()
+
+
+def test_teachers_stay_as_they_are(tiny_scene: Scene, teachers: list[Model]) -> None:
+    before = [{name: x.clone() for name, x in model.state_dict().items()} for model in teachers]
+    nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
+    assert all(same(old, model.state_dict()) for old, model in zip(before, teachers, strict=True))
+
+
+def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
+    tiny_scene: Scene, teachers: list[Model], tmp_path: Path
+) -> None:
+    whole = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    whole.run()
+    begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    begun.run(until=7)
+    begun.save_checkpoint(tmp_path)
+    resumed = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    resumed.restore(tmp_path)
+    resumed.run()
+    assert same(learned(whole), learned(resumed))
+    alone = Trainer(tiny_scene, CONFIG, CPU)
+    alone.run()
+    assert not torch.equal(learned(whole)["sh0"], learned(alone)["sh0"])
+
+
+@pytest.mark.parametrize("kind", ["none", "fewer", "swapped", "bare"])
+def test_a_checkpoint_of_other_teachers_is_refused(
+    tiny_scene: Scene, teachers: list[Model], tmp_path: Path, kind: str
+) -> None:
+    first, second = teachers
+    others = {"none": [], "fewer": [first], "swapped": [second, first], "bare": [first.bare(), second]}[kind]
+    begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
+    begun.run(until=3)
+    begun.save_checkpoint(tmp_path)
+    with pytest.raises(CheckpointError, match="learned from other teachers"):
+        Trainer(tiny_scene, CONFIG, CPU, teachers=others).restore(tmp_path)
+
+
+def test_teachers_given_to_a_run_without_are_refused(tiny_scene: Scene, teachers: list[Model], tmp_path: Path) -> None:
+    begun = Trainer(tiny_scene, CONFIG, CPU)
+    begun.run(until=3)
+    begun.save_checkpoint(tmp_path)
+    with pytest.raises(CheckpointError, match="learned from other teachers"):
+        Trainer(tiny_scene, CONFIG, CPU, teachers=teachers).restore(tmp_path)
+
+
+def test_learned_poses_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
+    for changes in ({"refine_poses": True}, {"blur_poses": 3}):
+        with pytest.raises(ValueError, match="teachers: expected refine_poses=False and blur_poses=1"):
+            Trainer(tiny_scene, dataclasses.replace(CONFIG, **changes), CPU, teachers=teachers)
+
+
+def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
+    for factor in (0.99, 2):
+        other = dataclasses.replace(tiny_scene, scale=factor * tiny_scene.scale)
+        with pytest.raises(ValueError, match=r"teachers\[0\]: expected a model of .* whose scale is"):
+            nw.train(other, CONFIG, device=CPU, teachers=teachers)
+
+
+def test_what_is_no_list_of_models_is_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
+    given: list[tuple[Any, str]] = [
+        ([teachers[0], "runs/b"], r"teachers\[1\]: expected a nexwarp.Model, got str"),
+        (teachers[0], "teachers: expected a list of models, got one"),
+    ]
+    for wrong, message in given:
+        with pytest.raises(TypeError, match=message):
+            Trainer(tiny_scene, CONFIG, CPU, teachers=wrong)
+    assert Trainer(tiny_scene, CONFIG, CPU, teachers=iter(teachers)).teachers is not None
+    assert Trainer(tiny_scene, CONFIG, CPU, teachers=[]).teachers is None
+
+
+def test_the_command_learns_from_runs(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = ["--iterations", "10", "--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024"]
+
+    def train(run: str, *options: str) -> int:
+        return cli.main(["train", str(tiny_folder), "--run", run, *small, *options])
+
+    for run, seed in (("a", "1"), ("b", "2")):
+        assert train(run, "--seed", seed) == 0
+    both = ["--teacher", "a", "--teacher", "b"]
+    assert train("c", *both) == 0
+    assert json.loads(Path("c/metrics.json").read_text())["teachers"] == 2
+    assert json.loads(Path("c/config.json").read_text())["teachers"] == [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert not any("teachers" in json.loads(Path(f"a/{name}.json").read_text()) for name in ("metrics", "config"))
+    # A run resumes with its teachers, before its first checkpoint too.
+    model = Path("c/model.safetensors").read_bytes()
+    for name in CHECKPOINTS:
+        shutil.rmtree(Path("c", name), ignore_errors=True)
+    Path("c/model.safetensors").unlink()
+    assert train("c", "--resume") == 0
+    assert Path("c/model.safetensors").read_bytes() == model
+    shutil.move("b", "moved")
+    assert train("c", "--resume", "--teacher", "a", "--teacher", "moved") == 0
+    assert train("c", "--resume") == 0  # it has noted where they lie
+    shutil.move("moved", "b")
+    capsys.readouterr()
+    for options, message in (
+        (["--teacher", "none"], "none: expected a model file, or a run folder"),
+        ([*both, "--refine-poses"], "--teacher: expected poses that stay as given"),
+        (["--teacher", "d/model.safetensors"], "--teacher: expected another run than d"),
+    ):
+        assert train("d", *options) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+        assert not Path("d").exists()
+    assert train("a", "--overwrite", "--teacher", "a") == 2
+    assert "--teacher: expected another run than a" in " ".join(capsys.readouterr().err.split())
+    assert Path("a/model.safetensors").is_file()
+
+
+def test_the_benchmarks_teachers_have_seeds_of_their_own(tiny_folder: Path) -> None:
+    """And are trained as any model of that seed."""
+    job = TrainingJob(tiny_folder.name, "", "mine", 60, 3, 12)
+    found, seconds = train_teachers(job, tiny_folder.parent, 2, 8, 50)
+    for number, teacher in enumerate(found, 1):
+        one = dataclasses.replace(job, seed=300 + number, iterations=8, size=50)
+        trainer = Trainer(scene_of(one, tiny_folder.parent), config_of(one, DEFAULT), CPU)
+        trainer.run()
+        assert torch.equal(trainer.finish().surfels.means, teacher.surfels.means)
+    assert seconds > 0
+
+
+def test_the_benchmarks_line_names_the_teachers(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
+    out = tmp_path / "out.jsonl"
+    command = [str(out), "--scenes", tiny_folder.name, "--data", str(tiny_folder.parent), "--variant", ""]
+    command += ["--teacher-iterations", "8", "--iterations", "10", "--size", "60", "--seed", "3", "--teachers"]
+    assert main([*command, "2"]) == 0
+    line = json.loads(out.read_text())
+    assert (line["row"], line["iterations"], line["seed"]) == ("2 teachers of 8", 10, 3)
+    assert (line["teachers"]["count"], line["teachers"]["max_surfels"]) == (2, 60) and line["teachers"]["seconds"] > 0
+    assert main([*command, "1", "--teacher-size", "70"]) == 0
+    second = json.loads(out.read_text().splitlines()[1])
+    assert (second["row"], second["teachers"]["max_surfels"]) == ("1 teachers of 8, 70 surfels", 70)
+    with pytest.raises(SystemExit):
+        main([*command, "0"])
+    assert "--teachers: expected at least one, got 0" in capsys.readouterr().err

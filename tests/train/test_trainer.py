@@ -1,0 +1,276 @@
+"""Training: the laws of the loop and its schedules, and what it learns from real photos."""
+
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.data import Scene, View
+from nexwarp.run.evaluate import evaluate
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.config import Config, LearningRates, TextureConfig
+from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.trainer import Trainer
+from tests.exposed import with_exposures
+from tests.tolerances import assert_close
+from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+
+FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
+
+
+@pytest.fixture(scope="session")
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
+
+
+def mean_psnr(trainer: Trainer, views: list[View]) -> float:
+    return evaluate(trainer.model(), views)["psnr"]
+
+
+# Repeatability
+
+
+@pytest.mark.parametrize("stop", [6, 7, 11])
+def test_resuming_changes_nothing(scene, tmp_path, stop):
+    """Straight to 12 = up to `stop`, saved, restored elsewhere, and on to 12: bit for bit."""
+    straight = trained(scene, small())
+    assert len(straight.surfels) > 60  # it has split
+    first = Trainer(scene, small(), "cpu")
+    for _ in range(stop):
+        first.step()
+    first.save(tmp_path)
+    second = Trainer(scene, small(), "cpu")
+    torch.manual_seed(99)
+    second.restore(tmp_path)
+    assert_same_state(second, first)
+    second.run()
+    assert_same_state(second, straight)
+
+
+def test_resuming_without_a_texture_changes_nothing(scene, tmp_path):
+    config = small(max_hits=0, iterations=4)
+    straight = trained(scene, config)
+    first, second = Trainer(scene, config, "cpu"), Trainer(scene, config, "cpu")
+    first.step()
+    first.save(tmp_path)
+    second.restore(tmp_path)
+    second.run()
+    for name, value in straight.surfels.state_dict().items():
+        assert torch.equal(second.surfels.state_dict()[name], value), name
+    fresh = Trainer(scene, config, "cpu")
+    assert torch.equal(straight.texture.grid, fresh.texture.grid)  # nothing trains what nothing shows
+
+
+def test_same_seed_same_run_and_other_seeds_differ(scene):
+    first = trained(scene, small(seed=1))
+    torch.rand(5)  # the state before has no say
+    assert_same_state(first, trained(scene, small(seed=1)))
+    other = trained(scene, small(seed=2))
+    assert not torch.equal(first.surfels.raw_quats[:60], other.surfels.raw_quats[:60])
+    assert not torch.equal(next(first.texture.mlp.parameters()), next(other.texture.mlp.parameters()))
+    assert first.order != other.order
+
+
+@pytest.mark.cuda
+def test_deterministic_runs_are_the_same_on_cuda(scene):
+    runs, exposed = [], with_exposures(scene)
+    for _ in range(3):
+        trainer = Trainer(exposed, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
+        trainer.run()
+        runs.append(trainer)
+    assert not torch.are_deterministic_algorithms_enabled()
+    for other in runs[1:]:
+        assert_same_state(other, runs[0])
+    first, *others = (trainer.finish() for trainer in runs)
+    assert first.exposures is not None and first.detail_limits is not None
+    for model in others:
+        assert model.state_dict().keys() == first.state_dict().keys()
+        for name, value in first.state_dict().items():
+            assert torch.equal(model.state_dict()[name], value), name
+
+
+@pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
+def test_a_checkpoint_that_does_not_fit_is_refused(scene, tmp_path, damage):
+    trainer = Trainer(scene, small(), "cpu")
+    trainer.step()
+    trainer.save(tmp_path)
+    tensors, state = load_checkpoint(tmp_path)
+    config = small()
+    if damage == "missing":
+        tensors.pop("densify.errors")
+    elif damage == "shape":
+        tensors["texture.grid"] = tensors["texture.grid"][:, :8].contiguous()
+    elif damage == "settings":
+        config = small(iterations=24)
+    else:
+        scene = dataclasses.replace(scene, train=scene.train[:-1])
+    save_checkpoint(tmp_path, tensors, state)
+    with pytest.raises(ValueError) as caught:
+        Trainer(scene, config, "cpu").restore(tmp_path)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path}: expected a checkpoint of this run") and "\n" not in message, message
+
+
+# Learning
+
+
+def test_it_learns(scene):
+    # On black: on the photos' mean colour a run starts with less to learn.
+    trainer = Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
+    before, losses = mean_psnr(trainer, scene.train), []
+    trainer.run(lambda progress: losses.append(progress.loss()))
+    epoch = len(scene.train)
+    assert all(math.isfinite(loss) for loss in losses)
+    assert sum(losses[-epoch:]) < 0.8 * sum(losses[:epoch])
+    after = mean_psnr(trainer, scene.train)
+    assert after >= before + 2.0, f"{before:.2f} -> {after:.2f} dB"
+
+
+def test_progress_tells_what_happened(scene):
+    trainer = Trainer(scene, small(), "cpu")
+    seen: list[nw.StepReport] = []
+    trainer.run(seen.append)
+    assert [p.iteration for p in seen] == list(range(1, 13))
+    assert seen[-1].surfels == len(trainer.surfels)
+    for p in seen:
+        assert p.loss() == pytest.approx(sum(x.item() for x in p.losses.values()), rel=1e-6)
+        error = (p.image.detach().double().clamp(0, 1) - p.target.double()).square().mean().item()
+        assert p.psnr() == pytest.approx(-10 * math.log10(error), abs=1e-4)
+    for p in seen:
+        assert set(p.losses) == {"l1", "dssim", "texture", "alpha", "opacity", "grid", "depth"}
+    counts = [p.surfels for p in seen]
+    assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
+    assert counts[2] == 63 == int(1.05 * counts[0])
+    assert max(counts) <= 120
+
+
+def test_budget_holds_in_training(scene):
+    fast = DensifyConfig(every=3, fraction=0.5)
+    trainer, counts = Trainer(scene, small(iterations=15, max_surfels=64, densify=fast), "cpu"), []
+    trainer.run(lambda p: counts.append(p.surfels))
+    assert counts[0] == 32 and max(counts) == 64
+
+
+@pytest.mark.skipif(not FOX.is_dir(), reason=f"{FOX} is not there")
+@pytest.mark.timeout(400)
+def test_it_learns_from_real_photos():
+    """Fox at downscale 8: 5 dB more on views it has not seen than after the first iteration."""
+    scene = nw.load_scene(FOX, downscale=8)
+    config = Config(iterations=200, max_surfels=3000, texture=TextureConfig(levels=8, table_size=2**14))
+    trainer = Trainer(scene, config, "cpu")
+    trainer.step()
+    before = mean_psnr(trainer, scene.test)
+    trainer.run()
+    after = mean_psnr(trainer, scene.test)
+    assert len(trainer.surfels) <= 3000
+    assert after >= before + 5.0, f"{before:.2f} -> {after:.2f} dB"
+
+
+# Schedules
+
+
+def test_rates_are_log_linear_between_their_ends(scene):
+    config = small(iterations=9, rates=LearningRates(mlp=(1e-3, 1e-5)))
+    trainer, rates = Trainer(scene, config, "cpu"), []
+    trainer.run(lambda _: rates.append([group["lr"] for group in trainer.optimizer.param_groups]))
+    r, s = config.rates, scene.scale
+    constant = [r.quats, r.scales, r.opacities, r.gammas, r.sh0, r.shN]
+    assert rates[0] == pytest.approx([1.6e-4 * s, *constant, 1e-3, 1e-3], rel=1e-12)
+    assert rates[-1] == pytest.approx([1.6e-6 * s, *constant, 1e-5, 1e-5], rel=1e-12)
+    logs = torch.tensor(rates, dtype=torch.float64).log()
+    assert logs.diff(n=2, dim=0).abs().max() < 1e-9
+    for step, row in enumerate(rates):
+        assert row[0] == pytest.approx(1.6e-4 * s * 100 ** (-step / 8), rel=1e-9)
+
+
+def test_groups_hold_every_parameter_once(scene):
+    trainer = Trainer(scene, small(), "cpu")
+    grouped = [p for group in trainer.optimizer.param_groups for p in group["params"]]
+    everything = [p for _, p in trainer._named_parameters()]
+    assert len(grouped) == len(everything) and {id(p) for p in grouped} == {id(p) for p in everything}
+    assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in trainer.optimizer.param_groups)
+
+
+@pytest.mark.parametrize(("iterations", "every"), [(30_000, 1000), (3000, 100), (60, 2)])
+def test_one_degree_is_unlocked_every_thousand_iterations_of_thirty(scene, iterations, every):
+    trainer = Trainer(scene, small(iterations=iterations), "cpu")
+    degrees = {}
+    for iteration in (1, every - 1, every, 2 * every - 1, 2 * every, 3 * every - 1, 3 * every, iterations):
+        trainer.iteration = iteration
+        degrees[iteration] = trainer.render_options().sh_degree
+    assert degrees == {i: min(3, i // every) for i in degrees} and degrees[iterations] == 3
+    lower = Trainer(scene, small(iterations=iterations, sh_degree=1), "cpu")
+    lower.iteration = iterations
+    assert lower.render_options().sh_degree == 1 and lower.surfels.sh.shape[1] == 4
+
+
+@pytest.mark.parametrize(
+    ("iterations", "rounds"),
+    [(30_000, (500, 25_000, 100)), (3000, (50, 2500, 10)), (60_000, (1000, 50_000, 200)), (600, (10, 500, 10))],
+)
+def test_rounds_stretch_with_the_run(scene, iterations, rounds):
+    config = Trainer(scene, small(iterations=iterations, densify=DensifyConfig()), "cpu").densifier.config
+    assert (config.start, config.stop, config.every) == rounds
+
+
+def test_surfels_settle_with_two_hits(scene):
+    """Up to 25,000 of 30,000 iterations, a run with more is one with two; `more_hits_from` 0 has all from the start."""
+    two, four, early = (
+        Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
+        for hits, start in ((2, 25_000), (4, 25_000), (4, 0))
+    )
+    assert [t.render_options().max_hits for t in (two, four, early)] == [2, 2, 4]
+    for iteration in range(1, 13):
+        for trainer in (two, four, early):
+            trainer.step()
+        if iteration < 10:
+            assert_same_state(four, two)
+        now = [t.render_options().max_hits for t in (two, four, early)]
+        assert now == [2, 2 if iteration < 10 else 4, 4]
+    assert not torch.equal(four.texture.grid, two.texture.grid)
+    assert four.finish().options.max_hits == 4
+    for hits in (0, 1):
+        few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
+        assert few.render_options().max_hits == hits
+
+
+def test_views_are_drawn_without_replacement(scene):
+    trainer, drawn = Trainer(scene, small(iterations=24, exposures=False), "cpu"), []
+    photos = [view.image.float() / 255 for view in scene.train]
+
+    def note(progress: Any) -> None:
+        drawn.append(next(i for i, photo in enumerate(photos) if torch.equal(photo, progress.target)))
+
+    trainer.run(note)
+    epochs = [drawn[:8], drawn[8:16], drawn[16:]]
+    assert all(sorted(epoch) == list(range(8)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
+
+
+# Scenes
+
+
+def test_a_scene_without_training_views_is_refused(scene):
+    with pytest.raises(ValueError, match="expected at least one training view, got none"):
+        Trainer(dataclasses.replace(scene, train=[]), small(), "cpu")
+
+
+@pytest.mark.parametrize("factor", [64.0, 1 / 64])
+def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
+    """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
+    texture = dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None)
+    config = small(iterations=40, texture=texture, densify=OFTEN)
+    runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
+    for step in range(config.iterations):
+        one, other = (torch.stack(list(trainer.step().losses.values())) for trainer in runs)
+        assert_close(other, one, kind="gradient", name=f"losses of step {step}")
+    assert len(runs[1].surfels) == len(runs[0].surfels)
+    images = [t.model().render(t.views.cameras[0]).image for t in runs]
+    assert_close(images[1], images[0], kind="gradient", name="image")
