@@ -11,8 +11,6 @@ from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
-from nexwarp.kernels.cpu.hashgrid import hashgrid_simd_kernels
-from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
 from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
 from nexwarp.kernels.expose import expose_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
@@ -76,14 +74,12 @@ def thread_kernels(
     low_passes: Sequence[bool] = (False, True),
     ssim_lengths: Sequence[int] = (1, SIMD_WIDTH),
     layered: bool = True,
-    simd: bool = True,
     cpu: bool = False,
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels of threads that work alone, in blocks of Warp's own size.
 
-    With `layered` also those of textured colours whose MLP is computed layer by layer, and with `simd`, on a CPU, those
-    of the MLP in SIMD form.
+    With `layered` also those of textured colours whose MLP is computed layer by layer.
     """
     yield from (project_kernels(real).forward, project_kernels(real).backward, depth_keys_kernel(real))
     for kernels in (unproject_kernels(real), compose_kernels(real)):
@@ -106,13 +102,11 @@ def thread_kernels(
         yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
         if degree > MAX_TEXTURE_SH_DEGREE:
             continue
-        if cpu and simd and storage is real:
-            yield from (mlp_simd_kernels(real, degree).forward, mlp_simd_kernels(real, degree).backward)
         for clamp in clamps if layered else ():
             colors = textured_colors_kernels(real, storage, degree, clamp)
             yield from (colors.forward, colors.backward)
     for count in features:
-        lookup = (hashgrid_simd_kernels if cpu else hashgrid_kernels)(real, storage, count)
+        lookup = hashgrid_kernels(real, storage, count)
         yield from (lookup.forward, lookup.backward)
         if fixed_point and not cpu:
             yield hashgrid_kernels(real, storage, count, fixed_point=True).backward

@@ -18,17 +18,17 @@ units that the caller chooses: the same bits in whatever order.
 import functools
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from nexwarp.kernels.types import types
 from nexwarp.native.fixed_point import fixed_point_units
-from nexwarp.native.simd import simd_functions
-from nexwarp.native.simd.slots import slot_functions
 from nexwarp.native.vector_loads import load_function
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
 PRIME_Z = wp.constant(wp.uint32(805459861))
+INVERSE_TWO_PI = wp.constant(wp.float64(1.0 / (2.0 * math.pi)))
 
 # Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
 _ADD = """
@@ -107,85 +107,26 @@ def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
     return wp.int32((x ^ y ^ z) & mask)
 
 
-@functools.cache
-def interpolation_functions(real: type, features: int, width: int = 1) -> SimpleNamespace:
-    """Interpolation in a cell, and its contraction for `wp.grad`, for one point or for `width` of them.
+@wp.func
+def interpolate(fraction: Any, corners: Any, scale: Any, depth: Any, focal: Any):
+    """Trilinear interpolation of the corners' rows times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 4."""
+    one = type(depth)(1.0)
+    gx = one - fraction[0]
+    gy = one - fraction[1]
+    gz = one - fraction[2]
+    ratio = focal / (scale * depth)
+    fade = one - wp.exp(-type(depth)(INVERSE_TWO_PI) * (ratio * ratio))
+    front = gx * gy * corners[0] + fraction[0] * gy * corners[1]
+    front += gx * fraction[1] * corners[2] + fraction[0] * fraction[1] * corners[3]
+    back = gx * gy * corners[4] + fraction[0] * gy * corners[5]
+    back += gx * fraction[1] * corners[6] + fraction[0] * fraction[1] * corners[7]
+    return gz * fade * front + fraction[2] * fade * back
 
-    Returns:
-        Types `corners` (8 corners x features; for more points, a SIMD vector in each slot, corner-major) and `values`
-        (features; for more points, likewise), and functions interpolate and interpolate_dot.
-    """
-    values = _interpolation(real, features, width, for_gradients=False)
-    copies = _interpolation(real, features, width, for_gradients=True)
-    values.interpolate_dot = copies.interpolate_dot  # see `surfel.hit_functions`
-    return values
 
-
-def _interpolation(real: type, features: int, width: int, for_gradients: bool) -> SimpleNamespace:
-    f = simd_functions(real, width, for_gradients)
-    reals, splat, scaled, times, over, inner = f.reals, f.splat, f.scaled, f.times, f.over, f.inner
-    power_of_e = f.power_of_e
-    ONE = types(real).ONE
-    INVERSE_TWO_PI = wp.constant(real(1.0 / (2.0 * math.pi)))
-    if width == 1:
-        corners_type = wp.types.matrix(shape=(8, features), dtype=real)
-        values_type = wp.types.vector(length=features, dtype=real)
-
-        @wp.func
-        def corner_of(corners: corners_type, j: int, k: int):
-            return corners[j, k]
-    else:
-        table = slot_functions(real, width, 8 * features, for_gradients)
-        corners_type, slot_at = table.reals_by_slot, table.reals_at
-        values_type = wp.types.matrix(shape=(features, width), dtype=real)
-
-        @wp.func
-        def corner_of(corners: corners_type, j: int, k: int):
-            return slot_at(corners, j * features + k)
-
-    @wp.func
-    def interpolate(fx: reals, fy: reals, fz: reals, corners: corners_type, scale: real, depth: reals, focal: real):
-        """Trilinear interpolation of the corners times 1 - exp(-(focal / (scale depth))^2 / 2 pi), paper Eq. 4."""
-        gx = splat(ONE) - fx
-        gy = splat(ONE) - fy
-        gz = splat(ONE) - fz
-        ratio = over(splat(focal), scaled(scale, depth))
-        fade = splat(ONE) - power_of_e(scaled(-INVERSE_TWO_PI, times(ratio, ratio)))
-        near = times(gz, fade)
-        far = times(fz, fade)
-        w00 = times(gx, gy)
-        w10 = times(fx, gy)
-        w01 = times(gx, fy)
-        w11 = times(fx, fy)
-        out = values_type()
-        for k in range(wp.static(features)):
-            front = times(w00, corner_of(corners, 0, k)) + times(w10, corner_of(corners, 1, k))
-            front += times(w01, corner_of(corners, 2, k)) + times(w11, corner_of(corners, 3, k))
-            back = times(w00, corner_of(corners, 4, k)) + times(w10, corner_of(corners, 5, k))
-            back += times(w01, corner_of(corners, 6, k)) + times(w11, corner_of(corners, 7, k))
-            out[k] = times(near, front) + times(far, back)
-        return out
-
-    @wp.func
-    def interpolate_dot(
-        fx: reals,
-        fy: reals,
-        fz: reals,
-        corners: corners_type,
-        scale: real,
-        depth: reals,
-        focal: real,
-        grad: values_type,
-    ):
-        value = interpolate(fx, fy, fz, corners, scale, depth, focal)
-        total = real(0.0)
-        for k in range(wp.static(features)):
-            total += inner(value[k], grad[k])
-        return total
-
-    return SimpleNamespace(
-        corners=corners_type, values=values_type, interpolate=interpolate, interpolate_dot=interpolate_dot
-    )
+@wp.func
+def interpolate_dot(fraction: Any, corners: Any, scale: Any, depth: Any, focal: Any, grad: Any):
+    """Contraction of `interpolate` with the gradient of its result, for `wp.grad`."""
+    return wp.dot(interpolate(fraction, corners, scale, depth, focal), grad)
 
 
 @functools.cache
@@ -202,8 +143,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
     vec3, vec4 = t.vec3, t.vec4
     row = wp.types.vector(length=features, dtype=storage)
     vec = wp.types.vector(length=features, dtype=real)
-    f = interpolation_functions(real, features)
-    mat, interpolate, interpolate_dot = f.corners, f.interpolate, f.interpolate_dot
+    mat = wp.types.matrix(shape=(8, features), dtype=real)
     ZERO = t.ZERO
     load = load_function(features, storage)
     options = {"fast_math": real is wp.float32}
@@ -249,7 +189,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
             base = cell(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
             x -= base
-            value = interpolate(x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0])
+            value = interpolate(x, gather(table, level, corner, mask), scale, depth, focal[0])
         for k in range(wp.static(features)):
             encoded[level * features + k, p] = storage(value[k])
 
@@ -289,8 +229,8 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
             base = cell(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
             x -= base
-            gx, gy, gz, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-                x[0], x[1], x[2], gather(table, level, corner, mask), scale, depth, focal[0], grad
+            gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+                x, gather(table, level, corner, mask), scale, depth, focal[0], grad
             )
             if wp.static(merged):
                 gc = merge_cells(corner[0], corner[1], corner[2], gc)
@@ -312,7 +252,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
                             add_row(grad_table, level, hash_slot(corner, j, mask), part)
                     else:
                         wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
-            total += vec4(gx * scale, gy * scale, gz * scale, gd)
+            total += vec4(gx[0] * scale, gx[1] * scale, gx[2] * scale, gd)
         if grad_points.shape[0] > 0:
             grad_points[run, p] = total
 

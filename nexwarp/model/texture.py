@@ -11,7 +11,7 @@ from torch import nn
 from nexwarp import ops
 from nexwarp.errors import check_range, check_tensors
 from nexwarp.kernels.types import MAX_TEXTURE_SH_DEGREE
-from nexwarp.ops import fused_texture, mlp
+from nexwarp.ops import fused_texture
 
 GRID_INIT = 0.01
 
@@ -135,8 +135,6 @@ class NeuralTexture(nn.Module):
         matrices = [*hidden, last[:outputs]]
         if self._in_half() and fused_texture.fits(self.grid, matrices, 0):
             return features * kept, torch.float16
-        if mlp.takes_simd(self.grid, self.grid, matrices):
-            return features, self.grid.dtype
         dtype = torch.float16 if self._in_half() else self.grid.dtype
         return features + outputs + sum(map(len, hidden)) * kept, dtype
 

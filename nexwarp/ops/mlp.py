@@ -1,28 +1,19 @@
-"""The texture's MLP (paper Sec. 4.1): layer by layer, or, on a CPU, with the SH colours in one kernel each way.
+"""The texture's MLP (paper Sec. 4.1), layer by layer.
 
 Values are (features, points): a column is a point.
 """
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
-import warp as wp
 
-from nexwarp.kernels.cpu.mlp import mlp_simd_kernels
-from nexwarp.kernels.launch import chunks
-from nexwarp.kernels.types import types
-from nexwarp.native.simd.mlp import BLOCKS, MOST_KEPT, MOST_ROWS, points_of
-from nexwarp.ops._interop import Argument, array, launch, real_of, uses_simd
 from nexwarp.ops.columns import parts_of, share_columns
 
 # Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
 POINT_MULTIPLE = 64
 # Not among torch's documented functions.
 _FUSED_RELU = hasattr(torch, "_addmm_activation")
-# Parts of the points, one for a thread of the SIMD form. Each part sums its own share of the matrices' gradients.
-SMALLEST_SIMD_PART, MOST_SIMD_PARTS = 2048, 64
 OUTPUTS = tuple(3 * (degree + 1) ** 2 for degree in range(4))  # of the last matrix, by SH degree
 
 
@@ -122,97 +113,3 @@ def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
     if signal.dtype == torch.float16:
         return torch.mm(signal, layer.T, out_dtype=torch.float32)
     return signal @ layer.T
-
-
-class SimdInputs(NamedTuple):
-    """What the SIMD form reads.
-
-    Attributes:
-        encoded: (in, padded n) features.
-        matrices: (out, in) each.
-        directions: (P, 3) unit directions, of n // P points each.
-        points: n.
-    """
-
-    encoded: torch.Tensor
-    matrices: Sequence[torch.Tensor]
-    directions: torch.Tensor
-    points: int
-
-    def arguments(self) -> list[Argument]:
-        """Return the first arguments of both kernels, from `part_size` to `hits`."""
-        real = real_of(self.encoded)
-        sizes = [len(self.encoded), *map(len, self.matrices)]
-        return [
-            self.part_size,
-            array(torch.cat([matrix.reshape(-1) for matrix in self.matrices]), real),
-            array(self.encoded.new_tensor(sizes, dtype=torch.int32), wp.int32),
-            array(self.encoded, real),
-            array(self.directions, types(real).vec3),
-            self.points // max(len(self.directions), 1),
-        ]
-
-    @property
-    def part_size(self) -> int:
-        """Points of a part, but for the last one."""
-        align = BLOCKS * points_of("float")
-        return next((last for _, last in chunks(self.points, align, SMALLEST_SIMD_PART, MOST_SIMD_PARTS)), align)
-
-    @property
-    def parts(self) -> int:
-        """Number of parts."""
-        return -(-self.points // self.part_size)
-
-    @property
-    def degree(self) -> int:
-        """SH degree."""
-        return OUTPUTS.index(len(self.matrices[-1]))
-
-
-def fits_simd(sizes: Sequence[int]) -> bool:
-    """Whether the SIMD form has room for an MLP of so many features, neurons of each hidden layer, and outputs."""
-    filled = [-(-size // 4) * 4 for size in sizes]
-    return max(filled) <= MOST_ROWS and sum(filled[:-1]) <= MOST_KEPT
-
-
-def takes_simd(like: torch.Tensor, grid: torch.Tensor, matrices: Sequence[torch.Tensor]) -> bool:
-    """Whether the SIMD form takes points like a tensor, the features of a grid (L, T, F), and an MLP for them."""
-    sizes = [grid.shape[0] * grid.shape[2], *map(len, matrices)]
-    chained = [tuple(matrix.shape) for matrix in matrices] == [*zip(sizes[1:], sizes[:-1], strict=True)]
-    same = all(x.dtype == like.dtype for x in (grid, *matrices))
-    return uses_simd(like) and same and chained and sizes[-1] in OUTPUTS and fits_simd(sizes)
-
-
-def simd_colors(inputs: SimdInputs, offset: float, clamp: bool) -> torch.Tensor:
-    """Return (n, 3) colours offset + SH(direction)."""
-    real = real_of(inputs.encoded)
-    colors = inputs.encoded.new_empty(inputs.points, 3)
-    arguments = [*inputs.arguments(), offset, clamp]
-    kernel = mlp_simd_kernels(real, inputs.degree).forward
-    launch(colors, kernel, inputs.parts, arguments, [array(colors, types(real).vec3)], smallest=1)
-    return colors
-
-
-def simd_colors_backward(
-    inputs: SimdInputs, colors: torch.Tensor, grad_colors: torch.Tensor, clamp: bool
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return the gradients of the features, padded as they are, and of the matrices.
-
-    Args:
-        inputs: as they were.
-        colors: (n, 3) what `simd_colors` returned, if `clamp`; else anything.
-        grad_colors: (n, 3) contiguous.
-        clamp: as it was.
-    """
-    real = real_of(inputs.encoded)
-    vec3 = types(real).vec3
-    grad_encoded = torch.empty_like(inputs.encoded)
-    grad_encoded[:, inputs.points :] = 0
-    sizes = [matrix.numel() for matrix in inputs.matrices]
-    slots = grad_colors.new_zeros(max(inputs.parts, 1), sum(sizes))
-    arguments = [*inputs.arguments(), clamp, array(colors, vec3), array(grad_colors, vec3)]
-    kernel = mlp_simd_kernels(real, inputs.degree).backward
-    launch(grad_colors, kernel, inputs.parts, arguments, [array(grad_encoded, real), array(slots, real)], smallest=1)
-    total = functools.reduce(torch.Tensor.add_, slots.unbind())
-    sums = zip(total.split(sizes), inputs.matrices, strict=True)
-    return grad_encoded, [x.view_as(matrix) for x, matrix in sums]

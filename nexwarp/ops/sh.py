@@ -6,7 +6,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, array, launch, real_of, uses_simd
+from nexwarp.ops._interop import Context, array, launch, real_of
 
 
 def plain_colors(
@@ -74,7 +74,7 @@ class _PlainColors(torch.autograd.Function):
         if need_sh0 or need_shN:
             grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
             # Memory is what counts on CUDA, arithmetic on a CPU.
-            sharing = 1 if uses_simd(means) else shN.shape[1] + 1
+            sharing = 1 if means.device.type == "cpu" else shN.shape[1] + 1
             outputs = [array(x, vec3) for x in (grad_sh0, grad_shN)]
             launch(means, kernels.coefficients_backward, count * sharing, [sharing, *seen], outputs)
         if need_means or need_position:

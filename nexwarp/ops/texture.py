@@ -7,12 +7,11 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from nexwarp.kernels.cpu.hashgrid import WIDTH, hashgrid_simd_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops import fused_texture, mlp
-from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point, uses_simd
+from nexwarp.ops._interop import STORAGES, array, launch, real_of, sums_in_fixed_point
 from nexwarp.ops.half_gradients import gradient_scale
 
 # Runs of levels that CPU threads share out in the backward pass.
@@ -40,9 +39,9 @@ def texture(
     Differentiable with respect to positions, depths, grid, weights and directions, not resolutions and focal.
     `torch.autocast` changes nothing: `half` alone says what is computed in half precision.
 
-    Colours whose directions need no gradient are computed in few kernels, all else layer by layer; the two differ by
-    rounding. Few kernels take layers that fit `mlp.fits_simd` on CPUs; in half precision on GPUs of compute capability
-    8.0 or more, L * F = 32, F = 2 or 4, and two hidden layers of 64, without torch's deterministic algorithms.
+    Colours whose directions need no gradient are computed by one fused kernel in half precision on GPUs of compute
+    capability 8.0 or more, for L * F = 32, F = 2 or 4 and two hidden layers of 64, without torch's deterministic
+    algorithms; all else layer by layer. The two differ by rounding.
 
     Args:
         positions: (n, 3) world.
@@ -69,15 +68,12 @@ def texture(
     keep = torch.is_grad_enabled() and (turned or any(x.requires_grad for x in (positions, depths, grid, *weights)))
     directions = None if directions is None else directions.contiguous()
     points = (positions, depths, directions)
-    if directions is not None and fused:
-        if half and fused_texture.usable(positions, directions, grid, weights):
-            height, width = image or (1, len(directions))
-            shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
-            copy = grid.detach().contiguous().half() if table is None else table
-            inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
-            return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
-        if not half and not (keep and turned) and mlp.takes_simd(positions, grid, weights):
-            return _SimdTexture.apply(*points, grid, resolutions, focal, offset, clamp, *weights)
+    if directions is not None and fused and half and fused_texture.usable(positions, directions, grid, weights):
+        height, width = image or (1, len(directions))
+        shape = fused_texture.Shape(width, height, len(positions) // max(len(directions), 1))
+        copy = grid.detach().contiguous().half() if table is None else table
+        inputs = fused_texture.Inputs(positions, depths, directions, copy, weights, resolutions, focal, shape)
+        return fused_texture.colors(inputs, grid, offset, clamp, keep=keep)
     return _Texture.apply(*points, grid, table, resolutions, focal, offset, clamp, half, keep, *weights)
 
 
@@ -156,53 +152,6 @@ class _Texture(torch.autograd.Function):
         )
 
 
-class _SimdTexture(torch.autograd.Function):
-    """Colours on a CPU, whose MLP and SH are one kernel each way."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        positions: torch.Tensor,
-        depths: torch.Tensor,
-        directions: torch.Tensor,
-        grid: torch.Tensor,
-        resolutions: torch.Tensor,
-        focal: torch.Tensor,
-        offset: float,
-        clamp: bool,
-        *weights: torch.Tensor,
-    ) -> torch.Tensor:
-        table = grid.contiguous()
-        encoded = _features(table, positions, depths, resolutions, focal)
-        colors = mlp.simd_colors(mlp.SimdInputs(encoded, weights, directions, len(positions)), offset, clamp)
-        ctx.clamp = clamp
-        ctx.save_for_backward(
-            positions, depths, directions, resolutions, focal, table, encoded, *[colors.clone()] * clamp, *weights
-        )
-        return colors
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        positions, depths, directions, resolutions, focal, table, encoded, *weights = ctx.saved_tensors
-        grad = grad.contiguous()
-        colors = weights.pop(0) if ctx.clamp else grad
-        need_positions, need_depths, _, need_grid = ctx.needs_input_grad[:4]
-        inputs = mlp.SimdInputs(encoded, weights, directions, len(positions))
-        signal, grad_matrices = mlp.simd_colors_backward(inputs, colors, grad, ctx.clamp)
-        grad_grid, grad_positions, grad_depths = _lookup_backward(
-            table, positions, depths, resolutions, focal, signal, grad.new_ones(1), need_positions or need_depths
-        )
-        return (
-            grad_positions if need_positions else None,
-            grad_depths if need_depths else None,
-            None,
-            grad_grid if need_grid else None,
-            *(None,) * 4,
-            *grad_matrices,
-        )
-
-
 def _features(
     table: torch.Tensor,
     positions: torch.Tensor,
@@ -219,7 +168,7 @@ def _features(
         encoded[:, count:] = 0
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
     outputs = [array(encoded, STORAGES[table.dtype])]
-    launch(positions, kernels.forward, (levels, _groups(positions)), arguments, outputs)
+    launch(positions, kernels.forward, (levels, len(positions)), arguments, outputs)
     return encoded
 
 
@@ -240,13 +189,7 @@ def _lookup(
         array(focal, real),
         wp.uint32(size - 1),
     ]
-    make = hashgrid_simd_kernels if uses_simd(positions) else hashgrid_kernels
-    return make(real, storage, features), arguments
-
-
-def _groups(positions: torch.Tensor) -> int:
-    """Threads a level: one for each point, in the SIMD form one for WIDTH of them."""
-    return -(-len(positions) // WIDTH) if uses_simd(positions) else len(positions)
+    return hashgrid_kernels(real, storage, features), arguments
 
 
 def _lookup_backward(
@@ -269,7 +212,7 @@ def _lookup_backward(
     grad_points = positions.new_empty(runs if need_points else 0, len(positions), 4)
     kernels, arguments = _lookup(table, positions, depths, resolutions, focal)
     arguments += [array(grad_encoded.contiguous(), STORAGES[table.dtype]), array(unscale, real)]
-    threads = (runs, _groups(positions))
+    threads = (runs, len(positions))
     if fixed_point:
         kernel = hashgrid_kernels(real, STORAGES[table.dtype], features, fixed_point=True).backward
         units = _units(grad_encoded, unscale)
@@ -281,10 +224,7 @@ def _lookup_backward(
     else:
         grad_grid = torch.zeros_like(table, dtype=positions.dtype)
         outputs = [array(grad_grid, wp.types.vector(length=features, dtype=real)), array(grad_points, vec4)]
-        if uses_simd(positions):
-            launch(positions, kernels.backward, threads, [*arguments, levels_per_thread], outputs)
-        else:
-            launch(positions, kernels.backward, threads, [*arguments, None, levels_per_thread], [*outputs, None])
+        launch(positions, kernels.backward, threads, [*arguments, None, levels_per_thread], [*outputs, None])
     if not need_points:
         return grad_grid, None, None
     points = grad_points.sum(0) if runs > 1 else grad_points[0]

@@ -20,7 +20,6 @@ from nexwarp.kernels.launch import get_num_threads
 from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.fused_texture import supported, takes_shape
-from nexwarp.ops.mlp import fits_simd
 from nexwarp.ops.startup import start_warp
 from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
@@ -51,9 +50,6 @@ def needed(config: Config, device: torch.device) -> list[Build]:
     """Return the catalogue's kernels that training and rendering with these settings need on a device."""
     textured, cpu = config.max_hits > 0, device.type == "cpu"
     shape = config.texture
-    outputs = 3 * (config.texture_sh_degree + 1) ** 2
-    sizes = [shape.levels * shape.features, *[shape.width] * shape.hidden_layers, outputs]
-    simd = cpu and textured and fits_simd(sizes)
     threads = thread_kernels(
         wp.float32,
         wp.float32 if cpu else wp.float16,
@@ -63,8 +59,6 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         clamps=(False,) * textured,
         low_passes=(config.low_pass,),
         ssim_lengths=(SIMD_WIDTH,) * cpu,
-        layered=not simd or config.learns_poses,  # directions with gradients
-        simd=simd,
         cpu=cpu,
         fixed_point=config.deterministic,
     )

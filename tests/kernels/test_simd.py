@@ -1,7 +1,5 @@
 """SIMD vectors calculate what torch does, each group of snippets by itself; SIMD forms agree with the others."""
 
-import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,13 +7,9 @@ import pytest
 import torch
 import warp as wp
 
-import nexwarp as nw
 from nexwarp.kernels import launch
 from nexwarp.native.simd import simd_functions
 from tests.ops.test_threads import Passes, errors_of
-from tests.reference.render import Texture
-from tests.reference.render import field as reference_field
-from tests.reference.sh import evaluate
 from tests.scenes import Scene, layered_scene, random_scene
 from tests.simd_kernels import ARITHMETIC, WIDTH, function_kernel, masks_kernel, slots_kernel
 from tests.tolerances import assert_close
@@ -157,102 +151,3 @@ def test_both_forms_of_collection_agree(
         assert_close(gradients[0][name], gradient, kind="gradient", name=name)
     assert blended[1].any()
     assert_close(blended[0], blended[1], kind="value", name="blended errors")
-
-
-@pytest.mark.parametrize("count", [1, 7, 8, 1003])
-@pytest.mark.parametrize("features", [1, 2, 4])
-@DTYPES
-def test_both_forms_of_lookup_agree(count: int, features: int, dtype: torch.dtype) -> None:
-    texture = nw.NeuralTexture(4, 2**8, features, 1.0, 6.0, width=16).to(dtype)
-    torch.nn.init.normal_(texture.grid)
-    generator = torch.Generator().manual_seed(4)
-    positions = (3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)).to(dtype)
-    depths = (1 + torch.rand(count, generator=generator, dtype=torch.float64)).to(dtype)
-    depths[3::7] = 0.0  # points to skip
-    results = []
-    for form in FORMS:
-        with launch.cpu_form(form):
-            leaves = [positions.clone().requires_grad_(), depths.clone().requires_grad_()]
-            out = texture(*leaves, 24.0)
-            factors = torch.randn(out.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
-            grads = torch.autograd.grad((out * factors).sum(), [*leaves, *texture.parameters()])
-            results.append([out.detach(), *grads])
-    assert_close(results[0][0], results[1][0], kind="value", name="coefficients")
-    for index, (simd, scalar) in enumerate(zip(results[0][1:], results[1][1:], strict=True)):
-        assert_close(simd, scalar, kind="gradient", name=f"gradient {index}")
-
-
-@pytest.mark.parametrize(
-    ("count", "hits", "degree", "width", "hidden_layers"),
-    [(1, 1, 3, 16, 2), (7, 2, 0, 5, 1), (64, 2, 1, 16, 0), (1003, 3, 2, 31, 3), (2100, 2, 3, 64, 2)],
-)
-@pytest.mark.parametrize("clamp", [False, True])
-@DTYPES
-def test_both_forms_of_textured_colors_agree_with_the_reference(
-    count: int, hits: int, degree: int, width: int, hidden_layers: int, clamp: bool, dtype: torch.dtype
-) -> None:
-    """Numbers of points, neurons and outputs that no block, vector or four divides, and more points than a part has."""
-    shape: dict[str, Any] = {"width": width, "hidden_layers": hidden_layers, "sh_degree": degree, "residual": True}
-    texture = nw.NeuralTexture(5, 2**8, 1, 1.0, 6.0, **shape).to(dtype)
-    torch.nn.init.normal_(texture.grid)
-    generator = torch.Generator().manual_seed(4)
-    draw = functools.partial(torch.randn, generator=generator, dtype=torch.float64)
-    positions, factors = draw(count, hits, 3).to(dtype), draw(count, hits, 3).to(dtype)
-    directions = torch.nn.functional.normalize(draw(count, 3), dim=-1).to(dtype)
-    depths = (1 + draw(count, hits).abs()).to(dtype)
-    depths[3::7] = 0.0  # points to skip
-    leaves = [
-        x.detach().double().requires_grad_() for x in (positions, depths, texture.grid, *texture.mlp.parameters())
-    ]
-    there = depths > 0
-    field = Texture(leaves[2], texture.resolutions.double(), leaves[3:])
-    coefficients = reference_field(field, leaves[0][there], leaves[1][there], 24.0)
-    toward = directions.double()[:, None].expand(count, hits, 3)[there]
-    expected = torch.zeros(count, hits, 3, dtype=torch.float64)  # without features there is no colour
-    expected[there] = evaluate(coefficients, toward, degree).clamp_min(0.0 if clamp else -math.inf)
-    references = torch.autograd.grad((expected * factors.double()).sum(), leaves)
-    for form in FORMS:
-        with launch.cpu_form(form):
-            at, far = positions.clone().requires_grad_(), depths.clone().requires_grad_()
-            out = texture.colors(at, far, directions, 24.0, clamp=clamp)
-            grads = torch.autograd.grad((out * factors).sum(), [at, far, *texture.parameters()])
-            with torch.no_grad():
-                assert torch.equal(texture.colors(positions, depths, directions, 24.0, clamp=clamp), out)
-        assert_close(out, expected, kind="value", name=f"colors, {form}")
-        for index, (gradient, reference) in enumerate(zip(grads, references, strict=True)):
-            assert_close(gradient, reference, kind="gradient", name=f"gradient {index}, {form}")
-
-
-def test_colors_of_large_layers_are_those_of_torch() -> None:
-    """Layers that the SIMD form has no room for are computed by torch, in both forms."""
-    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, width=200)
-    positions, depths = torch.rand(9, 2, 3), torch.ones(9, 2)
-    directions = torch.nn.functional.normalize(torch.rand(9, 3), dim=-1)
-    colors = []
-    for form in FORMS:
-        with launch.cpu_form(form):
-            colors.append(texture.colors(positions, depths, directions, 24.0))
-    assert_close(colors[0], colors[1], kind="value", name="colors")
-
-
-@pytest.mark.parametrize("part", ["grid", "hidden", "last"])
-@pytest.mark.parametrize("form", FORMS)
-def test_what_is_not_a_number_reaches_the_colors(part: str, form: launch.CpuForm) -> None:
-    """And its gradients: ReLU must not hide that a training has diverged."""
-    texture = nw.NeuralTexture(2, 2**4, 1, 1.0, 2.0, width=8)
-    *hidden, last = texture.mlp.parameters()
-    with torch.no_grad():
-        {"grid": texture.grid, "hidden": hidden[1], "last": last}[part].fill_(torch.nan)
-    with launch.cpu_form(form):
-        colors = texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)
-        assert colors.isnan().all()
-        grads = torch.autograd.grad(colors.sum(), [texture.grid, hidden[0]])
-    assert any(grad.isnan().any() for grad in grads)
-
-
-def test_an_mlp_that_does_not_fit_its_grid_is_refused() -> None:
-    for wrong in (torch.nn.Linear(8, 48, bias=False), torch.nn.Linear(4, 47, bias=False)):
-        texture = nw.NeuralTexture(2, 2**4, 2, 1.0, 2.0, hidden_layers=0)
-        texture.mlp = torch.nn.Sequential(wrong)
-        with pytest.raises((RuntimeError, ValueError)):
-            texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)
