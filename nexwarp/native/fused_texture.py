@@ -1,6 +1,5 @@
 """Text of the fused texturing kernels, a program for one warp; see `nexwarp.kernels.fused_texture`."""
 
-from nexwarp.kernels.sh_terms import basis_terms
 from nexwarp.native.mma import PRELUDE, TRANSPOSED, product
 
 FEATURES, WIDTH = 32, 64  # of the shapes that these kernels take: L * F, and both hidden layers
@@ -41,19 +40,31 @@ def _constants(**values: int) -> str:
     return "".join(f"    constexpr int {name} = {value};\n" for name, value in values.items())
 
 
-def _basis() -> str:
-    """Return the text of `basis(x, y, z, q, out)`: the basis functions q, q + 4, q + 8, q + 12 at a unit direction."""
-    return f"""
-    auto basis = [](float x, float y, float z, int q, float* out) {{
+# The basis functions q, q + 4, q + 8 and q + 12 at a unit direction; see `nexwarp.kernels.sh.basis_function`.
+_BASIS = """
+    auto basis = [](float x, float y, float z, int q, float* out) {
         const float xx = x * x, yy = y * y, zz = z * z;
-        const float all[] = {{{", ".join(basis_terms(3, suffix="f"))}}};
+        const float all[] = {
+            0.28209479177387814f,
+            -0.4886025119029199f * y,
+            0.4886025119029199f * z,
+            -0.4886025119029199f * x,
+            1.0925484305920792f * x * y,
+            -1.0925484305920792f * y * z,
+            0.31539156525252005f * (2.0f * zz - xx - yy),
+            -1.0925484305920792f * x * z,
+            0.5462742152960396f * (xx - yy),
+            -0.5900435899266435f * y * (3.0f * xx - yy),
+            2.890611442640554f * x * y * z,
+            -0.4570457994644658f * y * (4.0f * zz - xx - yy),
+            0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy),
+            -0.4570457994644658f * x * (4.0f * zz - xx - yy),
+            1.445305721320277f * z * (xx - yy),
+            -0.5900435899266435f * x * (xx - 3.0f * yy)};
         for (int j = 0; j < 4; ++j)
             out[j] = q < 2 ? (q == 0 ? all[4 * j] : all[4 * j + 1]) : (q == 2 ? all[4 * j + 2] : all[4 * j + 3]);
-    }};
+    };
 """
-
-
-_BASIS = _basis()
 
 # The two points of a lane, rows g and g + 8 of a tile: their pixels, -1 beyond the image.
 _PIXELS = """

@@ -83,7 +83,7 @@ def test_types_say_something() -> None:
     """Outside kernels: few `Any`, and no SimpleNamespace."""
     any_, loose = 0, []
     for path in modules():
-        if path.is_relative_to(ROOT / "kernels"):
+        if path.is_relative_to(ROOT / "kernels") or path.is_relative_to(ROOT / "native"):
             continue
         names = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Name)]
         any_ += sum(node.id == "Any" for node in names)
@@ -94,10 +94,10 @@ def test_types_say_something() -> None:
 
 
 def test_kernels_are_pure_warp() -> None:
-    for path in sorted((ROOT / "kernels").rglob("*.py")):
+    for path in sorted([*(ROOT / "kernels").rglob("*.py"), *(ROOT / "native").rglob("*.py")]):
         for dotted in imported_modules(path):
             root = dotted.split(".")[0]
-            pure = root in PURE | {"__future__", "warp"} or dotted.startswith("nexwarp.kernels")
+            pure = root in PURE | {"__future__", "warp"} or dotted.startswith(("nexwarp.kernels", "nexwarp.native"))
             assert pure, f"{path}: imports {dotted}"
 
 
