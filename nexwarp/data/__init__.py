@@ -2,7 +2,7 @@
 
 from nexwarp.data.demo import demo_folder, write_demo
 from nexwarp.data.points import InitialPoints, initial_points
-from nexwarp.data.scene import Scene, load_scene
+from nexwarp.data.scene import Scene, SceneSource, load_scene
 from nexwarp.data.views import View
 
-__all__ = ["InitialPoints", "Scene", "View", "demo_folder", "initial_points", "load_scene", "write_demo"]
+__all__ = ["InitialPoints", "Scene", "SceneSource", "View", "demo_folder", "initial_points", "load_scene", "write_demo"]

@@ -3,20 +3,22 @@
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
+from tyro.conf import Positional, arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data.background import parse_color
 from nexwarp.data.cache import PhotoCache, cache_folder
 from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, scene_errors
 from nexwarp.data.colmap import has_model, read_model
+from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import Array, make_cloud, split_views
 from nexwarp.data.memory import check_memory
@@ -25,6 +27,7 @@ from nexwarp.data.random_points import random_points
 from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
 from nexwarp.data.views import PlannedView, View, ViewReader, find_mask
 
+DEMO = "demo"
 TEST_EVERY = 8  # the field's split: of the views sorted by name, those with index % 8 == 0 are for testing
 NEAR_FRACTION = 0.01  # near plane, in units of the scene scale
 SCALE_MARGIN = 1.1
@@ -39,6 +42,65 @@ MAX_READERS = 32
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 ProgressCallback = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Where a scene lies and how to read it: the options of `load_scene` and `nexwarp train`, kept by a run folder."""
+
+    path: Annotated[str, Positional, arg(metavar="SCENE")]
+    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
+    images: Annotated[str, arg(metavar="FOLDER")] = "images"
+    """Folder of the photos, relative to SCENE, such as images_4."""
+    downscale: Annotated[int, arg(metavar="N")] = 1
+    """Factor by which photos are downscaled, with an area filter."""
+    masks: Annotated[str, arg(metavar="{FOLDER,alpha,none}")] = MASKS
+    """Folder of the masks, relative to SCENE, used if it exists; `alpha` takes the photos' alpha channel as masks."""
+    background: Annotated[
+        str | None,
+        arg(
+            metavar="{white,black,R,G,B,random}",
+            help_behavior_hint="(default: white for Blender scenes, else alpha is ignored)",
+        ),
+    ] = None
+    """Colour behind transparent photos and behind renderings; R,G,B are in [0, 1], `random` changes in each step."""
+    points: Annotated[str | None, arg(metavar="FILE.ply", help_behavior_hint="(default: the scene's own)")] = None
+    """PLY file of the initial points."""
+    format: Annotated[
+        str | None, arg(metavar="{colmap,nerfstudio,blender}", help_behavior_hint="(default: detected)")
+    ] = None
+    """Format of the scene, for a folder that holds several."""
+    follow_links: bool = False
+    """Allow photos that symbolic links lead to outside of SCENE, as with DVC, git-annex and caches of hubs."""
+    skip_missing: bool = False
+    """Go on without photos that do not exist; they are named."""
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "SceneSource":
+        """Rebuild it from `dataclasses.asdict`; what a newer version added is passed over.
+
+        Raises:
+            TypeError, ValueError: naming a field of another type.
+        """
+        known = {field.name for field in dataclasses.fields(cls)}
+        source = cls(**{name: value for name, value in data.items() if name in known})
+        _check_types(source)
+        return source
+
+    @property
+    def name(self) -> str:
+        """Name of the scene, for folders and tables."""
+        return DEMO if self.path == DEMO else Path(self.path).resolve().name
+
+    def absolute(self) -> "SceneSource":
+        """Return the same source with absolute paths."""
+        path = self.path if self.path == DEMO else str(Path(self.path).resolve())
+        points = None if self.points is None else str(Path(self.points).resolve())
+        return dataclasses.replace(self, path=path, points=points)
+
+    def load(self, progress: ProgressCallback | None = None) -> "Scene":
+        """Read the scene; progress and errors are those of `load_scene`."""
+        return _read_scene(self, demo_folder() if self.path == DEMO else Path(self.path), progress)
 
 
 @dataclass(frozen=True)
@@ -122,13 +184,8 @@ def load_scene(
     images: str = "images",
     downscale: int = 1,
     *,
-    masks: str | None = MASKS,
-    background: str | Sequence[float] | None = None,
-    points: str | os.PathLike[str] | None = None,
-    format: str | None = None,
-    follow_links: bool = False,
-    skip_missing: bool = False,
     progress: ProgressCallback | None = None,
+    **options: Any,
 ) -> Scene:
     """Read a scene: a COLMAP folder, nerfstudio's transforms.json, or Blender's transforms_train.json.
 
@@ -142,18 +199,13 @@ def load_scene(
         path: folder of the scene.
         images: folder of the photos, inside `path`.
         downscale: average blocks of this many pixels squared; what fills no block is cropped.
-        masks: where the views' masks come from. A folder inside `path` with a mask for each photo that needs one,
-            NAME.png beside NAME or of the same stem, white where the photo counts; "masks", the default, need not
-            exist, and what transforms.json names as a frame's `mask_path` goes before it. "alpha": alpha of one half
-            and more counts. None or "none": no masks.
-        background: colour that transparent photos are put on, "white", "black" or three numbers in [0, 1]; by
-            default white for a Blender scene with any, while for others alpha is dropped. "random" puts them on white
-            and marks the scene for training on random colours.
-        points: PLY file of the points to start from, in the scene's world frame, in place of the scene's own.
-        format: "colmap", "nerfstudio" or "blender" where a folder holds more than one of them.
-        follow_links: allow symbolic links out of the scene's folder; a scene of others can then show any picture.
-        skip_missing: warn of photos that do not exist, and go on without them.
         progress: called with the number of photos read and their total, from one thread at a time.
+        options: the other fields of `SceneSource`. `masks`: a folder inside `path` with a mask for each photo that
+            needs one, NAME.png beside NAME or of the same stem, white where the photo counts; "masks", the default,
+            need not exist, and what transforms.json names as a frame's `mask_path` goes before it. "alpha": alpha of
+            one half and more counts. None or "none": no masks. `background`: "white", "black", three numbers in
+            [0, 1] or "random", which puts photos on white and marks the scene for training on random colours.
+            `points`: in the scene's world frame. `follow_links`: a scene of others can then show any picture.
 
     Returns:
         The scene, all tensors on the CPU.
@@ -166,37 +218,61 @@ def load_scene(
             usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than 2 photos,
             a COLMAP model without points, photos too many for the memory.
     """
-    _check_paths(path, images, masks, points)
-    _check_downscale(downscale)
-    random = isinstance(background, str) and background == RANDOM
-    color = parse_color("white" if random else background)
+    source = SceneSource(path, images, downscale, **options)  # type: ignore[arg-type]  # checked below
+    _check_types(source)
+    return _read_scene(source, Path(path), progress)
+
+
+def _check_types(source: SceneSource) -> None:
+    """Raise TypeError naming a field of another type."""
+    path: Any = (str, os.PathLike)
+    kinds: dict[str, tuple[Any, str]] = {
+        "path": (path, "a path"),
+        "images": (str, "the name of a folder"),
+        "masks": (str | None, "the name of a folder"),
+        "points": ((*path, type(None)), "the path of a PLY file"),
+        "format": (str | None, "text"),
+        "follow_links": (bool, "True or False"),
+        "skip_missing": (bool, "True or False"),
+    }
+    for name, (kind, expected) in kinds.items():
+        value = getattr(source, name)
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
+    if isinstance(source.downscale, bool) or not isinstance(source.downscale, int):
+        raise TypeError(f"downscale: expected an int, got {type(source.downscale).__name__}")
+
+
+def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | None) -> Scene:
+    """Read the scene of a source whose folder is `path`."""
+    if source.downscale < 1:
+        raise ValueError(f"downscale: expected at least 1, got {source.downscale}")
+    random = isinstance(source.background, str) and source.background == RANDOM
+    color = parse_color("white" if random else source.background)
     with quiet_pillow(), scene_errors():
-        path = _scene_folder(path)
-        kind = find_format(path, format)
-        capture = _read_capture(path, images, kind, follow_links, skip_missing)
-        scene = _load(path, kind, capture, images, downscale, masks, color, points, progress)
+        if path.is_file():
+            raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
+        if not path.is_dir():
+            raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
+        kind = find_format(path, source.format)
+        capture = _read_capture(source, path, kind)
+        if len(capture.photos) < 2:
+            raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
+        cloud = capture.cloud if source.points is None else read_ply(Path(source.points))
+        if cloud is None and kind == "colmap":
+            raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
+        tests = [
+            index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
+            for index, photo in enumerate(capture.photos)
+        ]
+        viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
+        scale = _scene_scale(str(capture.source), viewmats, cloud)
+        background = capture.background if color is None else color
+        train, held_out = _read_views(source, path, capture.photos, tests, background, NEAR_FRACTION * scale, progress)
+        if color is None and all(view.alpha is None for view in train + held_out):
+            background = None  # behind opaque photos there is none to see
+        scene = _make_scene(train, held_out, cloud, scale, path, background)
     return dataclasses.replace(scene, random_background=random)
-
-
-def _scene_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a scene after a check that it is a folder."""
-    path = Path(path)
-    if path.is_file():
-        raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
-    return path
-
-
-def _check_paths(path: object, images: object, masks: object, points: object) -> None:
-    """Raise TypeError unless the paths that `load_scene` takes are paths."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    for name, value in (("images", images), ("masks", masks)):
-        if not isinstance(value, str) and not (name == "masks" and value is None):
-            raise TypeError(f"{name}: expected the name of a folder, got {type(value).__name__}")
-    if points is not None and not isinstance(points, (str, os.PathLike)):
-        raise TypeError(f"points: expected the path of a PLY file, got {type(points).__name__}")
 
 
 def find_format(path: Path, format: str | None = None) -> str:
@@ -227,46 +303,31 @@ def find_format(path: Path, format: str | None = None) -> str:
     return found[0]
 
 
-def _load(
+def _read_views(
+    source: SceneSource,
     path: Path,
-    kind: str,
-    capture: Capture,
-    images: str,
-    downscale: int,
-    masks: str | None,
+    photos: list[Photo],
+    tests: list[bool],
     background: tuple[float, float, float] | None,
-    points: str | os.PathLike[str] | None,
+    near: float,
     progress: ProgressCallback | None,
-) -> Scene:
-    if len(capture.photos) < 2:
-        raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
-    cloud = read_ply(Path(points)) if points is not None else capture.cloud
-    if cloud is None and kind == "colmap":
-        raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
-    asked, background = background, capture.background if background is None else background
-    tests = [
-        index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
-        for index, photo in enumerate(capture.photos)
-    ]
-    viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
-    scale = _scene_scale(str(capture.source), viewmats, cloud)
+) -> tuple[list[View], list[View]]:
+    """Read all photos; return the training views and the test views."""
+    alpha_mask = source.masks == ALPHA
     reader = ViewReader(
-        downscale=downscale,
+        downscale=source.downscale,
         background=background,
-        alpha_mask=masks == ALPHA,
+        alpha_mask=alpha_mask,
         cache=PhotoCache(cache_folder() / "undistorted"),
     )
-    plans = _map(reader.plan, _with_masks(path, capture.photos, masks), MAX_READERS)
+    plans = _map(reader.plan, _with_masks(path, photos, source.masks), MAX_READERS)
     jobs = [job for plan in plans for job in plan]
+    channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
+    workers = _workers(source, path, channels, jobs)
+    views = _map(lambda job: reader.read(job, near), jobs, workers, progress)
     held_out = [test for plan, test in zip(plans, tests, strict=True) for _ in plan]
-    channels = 3 + (background is not None) + (masks == ALPHA or any(job.photo.mask for job in jobs))
-    workers = _workers(path, images, downscale, channels, jobs)
-    views = _map(lambda job: reader.read(job, NEAR_FRACTION * scale), jobs, workers, progress)
-    if asked is None and all(view.alpha is None for view in views):
-        background = None  # behind opaque photos there is none to see
     train = [view for view, test in zip(views, held_out, strict=True) if not test]
-    held = [view for view, test in zip(views, held_out, strict=True) if test]
-    return _make_scene(train, held, cloud, scale, path, background)
+    return train, [view for view, test in zip(views, held_out, strict=True) if test]
 
 
 def _make_scene(
@@ -292,27 +353,18 @@ def _make_scene(
     )
 
 
-def _check_downscale(downscale: int) -> None:
-    if isinstance(downscale, bool) or not isinstance(downscale, int):
-        raise TypeError(f"downscale: expected an int, got {type(downscale).__name__}")
-    if downscale < 1:
-        raise ValueError(f"downscale: expected at least 1, got {downscale}")
-
-
-def _read_capture(
-    path: Path, images: str, kind: str, follow_links: bool = False, skip_missing: bool = False
-) -> Capture:
+def _read_capture(source: SceneSource, path: Path, kind: str) -> Capture:
     if kind == "colmap":
-        capture = read_model(path, path / images, follow_links)
-        _check_folder("images", path, images)
+        capture = read_model(path, path / source.images, source.follow_links)
+        _check_folder("images", path, source.images)
         photos = [photo for photo in capture.photos if photo.file.is_file()]
         missing = [photo.name for photo in capture.photos if not photo.file.is_file()]
-        report_missing(capture.source, missing, len(capture.photos), skip_missing)
+        report_missing(capture.source, missing, len(capture.photos), source.skip_missing)
         return dataclasses.replace(capture, photos=photos)
-    if images != "images":
-        _check_folder("images", path, images)
+    if source.images != "images":
+        _check_folder("images", path, source.images)
     read = read_nerfstudio if kind == "nerfstudio" else read_blender
-    return read(path, images, follow_links, skip_missing)
+    return read(path, source.images, source.follow_links, source.skip_missing)
 
 
 def _check_folder(argument: str, path: Path, name: str) -> None:
@@ -351,9 +403,10 @@ def _scene_scale(source: str, viewmats: Sequence[np.ndarray], cloud: Cloud | Non
     return scale
 
 
-def _workers(path: Path, images: str, downscale: int, channels: int, jobs: list[PlannedView]) -> int:
+def _workers(source: SceneSource, path: Path, channels: int, jobs: list[PlannedView]) -> int:
     """How many photos to read at a time, so that what reading takes beside them fits as well."""
-    free = check_memory(path, images, [(job.target.width, job.target.height) for job in jobs], downscale, channels)
+    sizes = [(job.target.width, job.target.height) for job in jobs]
+    free = check_memory(path, source.images, sizes, source.downscale, channels)
     largest = max(
         READ_BYTES * job.size[0] * job.size[1]
         + (UNDISTORT_BYTES * job.target.width * job.target.height if job.photo.lens.distorted else 0)

@@ -9,10 +9,10 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
-from nexwarp.data import Scene, demo_folder, load_scene
+from nexwarp.data.scene import DEMO as DEMO
+from nexwarp.data.scene import SceneSource as SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
 from nexwarp.io.files import is_temporary, one_line, sync, write_atomically, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
@@ -31,47 +31,7 @@ from nexwarp.train.config import MIN_SURFELS, MOST_TEACHERS, Config
 from nexwarp.train.presets import config_from_dict
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 
-DEMO = "demo"
 RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
-
-
-@dataclass(frozen=True)
-class SceneSource:
-    """Location of a run's scene, and the options for loading it."""
-
-    path: str
-    """Scene folder (COLMAP, nerfstudio or Blender), or "demo"."""
-    images: str = "images"
-    """Folder of the photos, relative to `path`."""
-    downscale: int = 1
-    """Factor by which photos are downscaled, with an area filter."""
-    masks: str = "masks"
-    """Folder of the masks, relative to `path`; "alpha" takes the photos' alpha channel, "none" takes no masks."""
-    background: str | None = None
-    """Colour behind transparent photos: white, black, R,G,B or random."""
-    points: str | None = None
-    """PLY file of the initial points; None takes the scene's points."""
-    format: str | None = None
-    """Format of the scene, for a folder that holds several; None detects it."""
-    follow_links: bool = False
-    """Whether photos may lie behind symbolic links that leave the scene's folder."""
-    skip_missing: bool = False
-    """Whether to go on without photos that do not exist."""
-
-    @property
-    def name(self) -> str:
-        """Name of the scene, for folders and tables."""
-        return DEMO if self.path == DEMO else Path(self.path).resolve().name
-
-    def load(self, progress: Callable[[int, int], None] | None = None) -> Scene:
-        """Load the scene; the demo is generated on first use.
-
-        Args:
-            progress: called with the number of photos read so far and their total.
-        """
-        options = dataclasses.asdict(self) | {"progress": progress}
-        folder = options.pop("path")
-        return load_scene(demo_folder() if folder == DEMO else folder, **options)
 
 
 @contextmanager
@@ -181,11 +141,7 @@ def create_run(
 
 def _places(source: SceneSource, teachers: Sequence[Path]) -> dict[str, Json]:
     """Return the entries of a run's config that hold paths, which are absolute there."""
-    scene = dataclasses.asdict(source)
-    if source.path != DEMO:
-        scene["path"] = str(Path(source.path).resolve())
-    if source.points is not None:
-        scene["points"] = str(Path(source.points).resolve())
+    scene = dataclasses.asdict(source.absolute())
     return {"scene": scene} | ({"teachers": [str(path.resolve()) for path in teachers]} if teachers else {})
 
 
@@ -263,23 +219,13 @@ def read_run(run: Path) -> tuple[SceneSource, Config, dict[str, Json]]:
     try:
         data = read_json(path)
         check_version(data.get("format_version", 1), RUN_VERSION)
-        scene = data["scene"]
-        if type(scene["downscale"]) is not int or not isinstance(scene["path"], str):
-            raise ValueError(f"scene: expected a path and an integer downscale, got {scene}")
-        for name in ("images", "masks", "background", "points", "format"):
-            if not isinstance(scene.get(name), (str, type(None))):
-                raise ValueError(f"scene: {name}: expected text, got {scene[name]!r}")
-        for name in ("follow_links", "skip_missing"):
-            if not isinstance(scene.get(name, False), bool):
-                raise ValueError(f"scene: {name}: expected true or false, got {scene[name]!r}")
+        source = SceneSource.from_dict(data["scene"])
         teachers = data.get("teachers", [])
         if not isinstance(teachers, list) or not all(isinstance(path, str) for path in teachers):
             raise ValueError(f"teachers: expected a list of paths, got {teachers!r}")
         own, config = _own_teachers(data), config_from_dict(data["config"])
         if own.count * own.iterations >= config.iterations:
             raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
-        known = {field.name for field in dataclasses.fields(SceneSource)}
-        source = SceneSource(**{name: value for name, value in scene.items() if name in known})
         return source, config, data
     except READ_ERRORS as error:
         raise FormatError(f"{path}: expected the settings of a nexwarp run ({one_line(error)})") from None

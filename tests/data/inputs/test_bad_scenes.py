@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import nexwarp.data.scene
+import nexwarp.data.transforms
 from benchmarks.inputs import APPLIED, write_blender, write_nerfstudio
 from nexwarp.data import load_scene
 from tests.data.inputs.support import MASK, assert_same_cameras, edit, file, frame, spoilt, write_mask
@@ -205,7 +205,7 @@ def test_damaged_json_never_crashes(demo, tmp_path):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                nexwarp.data.scene._read_capture(path, "images", "nerfstudio")
+                nexwarp.data.transforms.read_nerfstudio(path, "images")
             outcomes["loaded"] += 1
         except (ValueError, FileNotFoundError) as error:
             assert "\n" not in str(error) and str(path) in str(error)
