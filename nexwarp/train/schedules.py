@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import torch
 
-from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
@@ -53,10 +52,9 @@ def make_optimizer(
         ValueError: its groups are not those that it was given.
     """
     ends = rate_ends(config, scale)
-    textures = texture.textures if isinstance(texture, MergedTexture) else [texture]
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
     if config.max_hits:
-        parts |= {"grid": [x.grid for x in textures], "mlp": [w for x in textures for w in x.mlp.parameters()]}
+        parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
     if poses is not None:
         learned = {"poses": poses.corrections, "motions": poses.motions}
         parts |= {name: [x] for name, x in learned.items() if x is not None and x.requires_grad}
@@ -70,7 +68,7 @@ def make_optimizer(
         raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {given}")
     for group in optimizer.param_groups:
         group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
-    if isinstance(optimizer, FusedAdam) and config.max_hits and not isinstance(texture, MergedTexture):
+    if isinstance(optimizer, FusedAdam) and config.max_hits:
         optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 
