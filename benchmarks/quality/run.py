@@ -30,7 +30,7 @@ from nexwarp.model.model_file import load
 from nexwarp.run.evaluate import METRICS as METRIC_FUNCTIONS
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
-from nexwarp.train.schedules import MOTION_RATES, POSE_RATES
+from nexwarp.train.schedules import POSE_RATES
 from nexwarp.train.stages import plan_teachers, student_trainer
 from nexwarp.train.step_losses import POSE_PRIOR
 from nexwarp.train.trainer import Trainer
@@ -166,7 +166,8 @@ def config_name(config: Config) -> str:
     del settings["teachers"]  # `trained_with` compares them
     settings["losses"] |= {"poses": POSE_PRIOR}
     settings["densify"] |= {"floaters": False}
-    settings["rates"] |= {"poses": POSE_RATES, "motions": MOTION_RATES}
+    settings["rates"] |= {"poses": POSE_RATES, "motions": (0.5, 0.02)}
+    settings["blur_poses"] = 1
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 

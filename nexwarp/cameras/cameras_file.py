@@ -21,7 +21,6 @@ def save_cameras(
     path: Path,
     cameras: Mapping[str, Mapping[str, Camera]],
     given: Mapping[str, Mapping[str, Camera]] | None = None,
-    exposures: Mapping[str, tuple[Camera, Camera]] | None = None,
 ) -> None:
     """Write cameras as JSON: set ("train", "test") -> name -> camera.
 
@@ -29,7 +28,6 @@ def save_cameras(
         path: file to write.
         cameras: the cameras.
         given: the same cameras before their poses were refined; those that differ are written, too.
-        exposures: cameras at the start and the end of the exposure, by the name of the training photo.
 
     Raises:
         OSError: `path` cannot be written.
@@ -43,7 +41,6 @@ def save_cameras(
                 "height": camera.height,
                 "near": camera.near,
                 **_given(camera, None if given is None else given[group][name]),
-                **_ends(exposures.get(name) if exposures and group == SETS[0] else None),
             }
             for name, camera in members.items()
         }
@@ -57,13 +54,6 @@ def _given(camera: Camera, given: Camera | None) -> dict[str, list[list[float]]]
     if given is None or torch.equal(given.viewmat.cpu(), camera.viewmat.cpu()):
         return {}
     return {"given_viewmat": given.viewmat.tolist()}
-
-
-def _ends(cameras: tuple[Camera, Camera] | None) -> dict[str, list[list[float]]]:
-    """Return the entries of the poses between which a camera moved while its photo was exposed."""
-    if cameras is None:
-        return {}
-    return {f"exposure_{end}": camera.viewmat.tolist() for end, camera in zip(("start", "end"), cameras, strict=True)}
 
 
 def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:

@@ -357,8 +357,8 @@ class Train:
         for path in self.teachers:
             if path.resolve().is_relative_to(run.resolve()):
                 raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
-        if self.teachers and config.learns_poses:
-            raise SettingError("--teacher: expected poses that stay as given, got --refine-poses or blur_poses")
+        if self.teachers and config.refine_poses:
+            raise SettingError("--teacher: expected poses that stay as given, got --refine-poses")
 
     def _resumed_config(self, run: Path, given: dict[str, Json], settings: dict[str, Json]) -> Config:
         """Return the settings of the run to resume; a SettingError names an option that differs."""

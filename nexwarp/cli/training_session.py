@@ -237,8 +237,7 @@ class TrainingSession:
         given = scene.cameras
         cameras = trainer.views.refined_cameras(trainer.poses)
         refined = {TRAIN: dict(zip(given[TRAIN], cameras, strict=True))}
-        ends = trainer.views.exposure_ends(trainer.poses)
-        save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given, ends)
+        save_cameras(run / CAMERAS_FILE, given if trainer.poses is None else given | refined, given)
         facts = self._facts(model, file)
         if self.stage.teacher:
             write_json(run / METRICS_FILE, facts)

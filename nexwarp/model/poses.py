@@ -1,7 +1,4 @@
-"""Rigid corrections of the training cameras and their motions during exposures, learned with the scene.
-
-Neither is in the paper.
-"""
+"""Rigid corrections of the training cameras, learned with the scene. Not in the paper."""
 
 import dataclasses
 import math
@@ -80,56 +77,34 @@ class PoseCorrections(nn.Module):
     surfels changes no rendering (the gauge). `keep_gauge` removes from the corrections what is such a common motion, to
     first order, so that the corrected cameras stay where the given ones are, and with them the test cameras.
 
-    A camera that moves while its photo is exposed has also a motion, a twist from the start to the end of the exposure
-    about the same point; the corrected pose is that in the middle. A photo cannot tell a motion from its reverse.
-
     Attributes:
-        corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`. It takes
-            no gradient where only motions are learned.
-        motions: (V, 6) parameter, pixels that the turn moves the picture, and pixels that the shift moves the point
-            about which it turns; None where cameras stand still.
+        corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`.
         scale: world units.
 
     Buffers, not saved:
         gauge: (6 V, G) orthonormal directions that change no rendering, G <= 7.
         pivots: (V,) z-depths of the points about which the corrections turn, world units.
-        pixels: (V,) angles of a pixel, radians.
     """
 
     gauge: torch.Tensor
     pivots: torch.Tensor
-    pixels: torch.Tensor
 
-    motions: nn.Parameter | None
-
-    def __init__(
-        self,
-        cameras: Sequence[Camera],
-        scale: float,
-        depths: Sequence[float] | None = None,
-        *,
-        refine: bool = True,
-        motions: torch.Tensor | None = None,
-    ) -> None:
+    def __init__(self, cameras: Sequence[Camera], scale: float, depths: Sequence[float] | None = None) -> None:
         """Start with no correction.
 
         Args:
             cameras: the V given cameras.
             scale: of the scene, world units > 0.
             depths: V typical z-depths of what the cameras see, world units > 0; None is `scale`.
-            refine: whether corrections are learned.
-            motions: (V, 6) pixels, to start with; None lets the cameras stand still.
         """
         super().__init__()
         check_range("scale", scale, 1e-30, 1e30)
         self.scale = scale
-        self.corrections = nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=refine)
-        self.motions = None if motions is None else nn.Parameter(motions.clone())
+        self.corrections = nn.Parameter(torch.zeros(len(cameras), 6))
         viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
         pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
         self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float().contiguous(), persistent=False)
         self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
-        self.register_buffer("pixels", torch.tensor([1 / camera.focal for camera in cameras]), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
         """Return the corrected viewmat (4, 4) of a view; differentiable.
@@ -140,21 +115,6 @@ class PoseCorrections(nn.Module):
         """
         twist = _row(self.corrections, view)
         return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), _row(self.pivots, view))
-
-    def moment(self, middle: Camera, view: int | torch.Tensor, time: float) -> Camera:
-        """Return the camera of a view at a moment of its exposure; differentiable.
-
-        Args:
-            middle: the camera in the middle of the exposure, corrected.
-            view: index of the camera, a number or a (1,) int64 tensor.
-            time: from -0.5, the start of the exposure, to 0.5, its end.
-        """
-        if self.motions is None:
-            return middle
-        twist, pivot = _row(self.motions, view) * _row(self.pixels, view), _row(self.pivots, view)
-        viewmat = corrected(middle.viewmat, time * torch.cat([twist[:3], pivot * twist[3:]]), pivot)
-        checked = (middle.fx, middle.fy, middle.cx, middle.cy)
-        return dataclasses.replace(middle, viewmat=viewmat, checked=checked)
 
     def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
         """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
@@ -167,11 +127,8 @@ class PoseCorrections(nn.Module):
         return [self.camera(camera, index) for index, camera in enumerate(given)]
 
     def prior(self, view: torch.Tensor) -> torch.Tensor:
-        """Return the squared length of a view's correction and motion, a scalar: what keeps both small."""
-        prior = self.corrections.index_select(0, view).square().sum()
-        if self.motions is None:
-            return prior
-        return prior + (self.motions.index_select(0, view) * self.pixels.index_select(0, view)).square().sum()
+        """Return the squared length of a view's correction, a scalar: what keeps it small."""
+        return self.corrections.index_select(0, view).square().sum()
 
     @torch.no_grad()
     def keep_gauge(self) -> None:
@@ -179,15 +136,10 @@ class PoseCorrections(nn.Module):
         flat = self.corrections.view(-1)
         flat -= self.gauge @ (self.gauge.T @ flat)
 
-    def load(self, corrections: torch.Tensor, motions: torch.Tensor | None = None) -> None:
-        """Overwrite corrections and motions, in place; ValueError where a shape is another, or motions lack."""
+    def load(self, corrections: torch.Tensor) -> None:
+        """Overwrite the corrections, in place; ValueError where their shape is another."""
         check_tensors({"corrections": (corrections, tuple(self.corrections.shape))})
         self.corrections.data.copy_(corrections)
-        if self.motions is not None:
-            if motions is None:
-                raise ValueError("motions: expected those of the exposures, got None")
-            check_tensors({"motions": (motions, tuple(self.motions.shape))})
-            self.motions.data.copy_(motions)
 
 
 def _row(values: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:

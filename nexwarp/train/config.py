@@ -19,7 +19,6 @@ REFERENCE_ITERATIONS = 30_000
 MIN_SURFELS = 16
 LARGEST_NUMBER = 2**53  # of settings: all integers up to there are floats too
 MASK_MODES = ("ignore", "background")
-MOST_BLUR_POSES = 31
 MOST_TEACHERS = 8
 
 
@@ -128,10 +127,6 @@ class Config:
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
-    blur_poses: int = 1
-    """For photos with motion blur, an odd number above 1, such as 3: learn how each training camera moves during its
-    exposure, and compare the photo with the mean of renderings from this many poses on the way. Steps take at least
-    that many times as long; 1 is for sharp photos."""
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
@@ -185,12 +180,9 @@ class Config:
         for value in self.background or ():
             check_range("background", value, 0.0, 1.0)
         check_order(self.order)
-        check_range("blur_poses", self.blur_poses, 1, MOST_BLUR_POSES)
-        if self.blur_poses % 2 == 0:
-            raise ValueError(f"blur_poses: expected an odd number, got {self.blur_poses}")
         if self.teachers is not None:
             check_range("teachers", self.teachers, 0, MOST_TEACHERS)
-        if self.teachers and self.learns_poses:
+        if self.teachers and self.refine_poses:
             raise ValueError(f"teachers: expected 0 or null where poses are learned, got {self.teachers}")
         if self.mask_mode not in MASK_MODES:
             raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
@@ -198,11 +190,6 @@ class Config:
     def scaled(self, iteration: float) -> int:
         """Iteration of this run that stands for one of a run of 30,000."""
         return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
-
-    @property
-    def learns_poses(self) -> bool:
-        """Whether poses or motions of the training cameras are learned."""
-        return self.refine_poses or self.blur_poses > 1
 
     @property
     def texture_sh_degree(self) -> int:

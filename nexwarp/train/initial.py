@@ -18,7 +18,6 @@ INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
-FIRST_BLUR = 0.5  # standard deviation of the first motions, pixels for each of their six numbers
 SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
 
@@ -113,16 +112,11 @@ def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 
 def initial_poses(scene: Scene, config: Config, device: torch.device) -> PoseCorrections | None:
-    """Return corrections of 0 for the training poses, and random motions; None where neither is learned."""
-    if not config.refine_poses and config.blur_poses == 1:
+    """Return corrections of 0 for the training poses; None where they stay as given."""
+    if not config.refine_poses:
         return None
-    cameras, depths = [view.camera for view in scene.train], [_typical_depth(view, scene) for view in scene.train]
-    motions = None
-    if config.blur_poses > 1:
-        # Not 0: a motion and its reverse blur alike, so that the mean over an exposure has no first derivative there.
-        generator = torch.Generator().manual_seed(config.seed)
-        motions = FIRST_BLUR * torch.randn(len(cameras), 6, generator=generator)
-    return PoseCorrections(cameras, scene.scale, depths, refine=config.refine_poses, motions=motions).to(device)
+    depths = [_typical_depth(view, scene) for view in scene.train]
+    return PoseCorrections([view.camera for view in scene.train], scene.scale, depths).to(device)
 
 
 def _typical_depth(view: View, scene: Scene) -> float:

@@ -31,6 +31,9 @@ DEMO_SETTINGS: dict[str, object] = {
 
 PARTS = ("losses", "rates", "texture", "densify")
 
+# Settings that no version has any more, and the value with which they did nothing.
+REMOVED: dict[str, object] = {"blur_poses": 1}
+
 # What runs did before a setting existed, where the default does something else; "" has the settings without a part.
 BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0, "teachers": 0}, "densify": {"relocate": 0.0}}
 
@@ -108,11 +111,20 @@ def preset(name: str) -> Config:
     return PRESETS[name]
 
 
+def refuse_removed(data: Mapping[str, Any]) -> None:
+    """Raise ValueError where settings, as an older version wrote them, ask for something that was removed since."""
+    for name, neutral in REMOVED.items():
+        part, _, key = name.rpartition(".")
+        value = (data.get(part, {}) if part else data).get(key, neutral)
+        if value != neutral:
+            raise ValueError(f"{name}: {value} was removed; versions up to 0.2 have it")
+
+
 def config_from_dict(data: Mapping[str, Any]) -> Config:
     """Rebuild a config from `Config.as_dict`; ValueError names a value of another type or out of range.
 
     Settings that an older version did not write are those of the preset that the run started from, but for those of
-    `BEFORE`. Those that a newer version wrote and this one does not know are passed over.
+    `BEFORE`. Those that this version does not know are passed over; see `refuse_removed`.
     """
     try:
         preset = data.get("preset")

@@ -18,12 +18,11 @@ from nexwarp.train.densify import DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are
-# learned, "poses" and "motions"; `lr`, the learning rate of the first step.
+# learned, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
-# First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps, and of motions
-# during exposures, pixels.
-POSE_RATES, MOTION_RATES = (2e-4, 2e-6), (0.5, 0.02)
+# First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
+POSE_RATES = (2e-4, 2e-6)
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 
@@ -45,7 +44,7 @@ def make_optimizer(
         scale: of the scene, world units, which the means' rates follow.
         make: makes an optimizer of one's own; None makes a `FusedAdam`, which regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
-        poses: pose corrections and motions to train; None trains none.
+        poses: pose corrections to train; None trains none.
 
     Raises:
         TypeError: `make` returned no optimizer.
@@ -56,8 +55,7 @@ def make_optimizer(
     if config.max_hits:
         parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
     if poses is not None:
-        learned = {"poses": poses.corrections, "motions": poses.motions}
-        parts |= {name: [x] for name, x in learned.items() if x is not None and x.requires_grad}
+        parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
     optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
@@ -108,7 +106,6 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
         "grid": rates.grid,
         "mlp": rates.mlp,
         "poses": (POSE_RATES[0] * longer, POSE_RATES[1] * longer),
-        "motions": MOTION_RATES,
     }
 
 

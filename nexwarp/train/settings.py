@@ -9,6 +9,7 @@ from typing import get_args, get_origin, get_type_hints
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.train.config import LARGEST_NUMBER, Config
+from nexwarp.train.presets import REMOVED
 
 
 def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
@@ -75,6 +76,8 @@ def _find_setting(config: Config, name: str) -> tuple[str, str]:
     known += [f"{p}.{f.name}" for p in sorted(parts) for f in dataclasses.fields(getattr(config, p))]
     if name in known:
         return part, key
+    if name in REMOVED:
+        raise ValueError(f"{name}: expected a setting, got one that was removed; versions up to 0.2 have it")
     close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part or name}.")]
     # Not the first one of all, the preset, which has a flag of its own.
     raise ValueError(f"{one_line(name, 60)}: expected a setting, such as {', '.join(close or known[1:5])}")

@@ -77,7 +77,7 @@ def teacher_count(config: Config, photos: int) -> int:
     if config.teachers is not None:
         return config.teachers
     few = photos <= MOST_PHOTOS and config.max_surfels >= SURFELS_A_PHOTO * photos
-    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.learns_poses else 0
+    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.refine_poses else 0
 
 
 def plan_teachers(config: Config, photos: int) -> OwnTeachers:

@@ -20,7 +20,7 @@ from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
-from nexwarp.train.presets import config_from_dict
+from nexwarp.train.presets import config_from_dict, refuse_removed
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -197,6 +197,7 @@ def check_origin(
     """
     state = snapshot.state
     # Neither CUDA graphs nor how many teachers the run would train first changes what a trainer does.
+    refuse_removed(state["config"])
     saved = config_from_dict(state["config"])
     saved = dataclasses.replace(saved, cuda_graphs=config.cuda_graphs, teachers=config.teachers)
     if extend and saved.iterations < config.iterations:

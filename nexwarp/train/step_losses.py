@@ -18,7 +18,7 @@ from nexwarp.train.target import Target
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 # Photos are clipped from here on: what lies beyond it is unknown.
 SATURATION = 250 / 255
-# Factor of the squared pose corrections, which keeps poses near the given ones, and of the squared motions.
+# Factor of the squared pose corrections, which keeps poses near the given ones.
 POSE_PRIOR = 0.1
 BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses")
 
@@ -48,28 +48,14 @@ def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering
     """
     if target.exposure is None:
         return out
-    if not out.image.is_cuda:  # where vector instructions make torch's passes faster than one kernel
-        return clipped(exposed(out, target, plain=plain), target)
-    image, textured = expose(out.image, out.textured, target.exposure, target.photo, SATURATION)
+    if out.image.is_cuda:
+        image, textured = expose(out.image, out.textured, target.exposure, target.photo, SATURATION)
+    else:  # where vector instructions make torch's passes faster than one kernel
+        image, textured = out.image * target.exposure, out.textured * target.exposure
+        brighter = (target.photo >= SATURATION) & (image > target.photo)
+        image = torch.where(brighter, target.photo, image)
     colors = out.plain * target.exposure if plain else out.plain
     return dataclasses.replace(out, image=image, plain=colors, textured=textured)
-
-
-def exposed(out: Rendering, target: Target, *, plain: bool = True) -> Rendering:
-    """Return a rendering times the gains and the falloff of its photo; `plain` says whether `out.plain`, too."""
-    if target.exposure is None:
-        return out
-    image, textured = out.image * target.exposure, out.textured * target.exposure
-    colors = out.plain * target.exposure if plain else out.plain
-    return dataclasses.replace(out, image=image, plain=colors, textured=textured)
-
-
-def clipped(out: Rendering, target: Target) -> Rendering:
-    """Return a rendering at the photo's exposure without what is brighter than a saturated photo; see `as_taken`."""
-    if target.exposure is None:
-        return out
-    brighter = (target.photo >= SATURATION) & (out.image > target.photo)
-    return dataclasses.replace(out, image=torch.where(brighter, target.photo, out.image))
 
 
 def step_losses(
@@ -95,7 +81,7 @@ def step_losses(
         cells_unit: world units in which the grid's loss counts its cells.
         own: losses of one's own, added as they are.
         grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
-        poses: corrections and motions, which have a prior; None where neither is learned.
+        poses: corrections, which have a prior; None where poses stay as given.
 
     Raises:
         TypeError, ValueError: an own loss returned no scalar; the message names it.

@@ -30,7 +30,7 @@ class Target:
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.model.render` takes it.
-        view: (1,) int64, index of the training view; None where neither poses nor motions are learned.
+        view: (1,) int64, index of the training view; None where poses are not learned.
         surface: factors of the normal and the distortion loss in this step.
     """
 
@@ -76,7 +76,7 @@ class TargetMaker:
             background: the colour behind everything, where it is not random.
             generator: of random backgrounds, on the CPU.
             noise: of the depth jitter, on the device.
-            poses: corrections and motions that are learned; None where neither is.
+            poses: corrections that are learned; None where poses stay as given.
         """
         self.poses = poses
         self.scene, self.config, self.views = scene, config, views
@@ -134,8 +134,7 @@ class TargetMaker:
             return target
         camera, device = target.camera, self.views.device
         key = (index, camera.width)
-        moves = self.poses is not None and self.poses.corrections.requires_grad
-        if key not in self.points or moves:  # a pose that moves sees them elsewhere
+        if key not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
             mask = target.counts if target.empty is None else ~target.empty
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)

@@ -45,11 +45,10 @@ class Teachers:
 
         Raises:
             TypeError: one is not a model.
-            ValueError: one is of a scene of another scale, or the training learns poses or motions, which teachers do
-                not follow.
+            ValueError: one is of a scene of another scale, or the training learns poses, which teachers do not follow.
         """
-        if config.learns_poses:
-            raise ValueError("teachers: expected refine_poses=False and blur_poses=1, for poses that stay as given")
+        if config.refine_poses:
+            raise ValueError("teachers: expected refine_poses=False, for poses that stay as given")
         for number, model in enumerate(models):
             if not isinstance(model, Model):
                 raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")

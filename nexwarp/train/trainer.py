@@ -29,7 +29,6 @@ from nexwarp.train.finish.finish import FinishObserver, FinishSettings, finish_m
 from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
-from nexwarp.train.motion_blur import render_target
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
@@ -48,7 +47,7 @@ from nexwarp.train.state import (
     restore_random,
     scene_digest,
 )
-from nexwarp.train.step_losses import OwnLoss, check_own_losses, step_losses
+from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, TargetMaker, refined
 from nexwarp.train.teachers import make_teachers
 from nexwarp.train.views import TrainingViews, mean_color, with_cameras
@@ -71,7 +70,7 @@ class Trainer:
         densifier: density control.
         views: the training views on the device.
         exposures: of the training photos; None where they have one exposure.
-        poses: corrections and motions of the training poses; None where neither is learned.
+        poses: corrections of the training poses; None where they stay as given.
         teachers: other models of the scene that every other step learns from; None where there are none.
         background: colour behind everything, three numbers.
         iteration: steps done.
@@ -231,8 +230,10 @@ class Trainer:
         fused = self.optimizer if isinstance(self.optimizer, FusedAdam) else None
         try:
             target = refined(target, self.poses)
-            own, poses, blur, grid = self.own_losses, self.poses, self.config.blur_poses, fused is None
-            out, taken = render_target(self.model(), target, poses, blur, plain=bool(own))
+            own, poses, grid = self.own_losses, self.poses, fused is None
+            background, jitter = target.background, target.depth_jitter
+            out = self.model().render(target.camera, background=background, depth_jitter=jitter)
+            taken = as_taken(out, target, plain=bool(own))
             given = (taken, target, self.surfels, self.texture, self.config)
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)
             image, room, request = taken.image.detach(), out.intermediates.tiles.room, None
@@ -374,7 +375,7 @@ class Trainer:
         self.surfels = Surfels(known_part(tensors, "surfels.", PARAMETERS)).to(self.device)
         self.texture.load_state_dict(known_part(tensors, "texture.", self.texture.state_dict()))
         if self.poses is not None:
-            self.poses.load(tensors["poses.corrections"], tensors.get("poses.motions"))
+            self.poses.load(tensors["poses.corrections"])
         self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
         self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)

@@ -69,17 +69,6 @@ class TrainingViews:
         """Return the cameras on the device, with the poses as they are corrected; None corrects none."""
         return self.cameras if poses is None else poses.cameras(self.cameras)
 
-    @torch.no_grad()
-    def exposure_ends(self, poses: PoseCorrections | None) -> dict[str, tuple[Camera, Camera]]:
-        """Return the cameras at the start and the end of each exposure by the photo's name; none without motions."""
-        if poses is None or poses.motions is None:
-            return {}
-        middles = enumerate(zip(self.names, self.refined_cameras(poses), strict=True))
-        return {
-            name: (poses.moment(camera, index, -0.5), poses.moment(camera, index, 0.5))
-            for index, (name, camera) in middles
-        }
-
     def torch_threads(self, max_hits: int) -> int:
         """Return how many threads to give torch's own loops: on a CPU one for each 500,000 values of K hits' colours.
 

@@ -50,7 +50,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "exposures": ("", ""),
     "mask_mode": ("", ""),
     "refine_poses": ("", ""),
-    "blur_poses": ("", ""),
     "depth_jitter": ("", ""),
     "low_pass": ("", ""),
     "order": ("", ""),

@@ -64,7 +64,6 @@ def masked(scene: Scene) -> Scene:
         {"low_pass": True, "losses.depth": 0.0},
         {"coarse": 0.5},
         {"refine_poses": True},
-        {"blur_poses": 3},
         {"background": (0.1, 0.2, 0.3), "sh_every": 5_000},
     ],
     ids=str,
