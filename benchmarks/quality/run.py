@@ -164,7 +164,7 @@ def config_name(config: Config) -> str:
     if not config.skybox:
         del settings["skybox"]
     del settings["teachers"]  # `trained_with` compares them
-    settings["losses"] |= {"poses": POSE_PRIOR}
+    settings["losses"] |= {"poses": POSE_PRIOR, "distortion": 0.0}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": (0.5, 0.02)}
     settings["blur_poses"] = 1

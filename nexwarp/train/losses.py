@@ -38,13 +38,10 @@ class LossWeights:
     normals: float = 0.0
     """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
     Counts from 7/30 of the run on; smoother meshes."""
-    distortion: float = 0.0
-    """Factor of the depth distortion of 2DGS, relative to the depth: how far apart the hits of a pixel are. Counts from
-    a tenth of the run on."""
 
     def __post_init__(self) -> None:
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals", "distortion"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals"):
             check_range(name, getattr(self, name), 0.0)
 
 

@@ -12,7 +12,7 @@ from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import expose
 from nexwarp.train.config import Config
 from nexwarp.train.losses import depth_loss, training_losses
-from nexwarp.train.surface_losses import distortion_loss, normal_loss
+from nexwarp.train.surface_losses import normal_loss
 from nexwarp.train.target import Target
 
 OwnLoss = Callable[[Rendering, Target], torch.Tensor]
@@ -20,7 +20,7 @@ OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 SATURATION = 250 / 255
 # Factor of the squared pose corrections, which keeps poses near the given ones.
 POSE_PRIOR = 0.1
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "distortion", "poses")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "poses")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -105,11 +105,8 @@ def step_losses(
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
         losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
-    normals, distortion = target.surface
-    if normals > 0:
-        losses["normals"] = normals * normal_loss(out, target.counts)
-    if distortion > 0:
-        losses["distortion"] = distortion * distortion_loss(out, target.counts)
+    if target.normals > 0:
+        losses["normals"] = target.normals * normal_loss(out, target.counts)
     if poses is not None and target.view is not None:
         losses["poses"] = POSE_PRIOR * poses.prior(target.view)
     for name, loss in (own or {}).items():

@@ -1,4 +1,4 @@
-"""Losses of the surface itself, as 2DGS has them (Huang et al., 2024): normal consistency and depth distortion."""
+"""The loss of the surface itself, as 2DGS has it (Huang et al., 2024): normal consistency."""
 
 import torch
 
@@ -6,18 +6,14 @@ from nexwarp import ops
 from nexwarp.model.render import Rendering
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 
-# Iterations, of a run of 30,000, from which the losses count: those of 2DGS.
+# Iteration, of a run of 30,000, from which the loss counts: that of 2DGS.
 NORMALS_FROM = 7_000
-DISTORTION_FROM = 3_000
 
 
-def surface_factors(config: Config, iteration: int) -> tuple[float, float]:
-    """Return the factors of `normal_loss` and `distortion_loss` at an iteration: 0 before the losses start."""
-    done, factors = iteration / config.iterations, config.losses
-    return (
-        factors.normals if done >= NORMALS_FROM / REFERENCE_ITERATIONS else 0.0,
-        factors.distortion if done >= DISTORTION_FROM / REFERENCE_ITERATIONS else 0.0,
-    )
+def normals_factor(config: Config, iteration: int) -> float:
+    """Return the factor of `normal_loss` at an iteration: 0 before the loss starts."""
+    begun = iteration / config.iterations >= NORMALS_FROM / REFERENCE_ITERATIONS
+    return config.losses.normals if begun else 0.0
 
 
 def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
@@ -33,18 +29,6 @@ def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Ten
     normals = depth_normals(out.median_depth, stages.viewmat, stages.pinhole)
     errors = out.alpha * normals.detach().any(-1) - (out.blended_normals * normals).sum(-1)
     return (errors if counts is None else errors * counts).mean()
-
-
-def distortion_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
-    """Mean over pixels of the depth distortion over the expected depth, which gets no gradient.
-
-    Args:
-        out: a rendering.
-        counts: (H, W) bool, the pixels that count; None is all.
-    """
-    depths = out.expected_depth.detach()
-    relative = out.distortion / torch.where(depths > 0, depths, 1.0)
-    return (relative if counts is None else relative * counts).mean()
 
 
 def depth_normals(depths: torch.Tensor, viewmat: torch.Tensor, pinhole: ops.Pinhole) -> torch.Tensor:

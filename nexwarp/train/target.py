@@ -12,7 +12,7 @@ from nexwarp.model.background import Color
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import jitter_factors
 from nexwarp.train.config import Config
-from nexwarp.train.surface_losses import surface_factors
+from nexwarp.train.surface_losses import normals_factor
 from nexwarp.train.views import TrainingViews
 
 
@@ -31,7 +31,7 @@ class Target:
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth_jitter: as `nexwarp.model.render` takes it.
         view: (1,) int64, index of the training view; None where poses are not learned.
-        surface: factors of the normal and the distortion loss in this step.
+        normals: factor of the normal loss in this step.
     """
 
     camera: Camera
@@ -44,7 +44,7 @@ class Target:
     expected: torch.Tensor | None = None
     depth_jitter: float | torch.Tensor = 0.0
     view: torch.Tensor | None = None
-    surface: tuple[float, float] = (0.0, 0.0)
+    normals: float = 0.0
 
 
 def refined(target: Target, poses: PoseCorrections | None) -> Target:
@@ -95,7 +95,7 @@ class TargetMaker:
         config = self.config
         coarse = iteration <= config.coarse * config.iterations
         target = self.with_points(self.from_view(index, 2 if coarse else 1, upcoming), index)
-        target = dataclasses.replace(target, surface=surface_factors(config, iteration))
+        target = dataclasses.replace(target, normals=normals_factor(config, iteration))
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)

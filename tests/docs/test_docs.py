@@ -68,7 +68,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "losses.empty": ("", ""),
     "losses.depth": ("", ""),
     "losses.normals": ("", ""),
-    "losses.distortion": ("", ""),
     "rates.means": ("", "code"),
     "rates.quats": ("", "code"),
     "rates.scales": ("", "code"),

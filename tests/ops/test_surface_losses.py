@@ -12,7 +12,7 @@ from nexwarp.data import Scene as Capture
 from nexwarp.model.render import Rendering
 from nexwarp.train.config import Config
 from nexwarp.train.losses import LossWeights
-from nexwarp.train.surface_losses import depth_normals, distortion_loss, normal_loss, surface_factors
+from nexwarp.train.surface_losses import depth_normals, normal_loss, normals_factor
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import present
 from tests.scenes import layered_scene, make_camera, make_surfels, random_scene
@@ -94,58 +94,43 @@ def test_normal_loss_by_its_definition(device: torch.device) -> None:
     assert_close(normal_loss(out, counts), (errors * counts).mean(), kind="value", name="masked loss")
 
 
-def test_distortion_loss_does_not_depend_on_the_unit_of_length(device: torch.device) -> None:
-    found = []
-    for unit in (1.0, 7.0):
-        scene = layered_scene(dtype=torch.float64, device=device)
-        scene["opacities"] *= 0.6
-        scene |= {"means": unit * scene["means"], "scales": unit * scene["scales"], "near": unit * scene["near"]}
-        scene["viewmat"] = scene["viewmat"].clone()
-        scene["viewmat"][:3, 3] *= unit
-        found.append(distortion_loss(nw.render(make_surfels(scene), None, make_camera(scene))))
-    assert found[0] > 0.01
-    assert_close(found[1], found[0], kind="value", name="loss")
-
-
-@pytest.mark.parametrize("loss", [normal_loss, distortion_loss])
-def test_descent_makes_a_loss_smaller_and_masked_pixels_have_no_gradient(loss, device: torch.device) -> None:
+def test_descent_makes_a_loss_smaller_and_masked_pixels_have_no_gradient(device: torch.device) -> None:
     surfels, out = layers(device)
-    loss(out, torch.zeros_like(out.alpha, dtype=torch.bool)).backward(retain_graph=True)
+    normal_loss(out, torch.zeros_like(out.alpha, dtype=torch.bool)).backward(retain_graph=True)
     assert not present(surfels.means.grad).any()
-    value = loss(out)
+    value = normal_loss(out)
     value.backward()
     with torch.no_grad():
         for name, x in surfels.named_parameters():
             if x.grad is not None and not name.startswith("sh"):
                 x.add_(x.grad, alpha=-1e-3)
         moved = nw.render(surfels, None, make_camera(layered_scene(dtype=torch.float64, device=device)))
-    assert loss(moved) < value
+    assert normal_loss(moved) < value
 
 
 def test_nothing_of_a_rendering_without_hits(device: torch.device) -> None:
     scene = random_scene(0, dtype=torch.float64, device=device)
     surfels = make_surfels(scene)
     out = nw.render(surfels, None, make_camera(scene))
-    (normal_loss(out) + distortion_loss(out)).backward()
-    assert normal_loss(out) == 0 and distortion_loss(out) == 0
+    normal_loss(out).backward()
+    assert normal_loss(out) == 0
 
 
-def test_the_losses_start_as_those_of_2dgs() -> None:
-    config = Config(losses=LossWeights(normals=0.05, distortion=0.1))
-    found = [surface_factors(config, i) for i in (1, 2_999, 3_000, 6_999, 7_000, 30_000)]
-    assert found == [(0, 0), (0, 0), (0, 0.1), (0, 0.1), (0.05, 0.1), (0.05, 0.1)]
-    assert surface_factors(Config(), 30_000) == (0, 0)
+def test_the_loss_starts_as_that_of_2dgs() -> None:
+    config = Config(losses=LossWeights(normals=0.05))
+    assert [normals_factor(config, i) for i in (1, 6_999, 7_000, 30_000)] == [0, 0, 0.05, 0.05]
+    assert normals_factor(Config(), 30_000) == 0
     short = dataclasses.replace(config, iterations=100)
-    assert [surface_factors(short, i) for i in (9, 10, 23, 24)] == [(0, 0), (0, 0.1), (0, 0.1), (0.05, 0.1)]
+    assert [normals_factor(short, i) for i in (9, 23, 24)] == [0, 0, 0.05]
 
 
-def test_a_training_has_the_losses_once_they_start(tiny_scene: Capture) -> None:
+def test_a_training_has_the_loss_once_it_starts(tiny_scene: Capture) -> None:
     """Before, its steps are those of a training without them, to the last bit."""
     found = []
-    for factors in ({}, {"normals": 0.05, "distortion": 0.1}):
+    for factors in ({}, {"normals": 0.05}):
         trainer = Trainer(tiny_scene, small(losses=LossWeights(**factors)), "cpu")
         steps = [trainer.step() for _ in range(4)]
         found.append([{name: x.item() for name, x in step.losses.items()} for step in steps])
     assert found[1][0] == found[0][0]
     added = [with_them.keys() - without.keys() for without, with_them in zip(*found, strict=True)]
-    assert added == [set(), {"distortion"}, {"distortion", "normals"}, {"distortion", "normals"}]
+    assert added == [set(), set(), {"normals"}, {"normals"}]
