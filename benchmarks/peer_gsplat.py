@@ -184,11 +184,11 @@ def train(
     for step in range(iterations):
         order = order or torch.randperm(len(views)).tolist()
         index = order.pop()
-        camera, photo = views.get(index, 1, order[:-3:-1])
+        camera, photo = views.get(index, order[:-3:-1])
         degree = min(step // max(round(SH_EVERY * stretch), 1), settings.sh_degree)
         image, info = gaussians.render(camera, degree)
         control.before(step, info)
-        exposure = views.exposure(index, 1)
+        exposure = views.exposure(index)
         if exposure is not None:
             image = image * exposure
             image = torch.where((photo >= SATURATION) & (image > photo), photo, image)

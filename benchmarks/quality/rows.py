@@ -84,7 +84,7 @@ SUSPECTS = (
 # `nexwarp train demo`, and the paper's preset with a run as short: with the demo's rates, without our additions.
 DEMO_CONFIG = with_settings(preset("default"), DEMO_SETTINGS)
 _SHORT = {name: value for name, value in DEMO_SETTINGS.items() if name not in ("iterations", "max_surfels")}
-_AS_PAPER = {"depth_jitter": 0.0, "coarse": 0.0, "rates.mlp": (DEMO_CONFIG.rates.mlp[0],) * 2}
+_AS_PAPER = {"depth_jitter": 0.0, "rates.mlp": (DEMO_CONFIG.rates.mlp[0],) * 2}
 DEMOS = (Row("demo", settings=_SHORT), Row("demo of the paper", "paper", _SHORT | _AS_PAPER))
 ROWS = {
     row.name: row

@@ -124,7 +124,6 @@ def tiny(config: Config) -> Config:
         iterations=ITERATIONS,
         max_surfels=POINTS,
         sh_every=2 * step,  # SH degrees of the steps: 0 1 1 2 2 3 3 3
-        coarse=0.5,
         texture=dataclasses.replace(config.texture, table_size=2**10),
         densify=dataclasses.replace(config.densify, start=0, every=3, stop=ITERATIONS * step),
     )

@@ -105,8 +105,6 @@ class Config:
     0."""
     sh_every: int = 1000
     """Iterations, of a run of 30,000, after which the SH degree rises by one."""
-    coarse: float = 0.0
-    """Fraction of the run, at its start, that trains on photos of half the width and height."""
     background: tuple[float, float, float] | None = None
     """Background colour; None takes that of the scene, or the mean colour of the training photos."""
     footprints: bool = True
@@ -171,7 +169,6 @@ class Config:
         check_range("more_hits_from", self.more_hits_from, 0)
         check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
         check_range("seed", self.seed, 0, 2**32 - 1)
-        check_range("coarse", self.coarse, 0.0, 1.0)
         check_range("skybox", self.skybox, 0)
         check_range("sh_every", self.sh_every, 1)
         if self.smooth_sh != 0.0:

@@ -12,7 +12,6 @@ from nexwarp.train.losses import LossWeights
 DEMO_SETTINGS: dict[str, object] = {
     "iterations": 1200,
     "max_surfels": 3000,
-    "coarse": 0.4,
     "depth_jitter": 0.5,
     "texture.levels": 12,
     "texture.table_size": 2**15,
@@ -32,7 +31,7 @@ DEMO_SETTINGS: dict[str, object] = {
 PARTS = ("losses", "rates", "texture", "densify")
 
 # Settings that no version has any more, and the value with which they did nothing.
-REMOVED: dict[str, object] = {"blur_poses": 1, "losses.distortion": 0.0}
+REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "losses.distortion": 0.0}
 
 # What runs did before a setting existed, where the default does something else; "" has the settings without a part.
 BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0, "teachers": 0}, "densify": {"relocate": 0.0}}

@@ -1,6 +1,7 @@
 """What a training step compares its rendering with."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -82,7 +83,7 @@ class TargetMaker:
         self.scene, self.config, self.views = scene, config, views
         self.background, self.generator, self.noise = background, generator, noise
         self.background_tensor = torch.tensor(background, device=views.device)
-        self.points: dict[tuple[int, int], tuple[torch.Tensor, torch.Tensor]] = {}
+        self.points: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
 
     def make(self, index: int, iteration: int, upcoming: list[int]) -> Target:
         """Make the target of a step.
@@ -93,8 +94,7 @@ class TargetMaker:
             upcoming: indices of the views to come, the next one first.
         """
         config = self.config
-        coarse = iteration <= config.coarse * config.iterations
-        target = self.with_points(self.from_view(index, 2 if coarse else 1, upcoming), index)
+        target = self.with_points(self.from_view(index, upcoming), index)
         target = dataclasses.replace(target, normals=normals_factor(config, iteration))
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
@@ -104,25 +104,19 @@ class TargetMaker:
             target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
         return target
 
-    def from_view(self, index: int, factor: int, upcoming: list[int] | None = None) -> Target:
-        """Make the target of a whole view, reduced by a factor: photo, background and mask.
-
-        Args:
-            index: of the training view.
-            factor: blocks of this many pixels squared are averaged.
-            upcoming: indices of the views to come, the next one first.
-        """
-        camera, photo = self.views.get(index, factor, upcoming or [])
+    def from_view(self, index: int, upcoming: Sequence[int] = ()) -> Target:
+        """Make the target of a view: photo, background and mask; the arguments are those of `make`."""
+        camera, photo = self.views.get(index, upcoming)
         background: Color = self.background
         behind = self.background_tensor
         if self.scene.random_background:
             drawn = torch.rand(3, generator=self.generator)
             background = behind = drawn.to(self.views.device, non_blocking=True)
-            alpha = self.views.alpha(index, factor)
+            alpha = self.views.alpha(index)
             if alpha is not None:
                 photo = photo + (1 - alpha)[..., None] * (behind - self.background_tensor)
-        mask = self.views.mask(index, factor)
-        exposure = self.views.exposure(index, factor)
+        mask = self.views.mask(index)
+        exposure = self.views.exposure(index)
         if mask is None or self.config.mask_mode == "ignore":
             return Target(camera, photo, background, exposure, counts=mask)
         return Target(camera, torch.where(mask[..., None], photo, behind), background, exposure, empty=~mask)
@@ -133,16 +127,15 @@ class TargetMaker:
         if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None:
             return target
         camera, device = target.camera, self.views.device
-        key = (index, camera.width)
-        if key not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
+        if index not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
             mask = target.counts if target.empty is None else ~target.empty
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)
                 seen = moved.project(points.to(device))
             found = visible_points(*seen, camera.width, camera.height, mask)
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
-            self.points[key] = none if found is None else found
-        places, expected = self.points[key]
+            self.points[index] = none if found is None else found
+        places, expected = self.points[index]
         # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad too:
         # sums of other lengths are rounded differently.
         fill = self._most_points - len(places) if device.type == "cuda" else 0

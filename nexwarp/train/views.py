@@ -51,7 +51,6 @@ class TrainingViews:
         self.photos = [view.image for view in views]
         self.masks = [view.mask for view in views]
         self.alphas = [view.alpha for view in views]
-        self.reduced: dict[tuple[int, int], Camera] = {}
         self.pool: ThreadPoolExecutor | None = None
         self.coming: dict[int, Future[tuple[torch.Tensor, torch.cuda.Event]]] = {}
         if device.type == "cuda":
@@ -87,38 +86,31 @@ class TrainingViews:
             digest.update(f"{name} {values}\n".encode())
         return digest.hexdigest()
 
-    def get(self, index: int, factor: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
-        """Return camera and photo (H, W, 3) float, reduced by a factor; incomplete blocks of pixels are cropped.
+    def get(self, index: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
+        """Return camera and photo (H, W, 3) float in [0, 1] of a view.
 
         `ahead` are the indices of the next views, in order; up to two of them are copied in the background.
         """
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
-        return self._camera(index, factor), self._reduce(photo.float() / 255.0, index, factor)
+        return self.cameras[index], photo.float() / 255.0
 
-    def exposure(self, index: int, factor: int) -> torch.Tensor | None:
-        """Return gains times falloff of the reduced photo, (3,) or (H, W, 3); None where photos have one exposure."""
+    def exposure(self, index: int) -> torch.Tensor | None:
+        """Return gains times falloff of a photo, (3,) or (H, W, 3); None where photos have one exposure."""
         if self.gains is None:
             return None
-        falloff = None if self.lens is None else self.lens.falloff_of(self._camera(index, factor))
+        falloff = None if self.lens is None else self.lens.falloff_of(self.cameras[index])
         return self.gains[index] if falloff is None else self.gains[index] * falloff
 
-    def mask(self, index: int, factor: int) -> torch.Tensor | None:
-        """Return the mask (H, W) bool of the reduced photo, or None; a block counts where all its pixels count."""
+    def mask(self, index: int) -> torch.Tensor | None:
+        """Return the mask (H, W) bool of a photo, or None."""
         mask = self.masks[index]
-        if mask is None:
-            return None
-        share = self._reduce(mask.to(self.device, non_blocking=True).float()[:, :, None], index, factor)
-        return share[:, :, 0] == 1.0
+        return None if mask is None else mask.to(self.device, non_blocking=True)
 
-    def alpha(self, index: int, factor: int) -> torch.Tensor | None:
-        """Return alpha (H, W) float in [0, 1] of the reduced photo; None if it is opaque."""
+    def alpha(self, index: int) -> torch.Tensor | None:
+        """Return alpha (H, W) float in [0, 1] of a photo; None if it is opaque."""
         alpha = self.alphas[index]
-        if alpha is None:
-            return None
-        return self._reduce(alpha.to(self.device, non_blocking=True).float()[:, :, None] / 255.0, index, factor)[
-            :, :, 0
-        ]
+        return None if alpha is None else alpha.to(self.device, non_blocking=True).float() / 255.0
 
     def _on_device(self, index: int) -> torch.Tensor:
         coming = self.coming.pop(index, None)
@@ -145,25 +137,6 @@ class TrainingViews:
             copied = torch.cuda.Event()
             copied.record()
         return photo, copied
-
-    def _camera(self, index: int, factor: int) -> Camera:
-        camera = self.cameras[index]
-        if factor == 1 or min(camera.width, camera.height) < factor:
-            return camera
-        if (index, factor) not in self.reduced:
-            K = camera.K.clone()
-            K[:2] /= factor
-            size = (camera.width // factor, camera.height // factor)
-            self.reduced[index, factor] = Camera(camera.viewmat, K, *size, near=camera.near)
-        return self.reduced[index, factor]
-
-    def _reduce(self, pixels: torch.Tensor, index: int, factor: int) -> torch.Tensor:
-        """Average blocks of pixels (H, W, C) as `_camera` reduces the camera."""
-        camera = self.cameras[index]
-        if factor == 1 or min(camera.width, camera.height) < factor:
-            return pixels
-        small = torch.nn.functional.avg_pool2d(pixels.permute(2, 0, 1), factor)
-        return small.permute(1, 2, 0).contiguous()
 
 
 def with_cameras(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]:

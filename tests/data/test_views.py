@@ -27,39 +27,25 @@ def make_views(count: int, width: int = 19, height: int = 13) -> list[View]:
     return views
 
 
-def blocks(values: np.ndarray, factor: int) -> np.ndarray:
-    """(h, factor, w, factor, ...) of what fills whole blocks."""
-    height, width = values.shape[0] // factor, values.shape[1] // factor
-    cut = values[: height * factor, : width * factor]
-    return cut.reshape(height, factor, width, factor, *values.shape[2:])
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3, 14])
-def test_photo_mask_and_alpha_are_reduced_alike(factor):
+def test_photo_mask_and_alpha_are_those_of_the_view() -> None:
     views = make_views(3)
     mine = training_views.TrainingViews(views, torch.device("cpu"))
-    used = factor if factor <= 13 else 1  # smaller photos than a block stay as they are
     for index, view in enumerate(views):
-        camera, photo = mine.get(index, factor)
-        expected = blocks(view.image.numpy() / 255.0, used).mean(axis=(1, 3))
-        np.testing.assert_allclose(photo.numpy(), expected, atol=1e-6)
-        assert photo.shape == (camera.height, camera.width, 3) == (13 // used, 19 // used, 3)
-        torch.testing.assert_close(camera.K[:2], K[:2] / used)
-        mask, alpha = mine.mask(index, factor), mine.alpha(index, factor)
+        camera, photo = mine.get(index)
+        mask, alpha = mine.mask(index), mine.alpha(index)
+        assert torch.equal(photo, view.image / 255.0) and torch.equal(camera.K, view.camera.K)
         if view.mask is None:
             assert mask is None and alpha is None
             continue
         assert mask is not None and alpha is not None and view.alpha is not None
-        assert np.array_equal(mask.numpy(), blocks(view.mask.numpy(), used).all(axis=(1, 3)))
-        expected = blocks(view.alpha.numpy() / 255.0, used).mean(axis=(1, 3))
-        np.testing.assert_allclose(alpha.numpy(), expected, atol=1e-6)
+        assert torch.equal(mask, view.mask) and torch.equal(alpha, view.alpha / 255.0)
 
 
 def test_what_comes_next_changes_nothing_on_a_cpu():
     views = make_views(4)
     mine = training_views.TrainingViews(views, torch.device("cpu"))
     for index, ahead in ((2, [1, 0]), (1, []), (3, [3, 3]), (0, [1, 2, 3])):
-        _, photo = mine.get(index, 1, ahead)
+        _, photo = mine.get(index, ahead)
         assert torch.equal(photo, views[index].image.float() / 255.0)
 
 
@@ -75,7 +61,7 @@ def test_photos_fetched_ahead_are_the_photos(monkeypatch: Any):
     seen = []
     for step, index in enumerate(order):
         ahead = order[step + 1 : step + 4] if step % 5 else [(index + 5) % 12]
-        _, photo = mine.get(index, 1, ahead)
+        _, photo = mine.get(index, ahead)
         load = load @ load / load.norm()
         seen.append((index, (photo * 255.0).round().byte()))
         assert len(mine.coming) <= 2

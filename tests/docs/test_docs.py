@@ -43,7 +43,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "more_hits_from": ("", ""),
     "sh_degree": ("S = (d + 1)^2", "5"),
     "sh_every": ("", "code"),
-    "coarse": ("", ""),
     "background": ("", "code"),
     "footprints": ("", ""),
     "smooth_sh": ("", ""),

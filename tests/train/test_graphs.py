@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from nexwarp import ops
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
 from nexwarp.train import graphs as step_graphs
@@ -55,6 +56,13 @@ def masked(scene: Scene) -> Scene:
     return dataclasses.replace(scene, train=[view(v) for v in scene.train])
 
 
+def half(view: View) -> View:
+    """A view of the left half of the photo."""
+    camera, width = view.camera, view.camera.width // 2
+    small = Camera(camera.viewmat, camera.K, width, camera.height, near=camera.near)
+    return dataclasses.replace(view, camera=small, image=view.image[:, :width].contiguous())
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -62,7 +70,6 @@ def masked(scene: Scene) -> Scene:
         {"max_hits": 0},
         {"max_hits": 4, "depth_jitter": 0.0},
         {"low_pass": True, "losses.depth": 0.0},
-        {"coarse": 0.5},
         {"refine_poses": True},
         {"background": (0.1, 0.2, 0.3), "sh_every": 5_000},
     ],
@@ -143,25 +150,15 @@ def test_resuming_changes_nothing(tiny_scene: Scene, tmp_path: Any) -> None:
     assert_same_state(second, straight)
 
 
-def test_sizes_beyond_the_first_few_are_launched(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
+@pytest.mark.parametrize("forgotten", [10**6, 0], ids=["launched", "make room"])
+def test_sizes_beyond_the_first_few(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, forgotten: int) -> None:
+    halves = [half(view) if index % 2 else view for index, view in enumerate(tiny_scene.train)]
+    scene = dataclasses.replace(tiny_scene, train=halves)
+    launched = trained(scene, cuda_graphs=False)
     monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
-    monkeypatch.setattr(step_graphs, "FORGOTTEN", 10**6)
-    replayed = trained(tiny_scene, coarse=0.5)
-    assert replayed.graphs is not None
-    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
-    assert widths == {tiny_scene.train[0].camera.width // 2}
-    assert_same_state(replayed, launched)
-
-
-def test_sizes_of_long_ago_make_room(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    launched = trained(tiny_scene, cuda_graphs=False, coarse=0.5)
-    monkeypatch.setattr(step_graphs, "MOST_KINDS", 1)
-    monkeypatch.setattr(step_graphs, "FORGOTTEN", 20)
-    replayed = trained(tiny_scene, coarse=0.5)
-    assert replayed.graphs is not None
-    widths = {stage.target.camera.width for stage in replayed.graphs.stages.values()}
-    assert widths == {tiny_scene.train[0].camera.width}
+    monkeypatch.setattr(step_graphs, "FORGOTTEN", forgotten)
+    replayed = trained(scene)
+    assert replayed.graphs is not None and len(replayed.graphs.stages) == 1
     assert_same_state(replayed, launched)
 
 

@@ -19,7 +19,6 @@ def test_paper_is_the_paper():
     assert p.more_hits_from == 0
     assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
     assert (p.filter_points, p.orient_points) == (False, False)
-    assert p.coarse == 0.0
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
     assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
     assert not p.exposures

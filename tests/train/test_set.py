@@ -29,7 +29,7 @@ def scene(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def run(scene, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
-    extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "coarse=0"]
+    extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "skybox=90"]
     assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, *extra]) == 0
     return run
 
@@ -81,7 +81,7 @@ def test_types():
         ("texture.residual=1", "texture.residual: expected true or false, got 1"),
         ("texture.residual=False", 'texture.residual: expected true or false, got "False"'),
         ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
-        ("coarse=1e999", "coarse: expected a number, got Infinity"),
+        ("smooth_sh=1e999", "smooth_sh: expected a number, got Infinity"),
         (f"iterations=1{'0' * 4000}", "iterations: expected an integer, got 1000"),
         ("mask_mode=3", "mask_mode: expected text, got 3"),
         ("mask_mode=both", "mask_mode: expected one of ignore, background, got 'both'"),
@@ -94,8 +94,9 @@ def test_types():
         ("densify.every=0", "densify.every: expected at least 1, got 0"),
         ("losses.dssim=2", "losses.dssim: expected at least 0 and at most 1, got 2"),
         ("sh_every=0", "sh_every: expected at least 1, got 0"),
-        ("coarse", "expected KEY=VALUE, got 'coarse'"),
-        ("coarse=", "expected KEY=VALUE, got 'coarse='"),
+        ("skybox", "expected KEY=VALUE, got 'skybox'"),
+        ("skybox=", "expected KEY=VALUE, got 'skybox='"),
+        ("coarse=0.4", "coarse: expected a setting, got one that was removed"),
         ("=1", "expected KEY=VALUE, got '=1'"),
     ],
 )
@@ -106,8 +107,8 @@ def test_refused(text, message):
 
 
 def test_a_setting_is_given_once():
-    with pytest.raises(ValueError, match=r"^coarse: expected it once, got it twice$"):
-        parse_settings(["coarse=0", "coarse=0.1"])
+    with pytest.raises(ValueError, match=r"^skybox: expected it once, got it twice$"):
+        parse_settings(["skybox=90", "skybox=1"])
 
 
 def test_rates_of_zero_are_allowed():
@@ -121,7 +122,7 @@ def test_rates_of_zero_are_allowed():
 def test_a_run_keeps_what_was_set(run):
     stored = json.loads((run / "config.json").read_text())["config"]
     config = config_from_dict(stored)
-    changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "coarse": 0}
+    changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "skybox": 90}
     changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
     assert config == with_settings(preset("default"), changes)
     texture = nw.load(run).texture
@@ -145,7 +146,7 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
     ("flags", "words"),
     [
         (["--set", "nope=1"], ["--set: nope: expected a setting"]),
-        (["--set", "coarse"], ["--set: expected KEY=VALUE, got 'coarse'"]),
+        (["--set", "skybox"], ["--set: expected KEY=VALUE, got 'skybox'"]),
         (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
         (["--set", "texture.table_size=1000"], ["table_size", "power of two"]),
         (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),

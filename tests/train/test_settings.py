@@ -69,7 +69,6 @@ def test_unknown_settings_are_refused(name: str) -> None:
     ("settings", "message"),
     [
         ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
-        ({"coarse": 1.5}, "coarse: expected at least 0 and at most 1, got 1.5"),
         ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
         ({"texture.levels": 0}, "texture.levels: expected at least 1 and at most 64, got 0"),
         ({"texture.features": -1}, "texture.features: expected 1, 2, 4 or 8, got -1"),
@@ -117,7 +116,7 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
     random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
     trainer = make_trainer(random)
-    seen = [trainer.targets.from_view(0, 1) for _ in range(3)]
+    seen = [trainer.targets.from_view(0) for _ in range(3)]
     colors = [torch.as_tensor(view.background) for view in seen]
     assert len({tuple(color.tolist()) for color in colors}) == 3
     photo = views[0].image.float() / 255
@@ -179,7 +178,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
         trainer = make_trainer(halves, iterations=60, mask_mode=mode)
         trainer.run()
         with torch.no_grad():
-            view = trainer.targets.from_view(0, 1)
+            view = trainer.targets.from_view(0)
             outs = trainer.model().render([v.camera for v in scene.train])
         alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
         if mode == "background":

@@ -88,17 +88,6 @@ def test_a_picture_is_at_the_mean_exposure_on_the_steps_background(tiny_scene: S
     assert not torch.equal(behind[0], behind[1])
 
 
-def test_a_picture_is_as_small_as_the_photo(tiny_scene: Scene, teachers: list[Model]) -> None:
-    student = Trainer(tiny_scene, dataclasses.replace(CONFIG, coarse=0.5), CPU, teachers=teachers)
-    whole = tiny_scene.train[0].camera
-    for number in range(1, 11):
-        target = student._next_target()
-        factor = 2 if number <= 6 else 1
-        assert (target.camera.width, target.camera.height) == (whole.width // factor, whole.height // factor)
-        assert target.photo.shape == (target.camera.height, target.camera.width, 3)
-        assert target.camera.K[0, 0] == pytest.approx(float(whole.K[0, 0]) / factor)
-
-
 def test_photos_and_cameras_near_each_have_their_turn_once_in_a_round(tiny_scene: Scene, teachers: list[Model]) -> None:
     """Two numbers of a round, one for a photo and one for a teacher, for each view."""
     views = len(tiny_scene.train)
