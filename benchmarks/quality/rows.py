@@ -78,7 +78,6 @@ CHANGES = (
 SUSPECTS = (
     Row("paper, K = 0", "paper", {"max_hits": 0}),
     *(Row(f"paper, T = 2^{power}", "paper", {"texture.table_size": 2**power}) for power in (16, 18)),
-    Row("paper, low-pass", "paper", {"low_pass": True}),
     Row("paper, residual texture", "paper", {"texture.residual": True}),
 )
 # `nexwarp train demo`, and the paper's preset with a run as short: with the demo's rates, without our additions.

@@ -167,7 +167,7 @@ def config_name(config: Config) -> str:
     settings["losses"] |= {"poses": POSE_PRIOR, "distortion": 0.0}
     settings["densify"] |= {"floaters": False}
     settings["rates"] |= {"poses": POSE_RATES, "motions": (0.5, 0.02)}
-    settings |= {"blur_poses": 1, "coarse": 0.0}
+    settings |= {"blur_poses": 1, "coarse": 0.0, "low_pass": False}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -57,16 +57,15 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         degrees=range(config.sh_degree + 1),
         features=(config.texture.features,) * textured,
         clamps=(False,) * textured,
-        low_passes=(config.low_pass,),
+        low_passes=(False,),
         ssim_lengths=(SIMD_WIDTH,) * cpu,
         cpu=cpu,
         fixed_point=config.deterministic,
     )
-    low_passes = (config.low_pass,)
     hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
     if config.footprints:
         hits.add(max(config.max_hits, 1))  # detail limits render with K >= 1
-    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=low_passes, cpu=cpu, fixed_point=fixed)
+    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=(False,), cpu=cpu, fixed_point=fixed)
     builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
     if not cpu:
         builds += (Build(*build) for build in ssim_tile_builds())

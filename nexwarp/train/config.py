@@ -128,8 +128,6 @@ class Config:
     depth_jitter: float = 1.0
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
-    low_pass: bool = False
-    """Screen-space low-pass for surfels smaller than a pixel."""
     order: str = "depth"
     """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
     `distance` by their distance from the camera, for scenes that are shown as panoramas."""

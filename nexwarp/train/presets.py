@@ -31,7 +31,7 @@ DEMO_SETTINGS: dict[str, object] = {
 PARTS = ("losses", "rates", "texture", "densify")
 
 # Settings that no version has any more, and the value with which they did nothing.
-REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "losses.distortion": 0.0}
+REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "low_pass": False, "losses.distortion": 0.0}
 
 # What runs did before a setting existed, where the default does something else; "" has the settings without a part.
 BEFORE: dict[str, dict[str, object]] = {"": {"skybox": 0, "teachers": 0}, "densify": {"relocate": 0.0}}

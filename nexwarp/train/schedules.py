@@ -145,7 +145,6 @@ def options_at(
         max_hits=config.hits_at(iteration),
         background=background,
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
-        low_pass=config.low_pass,
         order=cast(Order, config.order),
     )
 

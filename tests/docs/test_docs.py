@@ -50,7 +50,6 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "mask_mode": ("", ""),
     "refine_poses": ("", ""),
     "depth_jitter": ("", ""),
-    "low_pass": ("", ""),
     "order": ("", ""),
     "filter_points": ("", ""),
     "orient_points": ("", ""),

@@ -108,7 +108,7 @@ SETTINGS = {
     "K = 3": Config(max_hits=3),
     "poses": Config(refine_poses=True),
     "deterministic": Config(deterministic=True),
-    "options": Config(low_pass=True, sh_degree=1, texture=TextureConfig(residual=False)),
+    "options": Config(sh_degree=1, texture=TextureConfig(residual=False)),
 }
 
 
@@ -183,7 +183,7 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_rehearsal_changes_only_what_is_not_compiled_in() -> None:
     for config in SETTINGS.values():
         tiny = warmup.tiny(config)
-        kept = ("preset", "max_hits", "sh_degree", "low_pass", "losses", "background")
+        kept = ("preset", "max_hits", "sh_degree", "losses", "background")
         assert all(getattr(tiny, name) == getattr(config, name) for name in kept)
         assert replace(tiny.texture, table_size=config.texture.table_size) == config.texture
 

@@ -69,7 +69,7 @@ def half(view: View) -> View:
         {},
         {"max_hits": 0},
         {"max_hits": 4, "depth_jitter": 0.0},
-        {"low_pass": True, "losses.depth": 0.0},
+        {"losses.depth": 0.0},
         {"refine_poses": True},
         {"background": (0.1, 0.2, 0.3), "sh_every": 5_000},
     ],

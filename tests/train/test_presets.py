@@ -17,7 +17,7 @@ def test_paper_is_the_paper():
     p = preset("paper")
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert p.more_hits_from == 0
-    assert (p.max_surfels, p.background, p.low_pass) == (400_000, (0.0, 0.0, 0.0), False)
+    assert (p.max_surfels, p.background) == (400_000, (0.0, 0.0, 0.0))
     assert (p.filter_points, p.orient_points) == (False, False)
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
     assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
