@@ -6,13 +6,13 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.panoramas import places, turned
 from nexwarp.model import render_rays as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.ops.rays import RayTiles
 from nexwarp.run.metrics import psnr
 from tests import scenes
+from tests.panorama_support import places, turned
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
 
 BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")

@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.inputs import write_blender, write_points
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
@@ -20,6 +19,7 @@ from nexwarp.train.presets import config_from_dict
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
 from tests.data.test_scene import make_scene
+from tests.scene_writers import write_blender, write_points
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.splats import draw, untextured
 from nexwarp.cameras.camera import resized
 from nexwarp.cameras.paths import look_at
 from nexwarp.data import write_demo
@@ -18,6 +17,7 @@ from nexwarp.run.metrics import psnr
 from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
+from tests.gsplat_support import draw, untextured
 from tests.reference import ewa
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_surfels, random_scene

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.mesh import read_mesh, sample
 from nexwarp.cameras.paths import look_at
 from nexwarp.cli import main as cli
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
 from nexwarp.ops.tsdf import DistanceField
 from tests import scenes
+from tests.mesh_support import read_mesh, sample
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.exposures import compare
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View, write_demo
 from nexwarp.io.pictures import to_uint8
@@ -483,19 +482,3 @@ def test_no_exposures_where_none_are_wanted(tmp_path, change):
     plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
     assert Trainer(known, plain, "cpu").finish().exposures is None
     assert Trainer(scene, plain, "cpu").finish().exposures is not None
-
-
-def test_the_benchmark_tells_spread_and_errors():
-    """Gains that follow the camera's position are predicted; the test views' own are those that were put in."""
-    course = 0.2 * torch.sin(torch.linspace(0, 3, 16))[:, None].expand(16, 3)
-    cameras, photos, points = photographs(course)
-    views = [View(c, p, None, f"{i}", None, x) for i, (c, p, x) in enumerate(zip(cameras, photos, points, strict=True))]
-    train = [view for i, view in enumerate(views) if i % 4 != 2]
-    test = views[2::4]
-    found = compare(train, test)
-    kept = torch.stack([course[i] for i in range(16) if i % 4 != 2])
-    torch.testing.assert_close(torch.as_tensor(found["spread"]).float(), kept.std(0), atol=0.01, rtol=0)
-    expected = (course[2::4] - kept.mean(0)).square().mean().sqrt().item()
-    assert found["ignored"] == pytest.approx(expected, abs=0.01)
-    assert found["predicted"] < 0.2 * found["ignored"]
-    assert found["edge"] == pytest.approx(1.0, abs=0.03)

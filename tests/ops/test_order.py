@@ -8,19 +8,16 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.panoramas import crop, sampled, turned
-from nexwarp.data import demo_folder
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.web.scene_data import SceneData
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import frames
 from nexwarp.ops.tiles import Order
-from nexwarp.run.metrics import psnr
 from nexwarp.run.optics import Optics
 from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
-from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.settings import with_settings
 from tests import scenes
+from tests.panorama_support import turned
 from tests.render_support import (
     BACKGROUND,
     BUFFERS,
@@ -134,20 +131,3 @@ def test_the_command_renders_by_the_order_asked_for(tmp_path):
         RenderOrder(None, views="test", order="distance", optics=Optics(kind="panorama"))
     with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
         with_settings(nw.Config(), {"order": "near"})
-
-
-@pytest.mark.slow
-def test_crops_of_a_panorama_of_the_trained_demo_are_pinhole_views():
-    """To 40 dB, at the panorama's pixel size and by distance; by z-depth they differ. Photos tell no order apart."""
-    scene = nw.load_scene(demo_folder())
-    config = with_settings(preset("default"), DEMO_SETTINGS)
-    model = nw.train(scene, config, device="cpu")
-    given, turn, width = scene.test[1].camera, (0.35, 0.1), 8192
-    with torch.no_grad():
-        camera = crop(given, turn, width)
-        found = sampled(model, given.viewmat, camera, width)
-        levels = {o: psnr(found, model.render(camera, order=o, exposure="mean").image) for o in ORDERS}
-        assert levels["distance"] > 40 > levels["depth"]
-        photos = [(v.camera, v.image / 255) for v in scene.test]
-        means = [sum([psnr(model.render(c, order=o).image, x) for c, x in photos]) / len(photos) for o in ORDERS]
-    assert abs(means[0] - means[1]) < 0.1

@@ -1,4 +1,4 @@
-"""Every reader stands damaged files: a bounded run of `benchmarks.fuzz`, and what its harness must notice."""
+"""Every reader stands damaged files: a bounded run of `tests.robustness.fuzz`, and what its harness must notice."""
 
 import json
 import os
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.fuzz import Failure, fuzz
-from benchmarks.fuzz_inputs import Files
-from benchmarks.fuzz_targets import TARGETS, FuzzTarget
+from tests.robustness.fuzz import Failure, fuzz
+from tests.robustness.fuzz_inputs import Files
+from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
 
 DRAWN = ("nerfstudio", "config", "colmap_binary")
 DRIVERS = {"mutate": (60, tuple(TARGETS)), "hypothesis": (40, DRAWN)}
@@ -23,8 +23,8 @@ PROGRAM = """
 import json, sys
 from pathlib import Path
 from typing import Any
-from benchmarks.fuzz import fuzz
-from benchmarks.fuzz_targets import TARGETS
+from tests.robustness.fuzz import fuzz
+from tests.robustness.fuzz_targets import TARGETS
 results = {}
 for driver, (inputs, names) in json.loads(sys.argv[2]).items():
     for name in names:
@@ -75,7 +75,17 @@ def test_the_valid_files_load(tmp_path: Path, name: str) -> None:
 def test_a_long_run_of_every_reader_finds_nothing(tmp_path: Path) -> None:
     """As long as NEXWARP_FUZZ_SECONDS says, 600 s without it; what failed is kept in the test's folder."""
     seconds, seed = os.environ.get("NEXWARP_FUZZ_SECONDS", "600"), os.environ.get("NEXWARP_FUZZ_SEED", "0")
-    command = [sys.executable, "-m", "benchmarks.fuzz", "--seconds", seconds, "--seed", seed, "--failed", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.robustness.fuzz",
+        "--seconds",
+        seconds,
+        "--seed",
+        seed,
+        "--failed",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 failures," in done.stdout.splitlines()[-1]
@@ -116,7 +126,7 @@ def _one(folder: Path) -> list[Files]:
 )
 def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, kind: str) -> None:
     if kind == "hang":
-        monkeypatch.setattr("benchmarks.fuzz.HANG", 1.0)
+        monkeypatch.setattr("tests.robustness.fuzz.HANG", 1.0)
     result = fuzz(
         FuzzTarget("one", _one, read, ("a",)), seconds=60.0, inputs=1, seed=3, driver="mutate", failed=tmp_path
     )
@@ -129,7 +139,7 @@ def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_same_seed_gives_the_same_inputs() -> None:
     import random
 
-    from benchmarks.fuzz_inputs import damage
+    from tests.robustness.fuzz_inputs import damage
 
     files = {"a.json": b'{"a": [1, 2, {"b": null}]}', "b.bin": bytes(range(100)), "c.txt": b"1 2 3\n4 5 6\n"}
     made = [[damage(random.Random(f"0/{i}"), files, (".json", ".bin", ".txt")) for i in range(50)] for _ in range(2)]

@@ -1,6 +1,6 @@
 """SIGKILL at random moments and in each stage of the finishing; what is resumed ends as if nothing had happened.
 
-`python -m benchmarks.kills` does the same to the demo, as often as one likes.
+`python -m tests.robustness.kills` does the same to the demo, as often as one likes.
 """
 
 import math
@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import Kills, kill_and_resume
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
 from nexwarp.model.model import Model
@@ -28,6 +27,7 @@ from nexwarp.train.finish import auto_exposure
 from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
+from tests.robustness.kills import Kills, kill_and_resume
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]

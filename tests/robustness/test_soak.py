@@ -1,4 +1,4 @@
-"""Memory stays as it is over frames and steps; `python -m benchmarks.soak` goes on for longer."""
+"""Memory stays as it is over frames and steps; `python -m tests.robustness.soak` goes on for longer."""
 
 import mmap
 import threading
@@ -6,8 +6,9 @@ import threading
 import pytest
 import torch
 
-from benchmarks import soak
-from benchmarks.soak import (
+from nexwarp.train.trainer import Trainer
+from tests.robustness import soak
+from tests.robustness.soak import (
     EVERYONES,
     MemorySample,
     Soak,
@@ -19,7 +20,6 @@ from benchmarks.soak import (
     phase,
     spans,
 )
-from nexwarp.train.trainer import Trainer
 from tests.trainer_support import small
 
 MIB = 2**20

@@ -12,7 +12,6 @@ import pytest
 import safetensors.torch
 import torch
 
-from benchmarks import scaling
 from nexwarp.cli import device
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
@@ -161,30 +160,6 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
-    # Other rules, which a benchmark compares with it.
-    for rule, factor, betas in (
-        ("linear", 4, (0.9**4, 0.999**4)),
-        ("none", 1, (0.9, 0.999)),
-        ("rates", 2, (0.9, 0.999)),
-    ):
-        other = Trainer(scene, short_config(), CPU).optimizer
-        scale_for_batch(other, 4)
-        scaling.change_rule(other, 4, rule)
-        for before, after in zip(one.optimizer.param_groups, other.param_groups, strict=True):
-            assert after["ends"] == pytest.approx(tuple(factor * rate for rate in before["ends"]))
-            assert after["betas"] == pytest.approx(betas)
-
-
-def test_the_simulation_counts_what_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
-    texture = NeuralTexture(levels=8, table_size=2**10, features=4, residual=True)
-    surfels = make_surfels(random_scene(24))
-    numbers = sum(x.numel() for x in (*surfels.parameters(), *texture.mlp.parameters())) + len(surfels)  # error sums
-    assert scaling.gradient_bytes(24, 2**10) == (4 * texture.grid.numel(), 4 * numbers)
-    assert scaling.main(["--simulate", "--step-ms", "10", "--surfels", "400000"]) == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
-    counts, efficiencies = [int(row[0]) for row in rows], [float(row[5]) for row in rows]
-    assert counts == [1, 2, 4, 8, 16, 32, 64] and efficiencies[0] == 1.0
-    assert efficiencies == sorted(efficiencies, reverse=True) and efficiencies[3] > 2 * efficiencies[4]
 
 
 # Bad input

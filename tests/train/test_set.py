@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.inputs import write_blender
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
 from nexwarp.train.config import Config, LearningRates
 from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
+from tests.scene_writers import write_blender
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
 FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]

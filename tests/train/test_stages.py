@@ -12,18 +12,12 @@ import torch
 from rich.console import Console
 
 import nexwarp as nw
-from benchmarks.quality.jobs import PHOTOS, THINNED, TrainingJob, config_of, group_jobs, training_photos
-from benchmarks.quality.rows import DEFAULT, PAPER, Row
-from benchmarks.quality.run import config_name, run_job, trained_with
-from benchmarks.quality.scenes import scene_of
-from benchmarks.timing import ROOT
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.cli.staged_session import StagedSession
 from nexwarp.data import write_demo
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
-from nexwarp.run.evaluate import METRICS
 from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
 from nexwarp.train import exposure_calibration
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
@@ -551,61 +545,3 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4, 240))
     session.train(Shown())  # type: ignore[arg-type]
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
-
-
-def test_the_benchmark_trains_teachers_first(
-    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
-    row = Row("two", settings={"teachers": 2})
-    job = TrainingJob(tiny_folder.name, "", "two", 60, 3, 20)
-    result = run_job(job, tiny_folder.parent, row, models=tmp_path)
-    assert result["teachers"] == {"count": 2, "surfels": 120, "max_surfels": 240}  # half of the budget
-    assert result["iterations"] == 20
-    config = config_of(job, row)
-    assert trained_with(result, config) and not trained_with(result, dataclasses.replace(config, teachers=0))
-    for older in ({"count": 2}, {"count": 2, "surfels": 60}, {"count": 2, "max_surfels": 60}):
-        assert not trained_with(result | {"teachers": older}, config), "as large as the student"
-    unknown = dataclasses.replace(config, teachers=None, iterations=30_000, max_surfels=10_000)  # number of photos
-    found = [{}, {"teachers": {"count": 2, "max_surfels": 40_000}}, {"teachers": {"count": 2}}]
-    assert [trained_with(each | {"config": config_name(unknown)}, unknown) for each in found] == [True, True, False]
-    large = dataclasses.replace(config, max_surfels=60_000)
-    for today in ({"count": 2}, {"count": 2, "surfels": 60_000}, {"count": 2, "surfels": 9, "max_surfels": 60_000}):
-        assert trained_with({"teachers": today, "config": config_name(large)}, large), "as large as the student"
-    assert result["config"] == config_name(dataclasses.replace(config, teachers=0, seed=9))
-    (file,) = tmp_path.iterdir()
-    expected = nw.train(scene_of(job, tiny_folder.parent), config, device=CPU)
-    assert same(nw.load(file), nw.load(expected.save(tmp_path / "expected")))
-    alone = group_jobs(
-        [job, dataclasses.replace(job, row="also")], {"two": row, "also": dataclasses.replace(row, name="also")}
-    )
-    assert [group.iterations for group in alone] == [0, 0], "stages share no first iterations"
-
-
-@pytest.mark.parametrize("variant", ["", "inner", "inner4", "arc", *THINNED])
-def test_the_benchmark_counts_training_photos(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
-    monkeypatch.setitem(PHOTOS, tiny_folder.name, 10)
-    job = TrainingJob(tiny_folder.name, variant, "default", 60, 0, 20)
-    assert training_photos(job) == len(scene_of(job, tiny_folder.parent).train)
-    assert training_photos(dataclasses.replace(job, scene="another")) is None
-
-
-@pytest.mark.parametrize("scene", PHOTOS)
-def test_the_benchmark_knows_the_number_of_photos(scene: str) -> None:
-    photos = ROOT.parent / "shared" / "data" / scene / "images"
-    if not photos.is_dir():
-        pytest.skip("needs the photos of ../shared/data")
-    assert len(list(photos.iterdir())) == PHOTOS[scene]
-
-
-def test_the_benchmark_asks_for_the_scenes_teachers() -> None:
-    counts = {
-        (scene, size): config_of(TrainingJob(scene, "", "default", size, 0, 30_000), DEFAULT).teachers
-        for scene in PHOTOS
-        for size in (10_000, 20_000, 40_000)
-    }
-    assert [scene for (scene, size), count in counts.items() if size == 10_000 and count] == ["saharov", "kitchen25"]
-    for large in (20_000, 40_000):
-        taught = [scene for (scene, size), count in counts.items() if size == large and count]
-        assert taught == ["fox", "saharov", "kitchen25"]
-    assert config_of(TrainingJob("fox", "", "paper", 40_000, 0, 30_000), PAPER).teachers == 0

@@ -10,15 +10,10 @@ import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.distillation import main, train_teachers
-from benchmarks.quality.jobs import TrainingJob, config_of
-from benchmarks.quality.rows import DEFAULT
-from benchmarks.quality.scenes import scene_of
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.errors import CheckpointError
 from nexwarp.model.exposures import Exposures
-from nexwarp.run.evaluate import METRICS
 from nexwarp.train.checkpoint import CHECKPOINTS
 from nexwarp.train.config import TextureConfig
 from nexwarp.train.teachers import Teachers
@@ -251,34 +246,3 @@ def test_the_command_learns_from_runs(
     assert train("a", "--overwrite", "--teacher", "a") == 2
     assert "--teacher: expected another run than a" in " ".join(capsys.readouterr().err.split())
     assert Path("a/model.safetensors").is_file()
-
-
-def test_the_benchmarks_teachers_have_seeds_of_their_own(tiny_folder: Path) -> None:
-    """And are trained as any model of that seed."""
-    job = TrainingJob(tiny_folder.name, "", "mine", 60, 3, 12)
-    found, seconds = train_teachers(job, tiny_folder.parent, 2, 8, 50)
-    for number, teacher in enumerate(found, 1):
-        one = dataclasses.replace(job, seed=300 + number, iterations=8, size=50)
-        trainer = Trainer(scene_of(one, tiny_folder.parent), config_of(one, DEFAULT), CPU)
-        trainer.run()
-        assert torch.equal(trainer.finish().surfels.means, teacher.surfels.means)
-    assert seconds > 0
-
-
-def test_the_benchmarks_line_names_the_teachers(
-    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(METRICS, "lpips", lambda *_: None)  # it warns where its weights are not
-    out = tmp_path / "out.jsonl"
-    command = [str(out), "--scenes", tiny_folder.name, "--data", str(tiny_folder.parent), "--variant", ""]
-    command += ["--teacher-iterations", "8", "--iterations", "10", "--size", "60", "--seed", "3", "--teachers"]
-    assert main([*command, "2"]) == 0
-    line = json.loads(out.read_text())
-    assert (line["row"], line["iterations"], line["seed"]) == ("2 teachers of 8", 10, 3)
-    assert (line["teachers"]["count"], line["teachers"]["max_surfels"]) == (2, 60) and line["teachers"]["seconds"] > 0
-    assert main([*command, "1", "--teacher-size", "70"]) == 0
-    second = json.loads(out.read_text().splitlines()[1])
-    assert (second["row"], second["teachers"]["max_surfels"]) == ("1 teachers of 8, 70 surfels", 70)
-    with pytest.raises(SystemExit):
-        main([*command, "0"])
-    assert "--teachers: expected at least one, got 0" in capsys.readouterr().err

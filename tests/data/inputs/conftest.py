@@ -5,10 +5,10 @@ from functools import partial
 import pytest
 
 import nexwarp.data.scene
-from benchmarks.inputs import BARREL, FISHEYE, demo_lens, write_distorted
 from nexwarp.data import write_demo
 from nexwarp.data.random_points import random_points
 from tests.data.inputs.support import SIZE
+from tests.scene_writers import BARREL, FISHEYE, demo_lens, write_distorted
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks.inputs import write_nerfstudio
+from tests.scene_writers import write_nerfstudio
 
 SIZE = {"width": 96, "height": 72, "views": 10, "points": 300}
 

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 import nexwarp.data.transforms
-from benchmarks.inputs import APPLIED, write_blender, write_nerfstudio
 from nexwarp.data import load_scene
 from tests.data.inputs.support import MASK, assert_same_cameras, edit, file, frame, spoilt, write_mask
 from tests.data.test_scene import make_scene
+from tests.scene_writers import APPLIED, write_blender, write_nerfstudio
 
 
 def text(content: str | bytes):

@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks.inputs import reconstruction_of, write_blender, write_nerfstudio, write_points, write_text
 from nexwarp.data import initial_points, load_scene
 from nexwarp.data.scene import find_format
 from nexwarp.train.presets import preset
 from nexwarp.train.trainer import Trainer
 from tests.data.inputs.support import assert_same_cameras, edit
 from tests.data.test_scene import make_scene, project, views_of
+from tests.scene_writers import reconstruction_of, write_blender, write_nerfstudio, write_points, write_text
 
 
 def test_every_format_gives_the_same_scene(demo, tmp_path):

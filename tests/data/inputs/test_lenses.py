@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks.inputs import demo_lens, write_nerfstudio
 from nexwarp.data import load_scene
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import Map, pycolmap_module
 from nexwarp.data.raytrace import render
 from tests.data.inputs.support import SIZE, assert_same_cameras, edit
 from tests.data.test_scene import make_scene, views_of
+from tests.scene_writers import demo_lens, write_nerfstudio
 
 
 def psnr(image: torch.Tensor, reference: np.ndarray) -> float:

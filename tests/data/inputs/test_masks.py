@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.inputs import write_nerfstudio
 from nexwarp.data import load_scene
 from tests.data.inputs.support import MASK, edit, write_mask
 from tests.data.test_scene import make_scene, views_of
+from tests.scene_writers import write_nerfstudio
 
 
 @pytest.mark.parametrize("name", ["03.png.png", "03.png", "03.jpg"])

@@ -8,9 +8,9 @@ import nexwarp.data.memory
 import nexwarp.data.scene
 import nexwarp.data.views
 import nexwarp.machine
-from benchmarks.inputs import write_points
 from nexwarp.data import load_scene
 from tests.data.test_scene import make_scene
+from tests.scene_writers import write_points
 
 # Points of one's own
 

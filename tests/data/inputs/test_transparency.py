@@ -6,10 +6,10 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from benchmarks.inputs import write_blender
 from nexwarp.data import load_scene
 from nexwarp.data.random_points import random_points
 from tests.data.test_scene import make_scene, project, views_of
+from tests.scene_writers import write_blender
 
 
 @pytest.fixture

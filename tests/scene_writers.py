@@ -1,23 +1,15 @@
-"""Quality of trainings on the demo scene in each input format.
-
-`python -m benchmarks.inputs FOLDER` writes the demo as a COLMAP model, binary and text, as nerfstudio's and Blender's
-JSON, and photographed through distorted lenses. It trains each form and prints the PSNR on held-out views: of the
-form's own photos, and of the pinhole demo's cameras and photos, which are the same for all forms.
-"""
+"""Writers of the demo in each input format: COLMAP text, nerfstudio, Blender, and through distorted lenses."""
 
 import json
 import shutil
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from PIL import Image
 
-from nexwarp.data import load_scene, write_demo
 from nexwarp.data.capture import Cloud
 from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.images import image_size
@@ -175,57 +167,3 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
     for split, listed in frames.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps({**shared, "frames": listed}))
     return folder
-
-
-def main(
-    base: Annotated[Path, tyro.conf.Positional], names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-) -> int:
-    """Train forms of the demo with the settings of `nexwarp train demo` and print a line each.
-
-    Args:
-        base: folder for the scenes; existing ones are used as they are.
-        names: which forms; by default all.
-    """
-    from nexwarp.run.evaluate import evaluate
-    from nexwarp.train.presets import DEMO_SETTINGS, preset
-    from nexwarp.train.settings import with_settings
-    from nexwarp.train.trainer import Trainer
-
-    demo = base / "pinhole"
-    forms = {
-        "pinhole": lambda folder: folder,
-        "text": lambda folder: write_text(demo, folder),
-        "nerfstudio": lambda folder: write_nerfstudio(demo, folder),
-        "blender": lambda folder: write_blender(demo, folder),
-        "nerfstudio-own": lambda folder: write_nerfstudio(demo, folder, tracks=False),
-        "blender-random": lambda folder: write_blender(demo, folder, points=False),
-        "opencv": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV", BARREL)),
-        "fisheye": lambda folder: write_distorted(demo, folder, demo_lens(demo, "OPENCV_FISHEYE", FISHEYE)),
-    }
-    if unknown := [name for name in names if name not in forms]:
-        print(f"names: expected some of {', '.join(forms)}, got {unknown[0]!r}", file=sys.stderr)
-        return 2
-    if not demo.exists():
-        write_demo(demo)
-    config = with_settings(preset("default"), DEMO_SETTINGS)
-    reference = load_scene(demo)
-    for name in names or forms:
-        folder = base / name
-        if not folder.exists():
-            forms[name](folder)
-        scene = load_scene(folder)
-        trainer = Trainer(scene, config, "cpu")
-        trainer.run()
-        model = trainer.finish()
-        own, same = (evaluate(model, views)["psnr"] for views in (scene.test, reference.test))
-        size = scene.train[0].camera
-        print(
-            f"{name:14}  {size.width}x{size.height}  own test photos {own:.2f} dB, "
-            f"pinhole test photos {same:.2f} dB, {len(trainer.surfels):,} surfels, {trainer.seconds:.0f} s",
-            flush=True,
-        )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(tyro.cli(main))

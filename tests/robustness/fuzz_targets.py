@@ -14,19 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.fuzz_inputs import Files
-from benchmarks.fuzz_models import (
-    HEIGHT,
-    VIEWS,
-    WIDTH,
-    check_rendering,
-    some_cameras,
-    some_model,
-    some_surfels,
-    some_trainer,
-    some_viewmats,
-)
-from benchmarks.fuzz_web import make_scene_files, read_scene_files
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
@@ -46,6 +33,19 @@ from nexwarp.run.log import keep_lines
 from nexwarp.train.config import Config
 from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
+from tests.robustness.fuzz_inputs import Files
+from tests.robustness.fuzz_models import (
+    HEIGHT,
+    VIEWS,
+    WIDTH,
+    check_rendering,
+    some_cameras,
+    some_model,
+    some_surfels,
+    some_trainer,
+    some_viewmats,
+)
+from tests.robustness.fuzz_web import make_scene_files, read_scene_files
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """Kills trainings at random moments, resumes them, and compares the models with that of an undisturbed training.
 
-    python -m benchmarks.kills --count 20
+    python -m tests.robustness.kills --count 20
 
 trains a short demo on the CPU and lists each kill: its time, the checkpoints that it left, and whether the resumed run
 ended with the same bytes. The exit code is 1 unless all did. A GPU repeats its results only with --deterministic:
 
-    python -m benchmarks.kills --device cuda --deterministic --count 5 --iterations 600 --checkpoint-every 20
+    python -m tests.robustness.kills --device cuda --deterministic --count 5 --iterations 600 --checkpoint-every 20
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Fuzzing of every reader with damaged files: `python -m benchmarks.fuzz --seconds 60`.
+"""Fuzzing of every reader with damaged files: `python -m tests.robustness.fuzz --seconds 60`.
 
 An input is a small valid file with damage: bytes flipped, cut or spliced, numbers replaced by extreme ones, JSON with
 values of other types, repeated keys, deep nesting. An input passes when its reader loads it or refuses it with a
@@ -34,8 +34,8 @@ from typing import Any
 import psutil
 import warp as wp
 
-from benchmarks.fuzz_inputs import Files, damage, strategy
-from benchmarks.fuzz_targets import TARGETS, FuzzTarget
+from tests.robustness.fuzz_inputs import Files, damage, strategy
+from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
 
 HANG = 5.0  # seconds an input may use the processor
 ASLEEP = 6  # how many times as long it may take where it does not use it: on a busy machine, or asleep
@@ -349,7 +349,7 @@ def drive_atheris(target: FuzzTarget, seconds: float, failed: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.robustness.fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="of the whole run")
     parser.add_argument("--inputs", type=int, default=10**9, help="at most so many a target")
     parser.add_argument("--targets", nargs="+", default=list(TARGETS), choices=list(TARGETS), metavar="TARGET")

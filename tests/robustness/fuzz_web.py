@@ -1,11 +1,11 @@
-"""Scene files of the web page, for `benchmarks.fuzz_targets`."""
+"""Scene files of the web page, for `tests.robustness.fuzz_targets`."""
 
 from pathlib import Path
 
-from benchmarks.fuzz_inputs import Files
-from benchmarks.fuzz_models import some_cameras, some_model
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.export.web.scene_reader import load_scene_file
+from tests.robustness.fuzz_inputs import Files
+from tests.robustness.fuzz_models import some_cameras, some_model
 
 
 def make_scene_files(folder: Path) -> list[Files]:

@@ -1,6 +1,6 @@
 """Searches for memory leaks: renders many frames of the demo and trains many small steps on it.
 
-    python -m benchmarks.soak --device cuda --frames 5000 --steps 20000
+    python -m tests.robustness.soak --device cuda --frames 5000 --steps 20000
 
 prints the memory of the GPU and of the host, and compares its mean over the first thousand frames (and steps) after a
 warm-up with that over the last thousand. The exit code is 1 unless each pair agrees within 1 %.
