@@ -1,10 +1,7 @@
-"""Benchmarks of speed, memory and quality, and tests that take too long for CI.
+"""Benchmarks of speed, memory and quality.
 
-`python -m benchmarks --help` times every stage. Each `bench_<stage>.py` is one stage and runs alone, too (`python -m
-benchmarks.bench_collect`). They share seeded scenes (`scenes`), one timer (`timing`) and one command line (`suite`).
-
-Commands of their own: `quality` (trainings beside gsplat, ablations), `before_after` (two checkouts), `finished_model`
-and `exposures` (stages of finishing a model), `inputs` (scene formats), `splats` (exported Gaussians in gsplat),
-`repeat` (determinism), `kills` (resuming), `soak` (memory leaks), `sanitize` (compute-sanitizer), `fuzz` (damaged
-files).
+`python -m benchmarks --help` times the stages of a frame and of a training step, on seeded scenes (`scenes`), with one
+timer (`timing`) and one command line (`suite`). `benchmarks.before_after` compares two checkouts in turns,
+`benchmarks.scaling` several GPUs, `benchmarks.quality` trains beside gsplat, `benchmarks.picture` draws the README's
+picture. LOG.md is the lab book; results/ holds the figures that the documents show.
 """

@@ -2,34 +2,18 @@
 
 import sys
 
-from benchmarks import (
-    bench_cold_start,
-    bench_collect,
-    bench_cpu,
-    bench_frame,
-    bench_kernels,
-    bench_peers,
-    bench_project,
-    bench_sizes,
-    bench_surface,
-    bench_texture,
-    bench_tiles,
-    bench_train_step,
-    suite,
-)
+from benchmarks import bench_cold_start, bench_collect, bench_frame, bench_peers, bench_texture, bench_train_step, suite
+from benchmarks.scenes import on_each_scene
 
 STAGES: dict[str, suite.Stage] = {
-    "project": bench_project.run,
-    "tiles": bench_tiles.run,
-    "collect": bench_collect.run,
-    "surface": bench_surface.run,
-    "texture": bench_texture.run,
-    "frame": bench_frame.run,
+    "project": on_each_scene(bench_collect.project),
+    "tiles": on_each_scene(bench_collect.tiles),
+    "collect": on_each_scene(bench_collect.collect),
+    "texture": on_each_scene(bench_texture.texturing),
+    "frame": on_each_scene(bench_frame.frame),
     "train_step": bench_train_step.run,
     "peers": bench_peers.run,
-    "kernels": bench_kernels.run,
-    "cpu": bench_cpu.run,
-    "sizes": bench_sizes.run,
+    "cpu": bench_collect.cpu,
     "cold_start": bench_cold_start.run,
 }
 

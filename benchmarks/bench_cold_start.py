@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 
-from benchmarks import suite
 from benchmarks.suite import Options
 from benchmarks.timing import ROOT, Measurement, figure
 
@@ -79,7 +78,3 @@ def fresh_process(command: list[str], cache: str) -> tuple[str, float]:
     if done.returncode:
         raise RuntimeError(f"the fresh process failed:\n{done.stderr}")
     return done.stdout.splitlines()[-1], time.perf_counter() - start
-
-
-if __name__ == "__main__":
-    sys.exit(suite.main({"cold_start": run}))

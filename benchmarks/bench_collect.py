@@ -1,54 +1,101 @@
-"""Collection: the walk along the tile lists alone, and the whole stage (project, tiles, collect), K = 2."""
+"""The collection stage and its parts, K = 2: plain colours and projection, tile lists, the walk along them."""
 
-import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 
-from benchmarks import suite
-from benchmarks.scenes import SurfelScene, entries, geometry, outputs, random_like, workload
+from benchmarks.scenes import SurfelScene, cloud, entries, geometry, outputs, random_like
 from benchmarks.suite import Options
-from benchmarks.timing import Measurement
+from benchmarks.timing import Measurement, ratio
 from nexwarp import ops
+from nexwarp.kernels.launch import get_num_threads, set_num_threads
+
+MAX_HITS = 2
 
 
-def run(options: Options) -> list[Measurement]:
-    return [m for scene in workload(options) for m in (*walk(scene, options), *stage(scene, options))]
+def project(scene: SurfelScene, options: Options) -> list[Measurement]:
+    """SH of degree 3, then the projection; a thread a surfel each."""
+    s, position = scene.surfels, scene.camera.position
+    sh0, shN, means = leaves = [x.detach().clone().requires_grad_() for x in (s.sh0, s.shN, s.means)]
+
+    def colors() -> torch.Tensor:
+        return ops.plain_colors((sh0, shN), means, position, 3)
+
+    g = geometry(scene)
+    return [
+        options.time("plain colours, forward", colors, **scene.facts),
+        backward("plain colours, backward", (colors(),), leaves, scene, options),
+        options.time("project, forward", g.project, **scene.facts),
+        backward("project, backward", (g.project().records,), g.leaves, scene, options),
+    ]
 
 
-def walk(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
-    """The pass alone, given projection and tile lists."""
+def tiles(scene: SurfelScene, options: Options) -> list[Measurement]:
+    """Depth sort, count, scan, emit, tile sort. Nothing here is differentiable."""
+    g = geometry(scene)
+    projection = g.project()
+    facts = scene.facts
+    facts["sizes"]["entries"] = entries(g.tiles(projection))
+    return [options.time("tiles", lambda: g.tiles(projection), **facts)]
+
+
+def collect(scene: SurfelScene, options: Options) -> list[Measurement]:
+    """The walk alone, given projection and lists; then the whole stage, from activated surfels to hits."""
     g = geometry(scene)
     with torch.no_grad():
         projection = g.project()
     records = projection.records.requires_grad_()
-    tiles = g.tiles(projection)
-    hits = ops.collect(projection, tiles, g.pinhole, max_hits=max_hits)
-    signals = random_like(outputs(hits))
-    facts = scene.facts
-    facts["sizes"] |= {"entries": entries(tiles), "max_hits": max_hits}
-    return [
-        options.time("collect, forward", lambda: ops.collect(projection, tiles, g.pinhole, max_hits=max_hits), **facts),
-        options.time(
-            "collect, backward",
-            lambda: torch.autograd.grad(outputs(hits), records, signals, retain_graph=True),
-            **facts,
-        ),
+    lists = g.tiles(projection)
+    hits = g.collect(projection, lists, MAX_HITS)
+    walk = [
+        options.time("collect, forward", lambda: g.collect(projection, lists, MAX_HITS), **scene.facts),
+        backward("collect, backward", outputs(hits), [records], scene, options),
     ]
-
-
-def stage(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
-    """Activated surfels to hits, and back."""
-    g = geometry(scene)
     with torch.no_grad():
-        signals = random_like(outputs(g.hits(max_hits)))
-        forward = options.time("collection stage, forward", lambda: g.hits(max_hits), **scene.facts)
-    both = options.time(
+        forward = options.time("collection stage, forward", lambda: g.hits(MAX_HITS), **scene.facts)
+    return [*walk, forward, stage(scene, options)]
+
+
+def stage(scene: SurfelScene, options: Options) -> Measurement:
+    """The whole stage, forward + backward."""
+    g = geometry(scene)
+    signals = random_like(outputs(g.hits(MAX_HITS)))
+    return options.time(
         "collection stage, forward + backward",
-        lambda: torch.autograd.grad(outputs(g.hits(max_hits)), g.leaves, signals),
+        lambda: torch.autograd.grad(outputs(g.hits(MAX_HITS)), g.leaves, signals),
         **scene.facts,
     )
-    return [forward, both]
 
 
-if __name__ == "__main__":
-    sys.exit(suite.main({"collect": run}))
+def backward(
+    name: str, results: tuple[torch.Tensor, ...], leaves: Sequence[torch.Tensor], scene: SurfelScene, options: Options
+) -> Measurement:
+    """Time the backward pass of results that are there."""
+    signals = random_like(results)
+    return options.time(name, lambda: torch.autograd.grad(results, leaves, signals, retain_graph=True), **scene.facts)
+
+
+def cpu(options: Options) -> list[Measurement]:
+    """The collection stage on a CPU, forward + backward, with one thread and with two."""
+    if options.cuda:
+        return []
+    scene = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
+    with threads(1):
+        one = stage(scene, options)
+    with threads(2):
+        two = stage(scene, options)
+    return [one, two, ratio("collection stage, 1 thread over 2", one, two)]
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let Warp's launches and torch use this many threads."""
+    before = get_num_threads(), torch.get_num_threads()
+    set_num_threads(count)
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        set_num_threads(before[0])
+        torch.set_num_threads(before[1])

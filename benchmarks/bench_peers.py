@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from benchmarks import suite
 from benchmarks.gpu_time import gpu_time
 from benchmarks.scenes import Geometry, SurfelScene, entries, fox, garden, geometry, outputs, random_like
 from benchmarks.suite import Options
@@ -192,7 +191,3 @@ def last_entries(image: torch.Tensor) -> torch.Tensor:
             return torch.stack([x.reshape(size) for x in kept]).amax(0)
         pending += [parent for parent, _ in node.next_functions]
     raise RuntimeError("gsplat: expected its rasterisation in the graph of its image")
-
-
-if __name__ == "__main__":
-    sys.exit(suite.main({"peers": run}))

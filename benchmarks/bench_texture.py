@@ -1,27 +1,18 @@
 """Texturing of an image's hits, K = 2, in the shape that training uses: hash lookup, MLP and SH, with detail limits.
 
-The table's half-precision copy exists, as in training and in frames. The second pair of figures includes the
-composition.
+The table's half-precision copy exists, as in training and in frames.
 """
-
-import sys
-from typing import Any
 
 import numpy as np
 import torch
 
 import nexwarp as nw
-from benchmarks import suite
-from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, texture, workload
+from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, texture
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
 from nexwarp.model.detail_limits import limited_depths
 from nexwarp.train.finish.detail_limits import measure_detail_limits
-
-
-def run(options: Options) -> list[Measurement]:
-    return [m for scene in workload(options) for m in texturing(scene, options)]
 
 
 def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:
@@ -32,7 +23,6 @@ def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[M
     with torch.no_grad():
         hits = g.hits(max_hits)
         positions, directions = ops.unproject(hits.depths, g.viewmat, g.pinhole)
-        background = torch.zeros(3, device=options.device)
     focal = scene.camera.focal
     depths = limited_depths(hits.ids, hits.depths, limits, focal).requires_grad_()
     positions.requires_grad_()
@@ -40,31 +30,15 @@ def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[M
     def colors() -> torch.Tensor:
         return field.colors(positions, depths, directions, focal)
 
-    def composed() -> torch.Tensor:
-        return ops.compose(hits.plain, colors(), hits.weights, hits.alpha, background)[0]
-
     facts = scene.facts
     facts["sizes"] |= {"slots": hits.ids.numel(), "hits": int((hits.ids >= 0).sum())}
     facts["sizes"] |= {name: field.config[name] for name in ("levels", "features", "table_size", "max_resolution")}
     leaves = [positions, depths, *field.parameters()]
-    found = []
-    for name, forward in (("texturing", colors), ("texturing and composition", composed)):
-        with torch.no_grad():
-            (signal,) = random_like((forward(),))
-            found.append(options.time(f"{name}, forward", forward, **facts))
-        both = _Backward(forward, leaves, signal)
-        found.append(options.time(f"{name}, forward + backward", both, **facts))
-    return found
-
-
-class _Backward:
-    """A function's forward and backward pass."""
-
-    def __init__(self, forward: Any, leaves: list[torch.Tensor], signal: torch.Tensor) -> None:
-        self.forward, self.leaves, self.signal = forward, leaves, signal
-
-    def __call__(self) -> tuple[torch.Tensor, ...]:
-        return torch.autograd.grad(self.forward(), self.leaves, self.signal)
+    with torch.no_grad():
+        (signal,) = random_like((colors(),))
+        forward = options.time("texturing, forward", colors, **facts)
+    both = options.time("texturing, forward + backward", lambda: torch.autograd.grad(colors(), leaves, signal), **facts)
+    return [forward, both]
 
 
 def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]:
@@ -83,7 +57,3 @@ def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]
     table = 2**20 if len(scene.surfels) >= SAHAROV else 2**15
     field = texture(scene, table_size=table, **shape)
     return field, measure_detail_limits(nw.Model(scene.surfels, field), scene.cameras)
-
-
-if __name__ == "__main__":
-    sys.exit(suite.main({"texture": run}))

@@ -1,13 +1,11 @@
 """One default training step in the middle of a run: SH of degree 3, splat errors, all losses, Adam."""
 
-import sys
 import time
 from collections.abc import Sequence
 
 import torch
 
 import nexwarp as nw
-from benchmarks import suite
 from benchmarks.scenes import GARDEN, SurfelScene, cloud, garden, saharov
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, synchronize
@@ -93,7 +91,3 @@ def training_scene(scene: SurfelScene, options: Options) -> Scene:
         scale=1.1 * float((centers - centers.mean(0)).norm(dim=1).max()),
         path=options.data,
     )
-
-
-if __name__ == "__main__":
-    sys.exit(suite.main({"train_step": run}))

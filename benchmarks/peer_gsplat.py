@@ -8,7 +8,6 @@ scale regularised by 0.01. D-SSIM is ours, with "same" padding in place of "vali
 has and the examples lack.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -18,28 +17,18 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
-from nexwarp.errors import check_range
 from nexwarp.kernels.sh import BAND_0
-from nexwarp.model.compact import decode, encode
 from nexwarp.model.exposures import Exposures
+from nexwarp.ops.ssim import weighted_dssim
 from nexwarp.train.config import Config
 from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
 from nexwarp.train.initial import starting_points
-from nexwarp.train.losses import image_loss
 from nexwarp.train.step_losses import SATURATION
 from nexwarp.train.views import TrainingViews, mean_color
 
-CODED = {  # names of the coding of our model files
-    "means": "surfels.means",
-    "quats": "surfels.raw_quats",
-    "scales": "surfels.log_scales",
-    "opacities": "surfels.logit_opacities",
-    "sh0": "surfels.sh0",
-    "shN": "surfels.shN",
-}
 FLOATS = {"3dgs": 11, "2dgs": 10}  # a primitive without SH: means 3, quats 4, scales 3 or 2, opacity 1
 NEAR = {"3dgs": 0.01, "2dgs": 0.2}  # the examples' near planes, in the normalised frame
-MOST_SH_DEGREE = 4  # gsplat evaluates no more
+SH_DEGREE = 3
 SH_EVERY = 1000
 REFERENCE_ITERATIONS = 30_000
 
@@ -57,7 +46,6 @@ class PeerSettings:
             gate uses exposures.
         even_start: start at half the budget from points chosen by farthest point sampling, as we do.
         skybox: with `even_start`, as `Config.skybox`: some of these points lie on a sphere around the scene.
-        sh_degree: 0 to 4; the examples have 3.
     """
 
     primitive: str = "3dgs"
@@ -66,7 +54,6 @@ class PeerSettings:
     exposures: bool = False
     even_start: bool = False
     skybox: int = 0
-    sh_degree: int = 3
 
     def __post_init__(self) -> None:
         if self.primitive not in FLOATS:
@@ -75,7 +62,6 @@ class PeerSettings:
             raise ValueError(f"strategy: expected mcmc or default, got {self.strategy!r}")
         if self.primitive == "2dgs" and self.strategy == "mcmc":
             raise ValueError("strategy: expected default for 2dgs, got mcmc")
-        check_range("sh_degree", self.sh_degree, 0, MOST_SH_DEGREE)
 
 
 @dataclass
@@ -101,34 +87,20 @@ class Gaussians:
     @property
     def megabytes(self) -> float:
         """On disk as float32, 10^6 bytes."""
-        floats = FLOATS[self.primitive] + 3 * (self.sh_degree + 1) ** 2
+        floats = FLOATS[self.primitive] + 3 * (SH_DEGREE + 1) ** 2
         return len(self.splats["means"]) * floats * 4 / 1e6
-
-    @property
-    def sh_degree(self) -> int:
-        """SH degree of the colours."""
-        return math.isqrt(1 + self.splats["shN"].shape[1]) - 1
-
-    def compact(self) -> tuple["Gaussians", int]:
-        """Return the Gaussians as a file with the coding of our compact model files gives them, and its bytes."""
-        tensors = {CODED[name]: x.detach().cpu() for name, x in self.splats.items()}
-        coded = encode(tensors)
-        back = decode(coded)
-        splats = {name: torch.nn.Parameter(back[CODED[name]].to(x.device)) for name, x in self.splats.items()}
-        size = sum(x.numel() * x.element_size() for x in coded.values())
-        return dataclasses.replace(self, splats=torch.nn.ParameterDict(splats)), size
 
     def image(self, camera: Camera) -> torch.Tensor:
         """Return an image (H, W, 3), not clamped, at the exposure that is predicted for the camera."""
         image, _ = self.render(camera)
         return image if self.exposures is None else image * self.exposures.factors(camera)
 
-    def render(self, camera: Camera, degree: int | None = None) -> tuple[torch.Tensor, dict[str, Any]]:
+    def render(self, camera: Camera, degree: int = SH_DEGREE) -> tuple[torch.Tensor, dict[str, Any]]:
         """Return an image (H, W, 3), not clamped, and gsplat's intermediate results for its strategy.
 
         Args:
             camera: the view.
-            degree: SH degree to evaluate; None is that of the colours.
+            degree: SH degree to evaluate.
         """
         from gsplat import rendering
 
@@ -147,7 +119,7 @@ class Gaussians:
             width=camera.width,
             height=camera.height,
             near_plane=NEAR[self.primitive],
-            sh_degree=self.sh_degree if degree is None else degree,
+            sh_degree=degree,
             packed=False,
             backgrounds=self.background[None],
         )
@@ -185,14 +157,14 @@ def train(
         order = order or torch.randperm(len(views)).tolist()
         index = order.pop()
         camera, photo = views.get(index, order[:-3:-1])
-        degree = min(step // max(round(SH_EVERY * stretch), 1), settings.sh_degree)
+        degree = min(step // max(round(SH_EVERY * stretch), 1), SH_DEGREE)
         image, info = gaussians.render(camera, degree)
         control.before(step, info)
         exposure = views.exposure(index)
         if exposure is not None:
             image = image * exposure
             image = torch.where((photo >= SATURATION) & (image > photo), photo, image)
-        loss = image_loss(image, photo, 0.2)
+        loss = 0.8 * (image - photo).abs().mean() + weighted_dssim(image, photo, 0.2)
         if settings.strategy == "mcmc":
             loss = loss + 0.01 * torch.sigmoid(gaussians.splats["opacities"]).mean()
             loss = loss + 0.01 * torch.exp(gaussians.splats["scales"]).mean()
@@ -282,7 +254,7 @@ def _initial(
         "quats": torch.rand(len(points), 4),
         "opacities": torch.full((len(points),), math.log(opacity / (1 - opacity))),
         "sh0": ((colors - 0.5) / BAND_0)[:, None],
-        "shN": torch.zeros(len(points), (settings.sh_degree + 1) ** 2 - 1, 3),
+        "shN": torch.zeros(len(points), (SH_DEGREE + 1) ** 2 - 1, 3),
     }
     parameters = torch.nn.ParameterDict({name: torch.nn.Parameter(x.contiguous()) for name, x in splats.items()})
     background = torch.tensor(mean_color(scene.train, calibration) if settings.background else (0.0, 0.0, 0.0))

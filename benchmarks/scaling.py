@@ -2,8 +2,6 @@
 
     python -m benchmarks.scaling --ranks 1 2 4 --scene SCENE --surfels 400000
     python -m benchmarks.scaling --ranks 1 2 --scene SCENE --train 30000          # PSNR at equal views seen
-    python -m benchmarks.scaling --ranks 2 --device cpu --train 1200 --surfels 3000 --rule linear
-    python -m benchmarks.scaling --simulate --step-ms 6 --surfels 400000          # more GPUs than there are, on paper
 
 Each rank renders one view a step, so that weak scaling (as many views a step as ranks) and strong scaling (a run of
 equally many views) are the same measurement: the speed-up is the number of ranks times the efficiency, the time of a
@@ -44,14 +42,6 @@ DEMO = "demo"
 LATE = 26_000  # an iteration of 30,000 after density control, with SH of degree 3
 CHUNKS = 5
 VISITS = 4  # untimed steps for each training view
-# Power of the number of views that rates are multiplied by, and whether Adam's betas stay as they are.
-RULES = {"sqrt": (0.5, False), "linear": (1.0, False), "rates": (0.5, True), "none": (0.0, True)}
-# Bytes a second that leave a GPU over NVLink 4: 450 GB/s in each direction (NVIDIA's data sheet of the H100), of which
-# an all-reduce is assumed to reach 80 %. Of the network's rate, 90 % are assumed.
-NVLINK, NVLINK_SHARE, NETWORK_SHARE = 450e9, 0.8, 0.9
-# Seconds that the two collectives of a step take beside their bytes; assumed.
-NVLINK_LATENCY, NETWORK_LATENCY = 20e-6, 50e-6
-NODE = 8  # GPUs of a node
 
 
 @dataclass(frozen=True)
@@ -72,46 +62,27 @@ class Scaling:
     """How steps run on CUDA: all-reduce inside the CUDA graph, after it, or no graph. A CPU has only `eager`."""
     device: str = "cuda"
     """Device: cuda or cpu."""
-    rule: str = "sqrt"
-    """Rates of a step of N views: `sqrt`, those of one view times sqrt(N), and betas to the power of N, as `nexwarp
-    train` does; `linear`, rates times N, and betas likewise; `rates`, sqrt(N) with betas as they are; `none`, all as
-    they are."""
     backend: str | None = None
     """Backend of the gradients; default nccl on CUDA, gloo on a CPU or with --share-gpu."""
     share_gpu: bool = False
     """Let all ranks use the first GPU: a check of the program, not of its speed."""
     settings: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = ()
     """Further settings, KEY=VALUE."""
-    simulate: bool = False
-    """Print the time of a step on 1 to 64 GPUs by the formulas of docs/gpus.md."""
-    step_ms: float = 6.0
-    """With --simulate: milliseconds of a step on one GPU."""
-    hidden_ms: float = 2.0
-    """With --simulate: milliseconds of the backward pass after the grid's gradient is complete."""
-    table: int = 2**20
-    """With --simulate: entries of each of the grid's levels."""
-    gbits: float = 100.0
-    """With --simulate: Gbit/s of a node's network; 3200 is that of a DGX H100, 8 adapters of 400."""
     worker: bool = False
     """Internal: this process is a rank."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    given = sys.argv[1:] if arguments is None else arguments
-    options = tyro.cli(Scaling, args=given, description=__doc__)
+    command = sys.argv[1:] if arguments is None else arguments
+    options = tyro.cli(Scaling, args=command, description=__doc__)
     wp.config.log_level = wp.LOG_ERROR
-    if options.rule not in RULES:
-        raise SystemExit(f"--rule: expected one of {', '.join(RULES)}, got {options.rule!r}")
-    if options.simulate:
-        print(simulate(options.step_ms, options.hidden_ms, options.surfels, options.table, options.gbits))
-        return 0
     if options.worker:
         work(options)
         return 0
     codes = []
     for count in options.ranks:
         print(f"{count} ranks ...", file=sys.stderr, flush=True)
-        codes.append(launch(count, ["-m", "benchmarks.scaling", *given, "--worker"]))
+        codes.append(launch(count, ["-m", "benchmarks.scaling", *command, "--worker"]))
     return max(codes)
 
 
@@ -131,18 +102,17 @@ def work(options: Scaling) -> None:
         for mode in options.modes if device.type == "cuda" else ("eager",):
             if mode == "captured" and ranks.backend != "nccl":
                 continue
-            found = trained(options, scene, mode, ranks) if options.train else timed(options, scene, mode, ranks)
+            figures = trained(options, scene, mode, ranks) if options.train else timed(options, scene, mode, ranks)
             facts = {
                 "ranks": ranks.size,
                 "mode": mode,
-                "rule": options.rule,
                 "backend": ranks.backend,
                 "scene": Path(options.scene).name,
                 "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
                 "commit": git_commit(),
             }
             if ranks.first:
-                print(json.dumps(facts | found), flush=True)
+                print(json.dumps(facts | figures), flush=True)
 
 
 def make_trainer(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> Trainer:
@@ -154,26 +124,7 @@ def make_trainer(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> Tra
     config = with_settings(config, parse_settings(options.settings))
     if ranks.size == 1:
         return Trainer(scene, config, ranks.device)
-    trainer = ParallelTrainer(scene, config, ranks.device, ranks, beside=mode == "beside")
-    change_rule(trainer.optimizer, ranks.size, options.rule)
-    return trainer
-
-
-def change_rule(optimizer: torch.optim.Optimizer, views: int, rule: str) -> None:
-    """Change the rates of an optimizer, which follow the square-root rule, to those of another rule.
-
-    Args:
-        optimizer: of a `ParallelTrainer`.
-        views: of a step.
-        rule: see `Scaling.rule`.
-    """
-    power, keeps_betas = RULES[rule]
-    factor = views ** (power - 0.5)
-    for group in optimizer.param_groups:
-        first, last = group["ends"]
-        group["ends"] = first * factor, last * factor
-        if keeps_betas:
-            group["betas"] = tuple(beta ** (1 / views) for beta in group["betas"])
+    return ParallelTrainer(scene, config, ranks.device, ranks, beside=mode == "beside")
 
 
 def trained(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, object]:
@@ -204,16 +155,16 @@ def timed(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, 
     # First steps are slower: graphs are captured, and a rank prepares each view when it first renders it.
     for _ in range(VISITS * len(scene.train)):
         trainer.step()
-    found: dict[str, object] = {"surfels": len(trainer.surfels), "step_ms": step_ms(trainer, options.steps)}
+    figures: dict[str, object] = {"surfels": len(trainer.surfels), "step_ms": step_ms(trainer, options.steps)}
     if isinstance(trainer, ParallelTrainer):
-        found["bytes"] = trainer.reducer.bytes_sent
-        found["communication_ms"] = communication_ms(trainer, options.steps)
+        figures["bytes"] = trainer.reducer.bytes_sent
+        figures["communication_ms"] = communication_ms(trainer, options.steps)
         with silent(trainer):
-            found["step_without_communication_ms"] = step_ms(trainer, options.steps)
-        exposed = float(str(found["step_ms"])) - float(str(found["step_without_communication_ms"]))
-        found["hidden_share"] = round(1 - exposed / float(str(found["communication_ms"])), 3)
-    found["views_per_second"] = round(1000 * ranks.size / float(str(found["step_ms"])), 1)
-    return found
+            figures["step_without_communication_ms"] = step_ms(trainer, options.steps)
+        exposed = float(str(figures["step_ms"])) - float(str(figures["step_without_communication_ms"]))
+        figures["hidden_share"] = round(1 - exposed / float(str(figures["communication_ms"])), 3)
+    figures["views_per_second"] = round(1000 * ranks.size / float(str(figures["step_ms"])), 1)
+    return figures
 
 
 def step_ms(trainer: Trainer, steps: int) -> float:
@@ -270,43 +221,6 @@ def silent(trainer: ParallelTrainer) -> Iterator[None]:
     trainer.reducer, before.overlapped = before, overlapped
     if trainer.graphs is not None:
         trainer.graphs.clear()
-
-
-def gradient_bytes(surfels: int, table: int, levels: int = 8, features: int = 4) -> tuple[int, int]:
-    """Return the bytes of the two buckets: the grid's, and those of surfels (60 numbers and an error each) and MLP."""
-    return 4 * levels * table * features, 4 * (61 * surfels + 64 * 32 + 64 * 64 + 48 * 64)
-
-
-def simulate(step: float, hidden: float, surfels: int, table: int, gbits: float) -> str:
-    """Return a table of the time of a step on 1 to 64 GPUs.
-
-    A ring or tree all-reduce of B bytes over n ranks sends 2 B (n - 1) / n from each. Nodes first reduce inside, then
-    each of their GPUs exchanges its share with those of other nodes, over the node's network. The grid's bucket is
-    hidden behind at most `hidden` milliseconds of the backward pass; nothing hides the other.
-
-    Args:
-        step: milliseconds of a step on one GPU.
-        hidden: milliseconds of the backward pass after the grid's gradient is complete.
-        surfels: how many there are.
-        table: entries of each of the grid's 8 levels of 4 features.
-        gbits: Gbit/s of a node's network.
-    """
-    nvlink, network = NVLINK * NVLINK_SHARE, gbits * 1e9 / 8 * NETWORK_SHARE
-    lines = ["GPUs  nodes  communication ms  not hidden ms  step ms  efficiency  speed-up"]
-    for count in (1, 2, 4, 8, 16, 32, 64):
-        nodes, inside = max(count // NODE, 1), min(count, NODE)
-        early, late = (
-            1000 * (2 * size * (inside - 1) / inside / nvlink + 2 * size * (nodes - 1) / nodes / network)
-            for size in gradient_bytes(surfels, table)
-        )
-        fixed = 1000 * ((count > 1) * NVLINK_LATENCY + (nodes > 1) * NETWORK_LATENCY)
-        exposed = max(early - hidden, 0) + late + fixed
-        efficiency = step / (step + exposed)
-        lines.append(
-            f"{count:4d}  {nodes:5d}  {early + late + fixed:16.2f}  {exposed:13.2f}  {step + exposed:7.2f}"
-            f"  {efficiency:10.3f}  {count * efficiency:8.1f}"
-        )
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

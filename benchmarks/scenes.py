@@ -1,5 +1,6 @@
 """Seeded scenes that all benchmarks share. Made on the CPU, so that they are the same on every device."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ import numpy as np
 import torch
 
 import nexwarp as nw
-from benchmarks.suite import Options
+from benchmarks.suite import Options, Stage
+from benchmarks.timing import Measurement
 from nexwarp import ops
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.paths import look_at
@@ -156,6 +158,11 @@ def workload(options: Options) -> list[SurfelScene]:
     if options.model is not None:
         scenes.append(fox(options.model, options.data))
     return [scene.to(options.device) for scene in scenes]
+
+
+def on_each_scene(measure: Callable[[SurfelScene, Options], list[Measurement]]) -> Stage:
+    """Return a stage that measures on each scene of the workload."""
+    return lambda options: [row for scene in workload(options) for row in measure(scene, options)]
 
 
 def garden(n: int = GARDEN, width: int = 1600, height: int = 1037, data: Path = Options.data) -> SurfelScene:

@@ -1,18 +1,21 @@
-"""The quality benchmark's results file: one JSON line per training."""
+"""The quality benchmark's results file, one JSON line per training, and its table."""
 
 import dataclasses
 import json
+import statistics
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from benchmarks.quality.jobs import TrainingJob
 
-METRICS = ("psnr", "ssim", "flip", "lpips")
-OTHERS = ("train_psnr", "zoom_psnr", "quarter_psnr")
-UNITS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS"}
-UNITS |= {"train_psnr": "train [dB]", "zoom_psnr": "zoom [dB]", "quarter_psnr": "at 1/4 [dB]"}
-DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4, "train_psnr": 2, "zoom_psnr": 1, "quarter_psnr": 2}
+METRICS = {"psnr": ("PSNR [dB]", 2), "ssim": ("SSIM", 4), "flip": ("FLIP", 4), "lpips": ("LPIPS", 4)}
+COLUMNS = METRICS | {
+    "train_psnr": ("train [dB]", 2),
+    "megabytes": ("MB", 1),
+    "seconds": ("s", 0),
+    "peak_mib": ("MiB", 0),
+}
 
 Results = dict[TrainingJob, dict[str, Any]]
 
@@ -25,7 +28,7 @@ def read_results(paths: Iterable[Path]) -> Results:
         ValueError: a line is not the result of a training; the message names file and line.
     """
     defaults = {f.name: f.default for f in dataclasses.fields(TrainingJob)}  # lines of older versions lack some fields
-    found = {}
+    results = {}
     for path in paths:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             try:
@@ -36,8 +39,8 @@ def read_results(paths: Iterable[Path]) -> Results:
                 complete = False
             if not complete:
                 raise ValueError(f"{path}, line {number}: expected the JSON of a training, got {line[:60]!r}")
-            found[job] = result
-    return found
+            results[job] = result
+    return results
 
 
 def drop_unfinished(path: Path) -> bool:
@@ -46,20 +49,38 @@ def drop_unfinished(path: Path) -> bool:
     end = text.rfind(b"\n") + 1
     if end == len(text):
         return False
-    try:
-        json.loads(text[end:])
-    except ValueError:
-        with path.open("r+b") as file:
-            file.truncate(end)
-        return True
-    with path.open("ab") as file:  # the line lacks only its end
-        file.write(b"\n")
-    return False
+    with path.open("r+b") as file:
+        file.truncate(end)
+    return True
 
 
 def result_line(job: TrainingJob, result: dict[str, Any]) -> str:
     """Return a training's figures as a line of text."""
-    facts = [f"{UNITS[m]} {result[m]:.{DIGITS[m]}f}" for m in METRICS if result[m] is not None]
-    facts += [f"{k[:-5]} {result[k]:.2f} dB" for k in OTHERS if k in result]
-    facts.append(f"{result['seconds']:.0f} s")
-    return f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {', '.join(facts)}"
+    facts = [f"{title} {result[m]:.{digits}f}" for m, (title, digits) in METRICS.items() if result[m] is not None]
+    return (
+        f"{job.scene}{job.variant} {job.row} {job.size} seed {job.seed}: {', '.join(facts)}, {result['seconds']:.0f} s"
+    )
+
+
+def table(results: Results) -> str:
+    """Return Markdown: means and standard deviations over seeds, by scene, variant, size and iterations."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for job, result in results.items():
+        key = (job.scene, job.variant, job.downscale, job.size, job.iterations, job.row)
+        groups.setdefault(key, []).append(result)
+    header = ["scene", "size", "iterations", "row", *(title for title, _ in COLUMNS.values()), "seeds"]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    for (scene, variant, downscale, size, iterations, row), members in sorted(groups.items(), key=lambda x: x[0]):
+        name = f"{scene} {variant}".strip() + (f", photos reduced by {downscale}" if downscale > 1 else "")
+        figures = [_spread([r.get(figure) for r in members], digits) for figure, (_, digits) in COLUMNS.items()]
+        cells = [name, f"{size:,}", f"{iterations:,}", row, *figures, str(len(members))]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _spread(values: list[float | None], digits: int) -> str:
+    known = [x for x in values if x is not None]
+    if not known:
+        return ""
+    deviation = f" ± {statistics.stdev(known):.{digits}f}" if len(known) > 1 else ""
+    return f"{statistics.fmean(known):.{digits}f}{deviation}"

@@ -2,31 +2,24 @@
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
-import nexwarp as nw
 from benchmarks import __main__ as command
-from benchmarks import bench_cpu, bench_frame, bench_kernels, bench_peers, bench_sizes
+from benchmarks import bench_frame, bench_peers
 from benchmarks.gpu_time import busy
-from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, outputs, random_like, texture, workload
+from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, texture, workload
 from benchmarks.suite import Options, table
 from benchmarks.timing import Measurement, figure, measure, ratio
-from nexwarp import Camera, NeuralTexture, Surfels, ops
+from nexwarp import NeuralTexture
 from nexwarp.cameras.cameras_file import save_cameras
-from nexwarp.model import model as model_module
 from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.ops import Pinhole
-from tests.tolerances import assert_close
 
 CPU = torch.device("cpu")
 
@@ -160,26 +153,6 @@ def test_trained_scene_takes_part_only_when_it_is_named(run_folder: Path) -> Non
     assert "fox" in with_model[-1].name and not any("fox" in scene.name for scene in without)
 
 
-def test_frames_of_the_trained_scene_are_timed_with_its_options(
-    run_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene, seen = fox(run_folder), []
-    render = nw.render
-
-    def note(surfels: Surfels, texture: NeuralTexture, camera: Camera, *options: Any, **others: Any) -> Any:
-        seen.append((texture, options[:5], others["detail_limits"]))
-        return render(surfels, texture, camera, *options, **others)
-
-    monkeypatch.setattr(model_module, "render", note)
-    bench_frame.frame(scene, Options(CPU, quick=True))
-    # The first rendering measures the detail limits, which this model lacks.
-    (_, _, first), *frames = seen
-    assert first is None and len(frames) > 2
-    expected = (OPTIONS.max_hits, OPTIONS.background, OPTIONS.sh_degree, OPTIONS.low_pass, OPTIONS.clamp_texture)
-    assert all(options == expected for _, options, _ in frames)
-    assert all(field is scene.model.texture and limits is not None for field, _, limits in frames)
-
-
 def test_frames_of_an_untrained_scene_have_what_a_finished_model_has() -> None:
     model = bench_frame.finished(small_scene())
     assert model.texture is not None and model.detail_limits is not None and model.exposures is not None
@@ -216,22 +189,6 @@ def test_a_failing_stage_leaves_the_others(tmp_path: Path, monkeypatch: pytest.M
     out = tmp_path / "figures.json"
     assert command.main(["--quick", "--device", "cpu", "--only", "tiles,project", "--out", str(out)]) == 1
     assert "project, forward" in out.read_text()
-
-
-@pytest.mark.parametrize("max_hits", [0, 2, 4])
-def test_torch_comparison_agrees_with_the_kernels(max_hits: int) -> None:
-    g = geometry(small_scene())
-    with torch.no_grad():
-        projection = g.project()
-    records = projection.records.requires_grad_()
-    tiles = g.tiles(projection)
-    actual = outputs(ops.collect(projection, tiles, g.pinhole, max_hits=max_hits))
-    expected = bench_cpu.torch_collect(records, tiles, g.pinhole, max_hits)
-    for name, a, e in zip(("plain", "depths", "weights", "alpha"), actual, expected, strict=True):
-        assert_close(a, e, kind="value", name=name)
-    signals = random_like(actual)
-    gradients = [torch.autograd.grad(found, records, signals)[0] for found in (actual, expected)]
-    assert_close(*gradients, kind="gradient", name="records")
 
 
 def test_peer_gets_the_same_scene() -> None:
@@ -277,96 +234,3 @@ def test_entries_walked_by_our_side_end_at_each_pixel_s_last_hit() -> None:
     starts = tiles.tile_offsets[(y // tiles.tile_size) * tiles.columns + x // tiles.tile_size]
     assert walked == pytest.approx((hits.stops - starts).double().mean().item())
     assert 0 < walked < listed
-
-
-# Cost against size
-
-
-def test_sizes_cover_what_they_should() -> None:
-    sweep = bench_sizes.CUDA
-    ends = {axis: [getattr(p, axis) for p in sweep.along(axis)] for axis in ("surfels", "megapixels", "hits")}
-    assert (ends["surfels"][0], ends["surfels"][-1]) == (10_000, 4_000_000)
-    assert (ends["megapixels"][0], ends["megapixels"][-1]) == (0.25, 8.0)
-    assert (ends["hits"][0], ends["hits"][-1]) == (0, 8)
-    for axis in ends:
-        points = sweep.along(axis)
-        assert sweep.base in points
-        assert all((bench_sizes.share(axis, a, b) or 1) <= 2.5 for a, b in pairwise(points)), axis
-
-
-def test_sizes_mark_a_cliff_and_nothing_else() -> None:
-    before = figure("frame", 10.0, CPU, peak_mib=100.0)
-    fair, steep = (figure("frame", t, CPU, peak_mib=200.0) for t in (20.0, 30.0))
-    assert bench_sizes.growth(before, fair, 2.0) == "time x2.00, memory x2.00 for x2.00"
-    assert bench_sizes.growth(before, steep, 2.0) == "time x3.00 CLIFF, memory x2.00 for x2.00"
-    assert "memory x2.00 CLIFF" in bench_sizes.growth(before, fair, 1.5)
-    assert "CLIFF" not in bench_sizes.growth(before, steep, None), "a texture is more than its share of K = 0"
-
-
-def sizes(monkeypatch: pytest.MonkeyPatch, cost: Callable[[SimpleNamespace, int], float]) -> list[Measurement]:
-    """Run the CUDA sweeps over made-up costs in ms."""
-
-    def at_size(scene: SimpleNamespace, hits: int, *_: object) -> list[Measurement]:
-        return [figure(name, cost(scene, hits), CPU, **scene.facts) for name in ("frame", "frame + backward")]
-
-    monkeypatch.setattr(bench_sizes, "CPU", bench_sizes.CUDA)
-    monkeypatch.setattr(bench_sizes, "at_size", at_size)
-
-    def scene_at(point: bench_sizes.Point, *_: object) -> SimpleNamespace:
-        return SimpleNamespace(point=point, facts={"scene": str(point), "sizes": {"surfels": point.surfels}})
-
-    monkeypatch.setattr(bench_sizes, "scene_at", scene_at)
-    return bench_sizes.run(Options(CPU))
-
-
-def test_sizes_count_cliffs_and_leave_out_what_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    *rows, cliffs = sizes(monkeypatch, lambda scene, hits: scene.point.surfels / 1000)  # 4M: 4 s, over the limit
-    assert cliffs.median == 0 and not any(bench_sizes.CLIFF in m.note for m in rows)
-    by_surfels = [m for m in rows if m.name == "frame + backward, by surfels"]
-    assert by_surfels[-1].sizes["surfels"] == 2_000_000
-    assert "left out, too slow: surfels 4,000,000" in by_surfels[-1].note
-
-    *rows, cliffs = sizes(monkeypatch, lambda scene, hits: 1.0 if scene.point.megapixels < 4.0 else 100.0)
-    marked = [m for m in rows if bench_sizes.CLIFF in m.note]
-    assert cliffs.median == len(marked) == 2 and all("megapixels=4.0" in m.scene for m in marked)
-
-
-def test_sizes_leave_out_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def cost(scene: SimpleNamespace, hits: int) -> float:
-        if scene.point.surfels > 1_000_000:
-            raise torch.OutOfMemoryError("full")
-        return 1.0
-
-    rows = [m for m in sizes(monkeypatch, cost) if m.name == "frame + backward, by surfels"]
-    assert rows[-1].sizes["surfels"] == 1_000_000
-    assert "left out, out of memory: surfels 2,000,000, 4,000,000" in rows[-1].note
-
-
-def test_sizes_measure_a_scene_that_is_seen() -> None:
-    rows = bench_sizes.run(Options(CPU, quick=True))
-    assert {m.name.rpartition(" by ")[2] for m in rows[:-1]} == {"surfels", "megapixels", "hits"}
-    assert {m.sizes["max_hits"] for m in rows[:-1]} == {0, 2}
-    empty = replace(small_scene(), cameras=(away(small_scene().camera),))
-    with pytest.raises(RuntimeError, match="finite picture"):
-        bench_sizes.at_size(empty, 0, bench_sizes.QUICK, Options(CPU, quick=True))
-
-
-def away(camera: Camera) -> Camera:
-    """The same camera, far outside and looking away."""
-    viewmat = camera.viewmat.clone()
-    viewmat[2, 3] = -1000.0
-    return Camera(viewmat, camera.K, camera.width, camera.height)
-
-
-def test_kernels_of_a_call_are_summed_by_short_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    hashed = ("collect_kernel__locals__collect_0a1b2c3d_cuda_kernel_forward", "collect_kernel__locals__collect")
-    sums = "void at::native::reduce_kernel<512, 1, at::native::ReduceOp<float> >(at::native::ReduceOp<float>)"
-    found = {hashed[0]: 2.0, sums: 1.0, sums.replace("<512", "<256"): 0.5, "rare_kernel(int)": 0.001}
-    monkeypatch.setattr(bench_kernels, "gpu_time", lambda call, repeats: (3.501, found))
-    scene = cloud(10, 8, 8)
-    rows = [*bench_kernels.kernels("frame", lambda: None, scene, Options(CPU))]
-    told = {row.name: (row.median, row.note) for row in rows[1:]}
-    assert rows[0].median == 3.501 and told == {
-        f"frame: {hashed[1]}": (2.0, "57.1 % of the call"),
-        "frame: reduce_kernel<ReduceOp": (1.5, "42.8 % of the call"),
-    }
