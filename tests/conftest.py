@@ -36,11 +36,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests on CUDA are skipped where there is none; long tests come first, so that no worker ends long after others.
-
-    The forms of `form` are forms of CPU kernels, so that tests on CUDA run once.
-    """
-    items[:] = [item for item in items if not _twice_on_cuda(item)]
+    """Skip tests on CUDA where there is none; long tests come first, so that no worker ends long after others."""
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("cuda"):
@@ -48,22 +44,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
 
 
-def _twice_on_cuda(item: pytest.Item) -> bool:
-    parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-    return parameters.get("device") == "cuda" and parameters.get("form") == "scalar"
-
-
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Device to run on: the CPU always, CUDA with `-m cuda`."""
     return torch.device(request.param)
-
-
-@pytest.fixture(params=["simd", "scalar"])
-def form(request: pytest.FixtureRequest) -> Iterator[launch.CpuForm]:
-    """Both forms of the kernels on a CPU: the one written for CPUs, and the bodies that run on CUDA."""
-    with launch.cpu_form(request.param):
-        yield request.param
 
 
 @pytest.fixture(autouse=True)

@@ -17,10 +17,6 @@ Words, each with one meaning:
     thread              one execution of a kernel's body: a GPU thread, or one turn of a CPU's loop
     warp, lane          32 GPU threads that run together, and a thread's index among them (native/warp.py); on a CPU a
                         warp is one thread
-    SIMD vector, width  several neighbouring pixels or points in one value of a CPU thread, and their number
-                        (native/simd); its elements are called elements, not lanes
-    SIMD form           a stage written with SIMD vectors, for CPUs (cpu/); the scalar form is the body that runs on
-                        CUDA. `launch.cpu_form` chooses between them on a CPU, and tests run both
     entry               one (tile, surfel) pair of the tile lists; `k` is the place of an entry in the walk
     gradient slot       where one entry's gradient is added up, before `reduce` adds up each surfel's
     tile polygon        a surfel's support as projected to the image, which decides its tiles

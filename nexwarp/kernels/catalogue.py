@@ -10,8 +10,6 @@ from nexwarp.kernels.antialias import antialias_kernels
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
 from nexwarp.kernels.compose import compose_kernels
-from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel
-from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
 from nexwarp.kernels.expose import expose_kernels
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
@@ -142,15 +140,13 @@ def walk_kernels(
     fixed_point: bool = True,
 ) -> Iterator[wp.Kernel]:
     """Yield the kernels that walk along a tile's list, on CUDA in blocks of `walk.BLOCK_DIM`."""
-    forward = collect_simd_kernel if cpu else collect_kernel
-    backward = collect_simd_backward_kernel if cpu else collect_backward_kernel
     for low_pass in low_passes:
-        yield (splat_error_simd_kernel if cpu else splat_error_kernel)(real, low_pass, tile_size)
+        yield splat_error_kernel(real, low_pass, tile_size)
         if fixed_point and not cpu:
             yield splat_error_kernel(real, low_pass, tile_size, fixed_point=True)
         for hits in max_hits:
-            yield forward(real, hits, low_pass, tile_size)
+            yield collect_kernel(real, hits, low_pass, tile_size)
             for with_errors in (False, True):
-                yield backward(real, hits, low_pass, tile_size, with_errors)
+                yield collect_backward_kernel(real, hits, low_pass, tile_size, with_errors, by_place=cpu)
                 if fixed_point and not cpu:
                     yield collect_backward_kernel(real, hits, low_pass, tile_size, with_errors, fixed_point=True)

@@ -11,7 +11,6 @@ A thread is a pixel (see `walk`). Read: records, centres and limits of the surfe
 A hit counts where alpha >= 1/255 and its depth lies beyond `near`; the walk ends behind the hit that takes the
 transmittance below 1e-4. `collect_backward` differentiates all outputs but ids and stops with respect to records and,
 with the low-pass, centres. Frozen there: the lists, which hits count, which are in the buffer, where the walk ends.
-`cpu.collect` is the SIMD form of this kernel.
 """
 
 import functools

@@ -9,8 +9,6 @@ from torch.autograd.function import once_differentiable
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel
-from nexwarp.kernels.cpu.collect import collect_simd_backward_kernel, collect_simd_kernel, strip_width
-from nexwarp.kernels.cpu.splat_error import splat_error_simd_kernel
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.splat_error import splat_error_kernel
 from nexwarp.kernels.types import MAX_HITS, types
@@ -24,7 +22,6 @@ from nexwarp.ops._interop import (
     real_of,
     sums_in_fixed_point,
     sums_like,
-    uses_simd,
 )
 from nexwarp.ops.pinhole import Pinhole
 from nexwarp.ops.project import Projection
@@ -129,24 +126,19 @@ def splat_error(
     inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
     pixels = [sums.slots, array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
     variant = (real, low_pass, tiles.tile_size)
-    if uses_simd(records):
-        inputs += [array(tiles.reaches, types(real).vec2), *pixels]
-        width = strip_width(tiles.tile_size)
-        launch_walk(records, splat_error_simd_kernel(*variant), tiles, inputs, [sums.array(slots, real)], width)
-    else:
-        kernel = splat_error_kernel(*variant, sums.fixed_point)
-        launch_walk(records, kernel, tiles, inputs + pixels, [sums.array(slots, real), sums.bad_array])
+    kernel = splat_error_kernel(*variant, sums.fixed_point)
+    launch_walk(records, kernel, tiles, inputs + pixels, [sums.array(slots, real), sums.bad_array])
     return sums.reduce(slots[:, None], real)[:, 0]
 
 
 def launch_walk(
-    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Argument], outputs: list[Argument], width: int = 1
+    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Argument], outputs: list[Argument]
 ) -> None:
-    """Launch a kernel over the pixels of all tiles, `width` of them a thread."""
-    threads = tiles.tile_size**2 // width
+    """Launch a kernel over the pixels of all tiles."""
+    pixels = tiles.tile_size**2
+    count = (len(tiles.tile_offsets) - 1) * pixels
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    count = (len(tiles.tile_offsets) - 1) * threads
-    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=threads, smallest=threads, even=False)
+    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
 
 
 def walk_inputs(
@@ -243,11 +235,7 @@ class _Collect(torch.autograd.Function):
         ]
         inputs = [*walk_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
         variant = (real, max_hits, low_pass, tiles.tile_size)
-        if uses_simd(records):
-            width = strip_width(tiles.tile_size)
-            launch_walk(records, collect_simd_kernel(*variant), tiles, inputs, outputs, width)
-        else:
-            launch_walk(records, collect_kernel(*variant), tiles, inputs, outputs)
+        launch_walk(records, collect_kernel(*variant), tiles, inputs, outputs)
         ctx.save_for_backward(records, centers, limits, plain, base, ids, weights, alphas, stops)
         ctx.mark_non_differentiable(ids, stops)
         ctx.rest = (tiles, camera, max_hits, low_pass, request)
@@ -290,12 +278,8 @@ class _Collect(torch.autograd.Function):
         grad_centers = sums.new(3) if low_pass else None
         error_sums = None if request.errors is None else sums.new()
         outputs = [sums.array(grad_records, t.vec4), sums.array(grad_centers, t.vec3), sums.array(error_sums, real)]
-        if uses_simd(records) and not sums.fixed_point:
-            width = strip_width(tiles.tile_size)
-            launch_walk(records, collect_simd_backward_kernel(*variant), tiles, inputs, outputs, width)
-        else:
-            kernel = collect_backward_kernel(*variant, sums.fixed_point, tiles.exact)
-            launch_walk(records, kernel, tiles, inputs, [*outputs, sums.bad_array])
+        kernel = collect_backward_kernel(*variant, sums.fixed_point, tiles.exact)
+        launch_walk(records, kernel, tiles, inputs, [*outputs, sums.bad_array])
         if error_sums is not None:
             request.sums_after_backward = sums.reduce(error_sums[:, None], real)[:, 0]
         grad_records = sums.reduce(grad_records, t.vec4)

@@ -14,9 +14,6 @@ from tests.narrowing import present
 from tests.scenes import SURFEL_KEYS, Scene, detached_shape, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-BOTH_FORMS = pytest.mark.usefixtures("form")
-
 BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
 BACKGROUND = (0.1, 0.4, 0.7)
 SIDE = 8192
@@ -87,7 +84,6 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("case", CASES)
 def test_extreme_surfels_are_finite(case: str, low_pass: bool, device: torch.device) -> None:
@@ -96,7 +92,6 @@ def test_extreme_surfels_are_finite(case: str, low_pass: bool, device: torch.dev
     check_finite(scene_with(device, **values), raw, low_pass=low_pass)
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("factor", [1e4, 1e8, 1e15])
 def test_huge_worlds_are_finite(factor: float, low_pass: bool, device: torch.device) -> None:
@@ -106,7 +101,6 @@ def test_huge_worlds_are_finite(factor: float, low_pass: bool, device: torch.dev
     check_finite(far | {"scales": factor * scene["scales"]}, low_pass=low_pass)
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("near", [0.0, 0.01])
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
@@ -116,7 +110,6 @@ def test_a_camera_inside_surfels_is_finite(scale: float, near: float, low_pass: 
     check_finite(scene | {"means": position.expand(24, 3).clone()}, low_pass=low_pass)
 
 
-@BOTH_FORMS
 def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.device) -> None:
     """The camera sits in a sheet, or before it by less than near."""
     for depth, near, seen in ((0.0, 0.01, False), (0.005, 0.01, False), (0.005, 0.0, True), (0.02, 0.01, True)):
@@ -125,7 +118,6 @@ def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.devic
         assert_close(out.alpha, torch.full((16, 16), 0.9 if seen else 0.0), kind="value", name=f"alpha at {depth}")
 
 
-@BOTH_FORMS
 def test_specks_are_seen_with_the_low_pass_alone(device: torch.device) -> None:
     scene = facing(device, scales=1e-8)
     assert not check_finite(scene).alpha.any()
@@ -135,7 +127,6 @@ def test_specks_are_seen_with_the_low_pass_alone(device: torch.device) -> None:
     assert_close(check_finite(scene, low_pass=True).alpha, expected, kind="value", name="alpha")
 
 
-@BOTH_FORMS
 def test_gamma_1000_is_a_quad(device: torch.device) -> None:
     """Opacity inside, nothing outside: 0.5 is 4 pixels, whose edges run between pixel centres."""
     expected = torch.zeros(16, 16)
@@ -143,7 +134,6 @@ def test_gamma_1000_is_a_quad(device: torch.device) -> None:
     assert_close(check_finite(facing(device, gammas=1e3)).alpha, expected, kind="value", name="alpha")
 
 
-@BOTH_FORMS
 def test_opacity_at_both_ends(device: torch.device) -> None:
     scene = facing(device, scales=1e8)
     opaque = check_finite(scene | {"opacities": torch.ones(1, device=device)})
@@ -152,7 +142,6 @@ def test_opacity_at_both_ends(device: torch.device) -> None:
         assert not check_finite(scene, {"logit_opacities": raw}).alpha.any()
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize(("scales", "opacity"), [(1e-8, 0.9), (1e8, 1.0)])
 def test_extremes_among_others_leave_those_as_they_are(scales: float, opacity: float, device: torch.device) -> None:
     """Surfels that cannot be seen, specks or sheets behind the camera, change no bit of the picture."""
@@ -170,7 +159,6 @@ def test_extremes_among_others_leave_those_as_they_are(scales: float, opacity: f
 # Sizes
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (1, 1), (SIDE, 1), (1, SIDE), (SIDE, 8)])
 def test_images_of_any_size(width: int, height: int, device: torch.device) -> None:
     """What a pixel shows does not depend on the image that it is in."""

@@ -18,9 +18,6 @@ from tests.render_support import (
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, multiply, random_scene, rigid
 from tests.tolerances import assert_close, assert_finite, assert_same_ids
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-pytestmark = pytest.mark.usefixtures("form")
-
 
 def test_repeated_renders_are_identical(device: torch.device) -> None:
     scene, texture = random_scene(device=device), make_texture(device=device)

@@ -12,9 +12,6 @@ from tests.render_support import MAX_HITS, assert_alike, assert_same, draw, refe
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-pytestmark = pytest.mark.usefixtures("form")
-
 
 @pytest.mark.parametrize("max_hits", [0, 2, MAX_HITS])
 def test_a_residual_texture_of_zeros_shows_the_plain_colours(max_hits: int, device: torch.device) -> None:

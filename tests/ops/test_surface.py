@@ -20,9 +20,6 @@ from tests.scenes import (
 )
 from tests.tolerances import FLIPS, assert_close
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-pytestmark = pytest.mark.usefixtures("form")
-
 DEPTHS = ("expected_depth", "median_depth", "top_depth")
 BUFFERS = (*DEPTHS, "normals", "blended_normals", "distortion")
 MAX_HITS = 8

@@ -19,9 +19,6 @@ from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("restore_launch_threads")
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-BOTH_FORMS = pytest.mark.usefixtures("form")
-
 BUFFERS = ("plain", "base", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
@@ -85,7 +82,6 @@ def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
 # Threads
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize(("low_pass", "size"), [(False, BIG), (True, BIG), (False, WIDE)])
 def test_collect_does_not_depend_on_threads(low_pass, size):
     scene = random_scene(600, **size)
@@ -103,7 +99,6 @@ def test_collect_does_not_depend_on_threads(low_pass, size):
     assert_identical(results)
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("with_colors", [False, True], ids=["coefficients", "colors"])
 @pytest.mark.parametrize("turned", [False, True], ids=["fixed", "turned"])
 def test_texture_does_not_depend_on_threads(with_colors, turned):
@@ -165,7 +160,6 @@ def test_many_threads_share_more_chunks():
 # Tiles
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("make", [random_scene, layered_scene])
 def test_hits_do_not_depend_on_the_size_of_tiles(make):
     """Values to the last bit; gradients to rounding, as the sums over tiles change their order."""
@@ -199,7 +193,6 @@ def summed(passes: Passes, errors: torch.Tensor, count: int) -> torch.Tensor:
     return torch.zeros(count, dtype=torch.float64).index_add(0, ids.clamp_min(0).flatten(), shares.flatten())
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
@@ -210,7 +203,6 @@ def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
     assert_close(passes.blended(errors), summed(passes, errors, 8), kind="value", name="blended")
 
 
-@BOTH_FORMS
 @pytest.mark.parametrize("make", [random_scene, layered_scene])
 def test_blended_error_is_the_gradient_to_the_colours(make):
     """With K = 0 the image is sum w c, so d(sum error * image) / dc = sum w error, for any number of hits."""
@@ -222,7 +214,6 @@ def test_blended_error_is_the_gradient_to_the_colours(make):
         assert_close(passes.blended(errors), gradient[:, channel], kind="value", name="blended")
 
 
-@BOTH_FORMS
 def test_the_backward_pass_gives_the_blended_error_on_request():
     scene = random_scene(40, seed=5)
     errors = errors_of(scene)

@@ -10,10 +10,6 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.native.simd.arithmetic import arithmetic_functions
-from nexwarp.native.simd.exp_log import exp_log_functions
-from nexwarp.native.simd.masks import mask_functions
-
 
 @functools.cache
 def simd_functions(real: type, width: int, for_gradients: bool = False) -> SimpleNamespace:
@@ -28,18 +24,7 @@ def simd_functions(real: type, width: int, for_gradients: bool = False) -> Simpl
         and binary logarithms have no derivative. For widths over 1 also `integers`, the type of masks and of whole
         numbers, `integer`, an element of it, as wide as `real`, and the rest of `mask_functions`.
     """
-    if width == 1:
-        return _scalar_functions(real)
-    integer = wp.int64 if real is wp.float64 else wp.int32
-    arithmetic = arithmetic_functions(real, width)
-    return SimpleNamespace(
-        reals=wp.types.vector(length=width, dtype=real),
-        integers=wp.types.vector(length=width, dtype=integer),
-        integer=integer,
-        **vars(arithmetic),
-        **vars(exp_log_functions(real, width)),
-        **vars(mask_functions(real, width, arithmetic.splat)),
-    )
+    return _scalar_functions(real)
 
 
 # Base 2 is what a GPU has instructions for: base e would multiply by ln 2 before or after each. Accurate to 2 units in

@@ -1,1 +1,0 @@
-"""SIMD forms of stages, for the CPU: collection, blended errors, lookup, and the texture's MLP with its SH."""
