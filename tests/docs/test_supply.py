@@ -19,7 +19,7 @@ else:
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ("torch", "run", "dev")
-RUN_EXTRAS = ("viewer", "video", "tensorboard", "wandb", "flip", "wgpu", "glb", "splats")
+RUN_EXTRAS = ("viewer", "video", "tensorboard", "wandb", "flip", "glb", "splats")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PLATFORMS = (
     {"sys_platform": "linux", "platform_machine": "x86_64"},

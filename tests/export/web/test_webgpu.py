@@ -3,6 +3,7 @@
 import base64
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,12 @@ import torch
 
 import nexwarp as nw
 from nexwarp.export.web.export import static_files
-from nexwarp.export.web.program import Program, shader
-from nexwarp.export.web.renderer import SHARING
-from nexwarp.export.web.scene_data import SceneData
 from nexwarp.export.web.scene_file import encode_scene
-from nexwarp.export.web.scene_reader import read_header
+from nexwarp.model.options import RenderOptions
+from nexwarp.viewer.modes import _id_colours, _normals
 from tests.export.web.support import CHROMIUM, FLAGS, named_cameras, psnr, serving, web_model
 from tests.export.web.test_scene_file import damaged
-from tests.tolerances import FLIPS, WEB_PSNR, assert_same_ids
+from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
@@ -31,24 +30,25 @@ PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="module">
 import { Renderer } from "nexwarp/renderer.js";
 import { SceneReader, fromHalf, toHalf } from "nexwarp/scene.js";
-import * as program from "nexwarp/program.js";
-window.nexwarp = { Renderer, SceneReader, fromHalf, toHalf, program };
+window.nexwarp = { Renderer, SceneReader, fromHalf, toHalf };
 </script>"""
-RENDER = """async ([file, camera, canvas]) => {
-    const stages = [];
-    const target = canvas ? document.getElementById("canvas") : null;
-    const renderer = await nexwarp.Renderer.create(target, { onStage: (stage) => stages.push(stage) });
+OPEN = """async ([file, settings, canvas]) => {
+    window.stages = [];
+    window.renderer?.destroy();
+    window.target = canvas ? document.getElementById("canvas") : null;
+    window.renderer = await nexwarp.Renderer.create(target, { onStage: (stage) => stages.push(stage), ...settings });
     await renderer.load(file);
-    const frame = await renderer.render(camera);
-    const base64 = (array) => btoa(String.fromCharCode(...new Uint8Array(array.buffer)));
-    const image = base64(await renderer.read("image"));
-    const ids = base64(await renderer.read("ids"));
-    const result = { stages, frame, image, ids, info: renderer.info, picked: await renderer.pick(18, 13, camera) };
-    if (canvas) {
-        result.shown = [...target.getContext("2d").getImageData(0, 0, 37, 27).data];
-    }
-    renderer.destroy();
-    return result;
+}"""
+RENDER = """async ([camera, options, names]) => {
+    const base64 = (array) => {
+        let text = "";
+        for (const byte of new Uint8Array(array.buffer)) text += String.fromCharCode(byte);
+        return btoa(text);
+    };
+    const frame = await renderer.render(camera, options);
+    const buffers = {};
+    for (const name of names) buffers[name] = base64(await renderer.read(name));
+    return [frame.entries, buffers];
 }"""
 READ = """async (file) => {
     try {
@@ -60,11 +60,49 @@ READ = """async (file) => {
         return `${error.name}: ${error.message}`;
     }
 }"""
+CASES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "3 hits, clamped": {
+        "features": 4,
+        "residual": False,
+        "options": RenderOptions(max_hits=3, clamp_texture=True, background=(0.5, 0.2, 0.1)),
+    },
+    "no hits": {"options": RenderOptions(max_hits=0)},
+    "1 hit, degree 1": {"features": 1, "texture_degree": 1, "hidden_layers": 1, "options": RenderOptions(max_hits=1)},
+    "no hidden layers, degree 2": {"features": 8, "hidden_layers": 0, "options": RenderOptions(sh_degree=2)},
+    "no limits, mean exposure": {"options": RenderOptions(detail_limits=False, exposure="mean")},
+}
+
+
+@dataclass
+class Tab:
+    """A browser's page with the modules, the folder that it is served from, and its errors."""
+
+    page: Any
+    folder: Path
+    errors: list[str]
+
+    def load(self, content: bytes, *, canvas: bool = False, **settings: Any) -> None:
+        """Load a scene file's content into a new renderer."""
+        (self.folder / "scene.nxw").write_bytes(content)
+        self.page.evaluate(OPEN, ["scene.nxw", settings, canvas])
+
+    def render(self, camera: nw.Camera, *names: str, **options: Any) -> tuple[int, dict[str, torch.Tensor]]:
+        """Render; returns the number of list entries, and "image" and further buffers by name, (H, W, C)."""
+        names = ("image", *names)
+        entries, buffers = self.page.evaluate(RENDER, [entry_of(camera), options, names])
+        size = (camera.height, camera.width, -1)
+        arrays = {
+            name: np.frombuffer(base64.b64decode(text), np.int32 if name == "ids" else np.float32).copy()
+            for name, text in buffers.items()
+        }
+        tensors = {name: torch.from_numpy(array).reshape(size) for name, array in arrays.items() if array.size}
+        tensors["image"] = tensors["image"][..., :3].contiguous()
+        return entries, tensors
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory) -> Iterator[tuple[Any, Path, list[str]]]:
-    """A browser's page with the modules, the folder that it is served from, and its errors."""
+def tab(tmp_path_factory) -> Iterator[Tab]:
     api = pytest.importorskip("playwright.sync_api", reason="drives Chromium (extra `dev`)")
     folder = tmp_path_factory.mktemp("page")
     (folder / "shaders").mkdir()
@@ -74,13 +112,21 @@ def page(tmp_path_factory) -> Iterator[tuple[Any, Path, list[str]]]:
     errors: list[str] = []
     with serving(folder) as url, api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        opened = browser.new_page()
-        opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        opened.on("pageerror", lambda error: errors.append(str(error)))
-        opened.goto(url)
-        opened.wait_for_function("window.nexwarp")
-        yield opened, folder, errors
+        page = browser.new_page()
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(url)
+        page.wait_for_function("window.nexwarp")
+        yield Tab(page, folder, errors)
         browser.close()
+
+
+@pytest.fixture
+def default(tab) -> tuple[nw.Model, nw.Camera]:
+    """The default model, loaded bit for bit in single precision, and its camera."""
+    model, camera = web_model()
+    tab.load(encode_scene(model, named_cameras(camera), quality="full"), half=False)
+    return model, camera
 
 
 def entry_of(camera: nw.Camera) -> dict[str, object]:
@@ -90,73 +136,134 @@ def entry_of(camera: nw.Camera) -> dict[str, object]:
     return {"viewmat": camera.viewmat.flatten().tolist(), "K": K, **size}
 
 
+@torch.no_grad()
+def test_the_canvas_shows_the_model(tab):
+    model, camera = web_model()
+    expected = model.render(camera)
+    tab.load(encode_scene(model, named_cameras(camera), quality="full", poster=b"picture"), canvas=True)
+    info = tab.page.evaluate("renderer.info")
+    assert info["textured"] and info["surfels"] == len(model.surfels)
+    assert tab.page.evaluate("stages") == ["header", "geometry", "grid", "done"]
+    _, out = tab.render(camera, "ids")
+    assert psnr(out["image"].numpy(), expected.image.numpy()) > WEB_PSNR["full"]
+    pixels = tab.page.evaluate("[...target.getContext('2d').getImageData(0, 0, 37, 27).data]")
+    shown = np.array(pixels, np.float32).reshape(camera.height, camera.width, 4)[..., :3] / 255
+    assert np.abs(shown - out["image"].numpy().clip(0, 1)).max() < 1.1 / 255
+    picked = tab.page.evaluate("camera => renderer.pick(18, 13, camera)", entry_of(camera))
+    assert picked["id"] == out["ids"][13, 18, 0]
+    assert picked["depth"] == pytest.approx(expected.depths[13, 18, 0].item(), rel=1e-4)
+    assert tab.errors == []
+
+
 @pytest.mark.parametrize(
-    ("quality", "degree"),
-    [("full", 3), ("full", 6), *(pytest.param("quantised", d, marks=pytest.mark.slow) for d in (3, 6))],
+    "case", [name if name == "default" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
-def test_the_picture_is_that_of_the_model(page, quality, degree):
-    opened, folder, errors = page
-    model, camera = web_model(sh_degree=degree, options=nw.RenderOptions(sh_degree=degree))
-    with torch.no_grad():
-        expected = model.render(camera)
-    (folder / "scene.nxw").write_bytes(encode_scene(model, named_cameras(camera), quality=quality, poster=b"picture"))
-    result = opened.evaluate(RENDER, ["scene.nxw", entry_of(camera), quality == "full"])
-    assert result["stages"] == ["header", "geometry", "grid", "done"]
-    assert result["info"]["textured"] and result["info"]["surfels"] == len(model.surfels)
-    size = (camera.height, camera.width)
-    image = np.frombuffer(base64.b64decode(result["image"]), np.float32).reshape(*size, 4)[..., :3]
-    assert psnr(image, expected.image.numpy()) > WEB_PSNR[quality]
-    if quality == "full":
-        ids = np.frombuffer(base64.b64decode(result["ids"]), np.int32).reshape(expected.ids.shape)
-        assert_same_ids(torch.from_numpy(ids.copy()), expected.ids, name="ids", allow_flips=FLIPS)
-        shown = np.array(result["shown"], np.float32).reshape(*size, 4)[..., :3] / 255
-        assert np.abs(shown - image.clip(0, 1)).max() < 1.1 / 255
-        assert result["picked"]["id"] == ids[13, 18, 0]
-        assert result["picked"]["depth"] == pytest.approx(expected.depths[13, 18, 0].item(), rel=1e-4)
-    assert errors == []
+@torch.no_grad()
+def test_all_buffers_are_those_of_the_model(tab, case):
+    model, camera = web_model(**CASES[case])
+    expected = model.render(camera)
+    tab.load(encode_scene(model, named_cameras(camera), quality="full"), half=False)
+    _, out = tab.render(camera, "ids", "depths", "weights", "colors")
+    buffers = {name: out[name] for name in ("image", "depths", "weights") if name in out}
+    buffers["alpha"] = out["colors"][..., 3].contiguous()
+    for mode in ("plain", "textured"):
+        buffers[mode] = tab.render(camera, mode=mode)[1]["image"]
+    if model.options.max_hits:
+        assert_same_ids(out["ids"], expected.ids, name="ids", allow_flips=FLIPS)
+    for name, buffer in buffers.items():
+        # Drivers may compute exp2 and log2 with a few units in the last place; opacities near 1 amplify them.
+        assert_close(buffer, getattr(expected, name), kind="value", name=name, allow_flips=FLIPS)
 
 
-def test_constants_and_shaders_are_those_of_python(page):
-    opened, _, _ = page
-    cases: list[dict[str, Any]] = [
-        {},
-        {"sh_degree": 6, "options": nw.RenderOptions(sh_degree=6)},
-        {"features": 4, "residual": False, "hidden_layers": 0, "texture_degree": 1},
-    ]
-    for case in cases:
-        model, camera = web_model(**case)
-        scene = SceneData.of(model)
-        header, _ = read_header(encode_scene(model, named_cameras(camera)))
-        program = Program.of(scene, SHARING, half=False, unrolled=True, uniform=True)
-        names = ["common", "project", "lists", "collect", "shade", "mlp", "compose", f"features{program.features}"]
-        texts = {name: shader(name) for name in names}
-        found = opened.evaluate(
-            """([header, texts, features]) => {
-                const constants = nexwarp.program.constantsOf(header);
-                const source = (name) => nexwarp.program.sourceOf(name, constants, texts, features, false, true);
-                return [constants, source("shade"), source("collect")];
-            }""",
-            [header, texts, program.features],
-        )
-        assert found == [program.constants, program.source("shade"), program.source("collect")]
+@torch.no_grad()
+def test_a_quantised_file_is_within_its_bound(tab):
+    model, camera = web_model()
+    tab.load(encode_scene(model, named_cameras(camera)))
+    _, out = tab.render(camera)
+    assert psnr(out["image"].numpy(), model.render(camera).image.numpy()) > WEB_PSNR["quantised"]
 
 
-def test_half_precision_numbers_are_those_of_numpy(page):
-    opened, _, _ = page
+def test_lists_grow_and_pictures_repeat_bit_for_bit(tab, default):
+    _, camera = default
+    entries, expected = tab.render(camera)
+    assert entries > 16
+    tab.render(camera, mode="depth")
+    assert torch.equal(tab.render(camera)[1]["image"], expected["image"])
+    tab.page.evaluate("renderer.capacity = 16")
+    again, out = tab.render(camera)
+    assert again == entries and tab.page.evaluate("renderer.capacity") >= entries
+    assert torch.equal(out["image"], expected["image"])
+
+
+@torch.no_grad()
+def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
+    model, camera = default
+    expected = model.render(camera)
+    ids = expected.ids[..., 0].long()
+    hit = (ids >= 0)[..., None]
+    normals = _normals(model.surfels, camera.position)[ids.clamp_min(0)]
+    pictures = {"ids": _id_colours(ids) * hit, "normals": (0.5 + 0.5 * normals) * hit}
+    pictures["alpha"] = expected.alpha[..., None].expand(*ids.shape, 3)
+    for mode, picture in pictures.items():
+        shown = tab.render(camera, mode=mode)[1]["image"]
+        assert_close(shown, picture.contiguous(), kind="value", name=mode, allow_flips=FLIPS)
+    depth, shown = expected.depths[..., 0], tab.render(camera, mode="depth")[1]["image"]
+    low, high = depth[hit[..., 0]].quantile(torch.tensor([0.25, 0.75]))
+    near, far = shown[hit[..., 0] & (depth <= low)], shown[hit[..., 0] & (depth >= high)]
+    assert near[:, 1].mean() < far[:, 1].mean()  # violet to yellow
+
+
+@torch.no_grad()
+def test_ways_to_save_work_change_what_they_say(tab, default):
+    model, camera = default
+    exact, coarse = tab.render(camera)[1]["image"], tab.render(camera, textureScale=0.5)[1]["image"]
+    # A pixel's own texel has 9,999 of 10,000 parts.
+    assert (coarse[::2, ::2] - exact[::2, ::2]).abs().max() < 1e-3
+    assert 1e-4 < (coarse - exact).abs().max()
+    # Light second hits have their plain colours.
+    out = model.render(camera)
+    base = out.intermediates.projection.records[:, 3, :3][out.ids[..., 1].clamp_min(0).long()]
+    factors = out.intermediates.factors
+    assert factors is not None
+    second = (base * factors - out.colors[..., 1, :]) * out.weights[..., 1:]
+    expected = out.image + second * (out.ids[..., 1:] >= 0)
+    image = tab.render(camera, leastWeight=1.0)[1]["image"]
+    assert_close(image, expected, kind="value", name="image", allow_flips=FLIPS)
+
+
+def test_an_empty_scene_shows_the_background(tab):
+    model, camera = web_model()
+    empty = nw.Surfels({name: value[:0] for name, value in model.surfels.state_dict().items()})
+    bare = nw.Model(empty, None, options=RenderOptions(background=(0.25, 0.5, 1.0)))
+    tab.load(encode_scene(bare, named_cameras(camera), quality="full"))
+    entries, out = tab.render(camera, "ids")
+    assert entries == 0 and (out["ids"] == -1).all()
+    assert torch.equal(out["image"], torch.tensor([0.25, 0.5, 1.0]).expand_as(out["image"]))
+
+
+def test_what_cannot_be_rendered_is_named(tab, default):
+    _, camera = default
+    text = "([camera, options]) => renderer.render(camera, options).then(() => '', error => error.message)"
+    assert "expected one of image, plain" in tab.page.evaluate(text, [entry_of(camera), {"mode": "picture"}])
+    large = {**entry_of(camera), "width": 60_000, "height": 60_000}
+    assert "picture of 60000 x 60000 pixels" in tab.page.evaluate(text, [large, {}])
+    assert tab.render(camera)[1]["image"].shape == (camera.height, camera.width, 3)
+
+
+def test_half_precision_numbers_are_those_of_numpy(tab):
     halves = np.arange(0, 2**16, 7, dtype=np.uint16)
     values = halves.view(np.float16)
     finite = halves[np.isfinite(values)]
-    numbers = opened.evaluate("(halves) => halves.map(nexwarp.fromHalf)", finite.tolist())
+    numbers = tab.page.evaluate("(halves) => halves.map(nexwarp.fromHalf)", finite.tolist())
     np.testing.assert_array_equal(numbers, finite.view(np.float16).astype(np.float64))
     rng = np.random.default_rng(0)
     floats = (rng.standard_normal(2000) * 10.0 ** rng.integers(-9, 5, 2000)).astype(np.float32)
-    bits = opened.evaluate("(floats) => floats.map(nexwarp.toHalf)", floats.astype(float).tolist())
+    bits = tab.page.evaluate("(floats) => floats.map(nexwarp.toHalf)", floats.astype(float).tolist())
     np.testing.assert_array_equal(np.array(bits, np.uint16), floats.astype(np.float16).view(np.uint16))
 
 
-def test_damaged_files_give_one_line(page):
-    opened, folder, _ = page
+def test_damaged_files_give_one_line(tab):
     for name, content in damaged().items():
-        (folder / "damaged.nxw").write_bytes(content)
-        message = opened.evaluate(READ, f"damaged.nxw?{json.dumps(name)}")
+        (tab.folder / "damaged.nxw").write_bytes(content)
+        message = tab.page.evaluate(READ, f"damaged.nxw?{json.dumps(name)}")
         assert message.startswith("SceneError: scene file: ") and "\n" not in message, (name, message)
