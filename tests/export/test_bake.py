@@ -16,8 +16,9 @@ from nexwarp.export.bake.glb import CUTOFF, save_glb, upright
 from nexwarp.export.bake.layout import lay_out
 from nexwarp.export.bake.observe import observe
 from nexwarp.export.splats_spz import save_splats_spz
-from nexwarp.export.web.atlas import ATLAS_FILE, BAKED_FILE, as_stored, decode_harmonics, encode_baked, encode_harmonics
+from nexwarp.export.web.atlas import ATLAS_FILE, BAKED_FILE, encode_baked, encode_harmonics
 from tests.export.web.baked_support import bilinear, composited, ring
+from tests.export.web.scene_reader import as_stored, decode_harmonics
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

@@ -2,10 +2,8 @@
 
 import base64
 import html
-import importlib.util
 import io
 import json
-import re
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -15,6 +13,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.errors import FormatError
+from nexwarp.export.web.atlas import bake
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import written_aside
 from nexwarp.io.pictures import to_uint8
@@ -23,18 +22,13 @@ from nexwarp.model.model import Model
 INDEX = "index.html"
 TITLE = "__TITLE__"
 IMPORT_MAP = '{"imports": {"nexwarp/": "./"}}'
+STYLE_LINK = '<link rel="stylesheet" href="style.css">'
 POSTER_WIDTH = 640
 POSTER_QUALITY = 75
-MODULES, STYLES = ".js", ".css"
 
 
 def export_web(
-    model: Model,
-    cameras: Mapping[str, Camera],
-    out: Path,
-    *,
-    quality: str = "quantised",
-    title: str = "nexwarp",
+    model: Model, cameras: Mapping[str, Camera], out: Path, *, quality: str = "quantised", title: str = "nexwarp"
 ) -> list[Path]:
     """Write the page of a scene.
 
@@ -55,13 +49,11 @@ def export_web(
     if out.suffix == ".html":
         content = {out.name: one_file(content)}
         out = out.parent
-    written = []
     for name, data in content.items():
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         with written_aside(out / name) as aside:
             aside.write_bytes(data)
-        written.append(out / name)
-    return written
+    return [out / name for name in content]
 
 
 def web_page(model: Model, cameras: Mapping[str, Camera], title: str = "nexwarp") -> bytes:
@@ -73,54 +65,45 @@ def page_files(
     model: Model, cameras: Mapping[str, Camera], *, quality: str = "quantised", title: str = "nexwarp"
 ) -> dict[str, bytes]:
     """Return the content of the page's files by name."""
-    found = dict(static_files())
-    text = found[INDEX].decode()
-    found[INDEX] = text.replace(TITLE, html.escape(title)).encode()
+    content = dict(static_files())
+    content[INDEX] = content[INDEX].decode().replace(TITLE, html.escape(title)).encode()
     poster = _poster(model, next(iter(cameras.values()))) if cameras else None
-    found[SCENE_FILE] = encode_scene(model, cameras, quality=quality, title=title, poster=poster)
-    if importlib.util.find_spec("nexwarp.export.web.atlas") is not None:
-        from nexwarp.export.web.atlas import bake
-
-        found |= bake(model, cameras)
-    return found
+    content[SCENE_FILE] = encode_scene(model, cameras, quality=quality, title=title, poster=poster)
+    return content | bake(model, cameras)
 
 
 @cache
 def static_files() -> Mapping[str, bytes]:
     """Return the content of the files that every page has."""
     package = files("nexwarp.export.web")
-    found = {item.name: item.read_bytes() for item in package.joinpath("page").iterdir() if item.is_file()}
-    for item in package.joinpath("shaders").iterdir():
-        if item.name.endswith(".wgsl"):
-            found[f"shaders/{item.name}"] = item.read_bytes()
-    return {name: found[name] for name in sorted(found)}
+    content = {item.name: item.read_bytes() for item in package.joinpath("page").iterdir() if item.is_file()}
+    shaders = [item for item in package.joinpath("shaders").iterdir() if item.name.endswith(".wgsl")]
+    content |= {f"shaders/{item.name}": item.read_bytes() for item in shaders}
+    return dict(sorted(content.items()))
 
 
 def one_file(content: Mapping[str, bytes]) -> bytes:
     """Return a page's files as one HTML file: modules in the import map, the others as elements with base64 text."""
-    page = content[INDEX].decode()
+    encoded = {name: base64.b64encode(data).decode() for name, data in content.items()}
     modules = {
-        f"nexwarp/{name}": f"data:text/javascript;base64,{base64.b64encode(data).decode()}"
-        for name, data in content.items()
-        if name.endswith(MODULES)
+        f"nexwarp/{name}": f"data:text/javascript;base64,{text}"
+        for name, text in encoded.items()
+        if name.endswith(".js")
     }
+    assets = "".join(
+        f'<script type="application/octet-stream" id="asset:{name}">{text}</script>\n'
+        for name, text in encoded.items()
+        if name != INDEX and not name.endswith((".js", ".css"))
+    )
+    page = content[INDEX].decode()
     first_script = page.find("<script", page.find("<body"))
     if IMPORT_MAP not in page or first_script < 0:
         raise FormatError(f"{INDEX}: expected the import map {IMPORT_MAP} and a script in the body")
     head, body = page[:first_script], page[first_script:]
-    page = head.replace(IMPORT_MAP, json.dumps({"imports": modules}))
-
-    def style(match: re.Match[str]) -> str:
-        return f"<style>{content[match[1]].decode()}</style>"
-
-    page = re.sub(r'<link rel="stylesheet" href="([^"]+)">', style, page)
-    elements = "".join(
-        f'<script type="application/octet-stream" id="asset:{name}">{base64.b64encode(data).decode()}</script>\n'
-        for name, data in content.items()
-        if name != INDEX and not name.endswith((MODULES, STYLES))
-    )
-    # Before the scripts, which look for them.
-    return f"{page}{elements}{body}".encode()
+    head = head.replace(IMPORT_MAP, json.dumps({"imports": modules}))
+    head = head.replace(STYLE_LINK, f"<style>{content['style.css'].decode()}</style>")
+    # The scripts look for the assets.
+    return f"{head}{assets}{body}".encode()
 
 
 @torch.no_grad()
@@ -130,7 +113,7 @@ def _poster(model: Model, camera: Camera) -> bytes:
 
     scale = min(POSTER_WIDTH / max(camera.width, camera.height), 1.0)
     small = resized(camera, max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-    pixels = to_uint8(model.render_image(small)).cpu().numpy()
     stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "JPEG", quality=POSTER_QUALITY, optimize=True)
+    picture = Image.fromarray(to_uint8(model.render_image(small)).cpu().numpy())
+    picture.save(stream, "JPEG", quality=POSTER_QUALITY, optimize=True)
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""Quantisation of the arrays of a scene file; docs/web.md describes it.
+"""Quantisation of a scene's arrays for its file; docs/web.md describes it.
 
 Surfels are sorted along a Morton curve, and each chunk of 256 neighbours has ranges of its own, so that a surfel far
 away costs the others no precision.
@@ -6,6 +6,7 @@ away costs the others no precision.
 
 import numpy as np
 
+from nexwarp.export.web.scene_data import SceneData
 from nexwarp.model.detail_limits import NEVER
 
 CHUNK = 256
@@ -15,6 +16,32 @@ SMALLEST = 1e-26
 HALF_WIDTH = 1 / np.sqrt(2)  # largest magnitude of x and y of a rotation whose w is the largest component
 TURN = np.sin(np.pi / 8)  # likewise of z, as quarter turns about z are free too
 QUAT_BITS = (11, 11, 10)
+
+
+def quantised(scene: SceneData) -> dict[str, np.ndarray]:
+    """Return the sections of the surfels by name, in the order of the file; surfels are in Morton order."""
+    order = morton_order(scene.means)
+    quats, swapped = encode_quats(scene.quats[order])
+    scales, gammas = (np.where(swapped[:, None], x[order, ::-1], x[order]) for x in (scene.scales, scene.gammas))
+    sh = scene.sh[order]
+    means, mean_ranges = encode_chunks(scene.means[order].astype(np.float64), np.uint16)
+    scale_codes, scale_ranges = encode_chunks(log_of(scales), np.uint16)
+    gamma_codes, gamma_ranges = encode_chunks(log_of(gammas), np.uint8)
+    degrees = range(round(sh.shape[1] ** 0.5))
+    bands = [_encode_band(sh[:, degree**2 : (degree + 1) ** 2]) for degree in degrees]
+    sections = {
+        "ranges": np.concatenate([mean_ranges, scale_ranges, gamma_ranges, *(band[1] for band in bands)], axis=1),
+        "means": means.T,
+        "quats": quats,
+        "scales": scale_codes.T,
+        "opacities": np.rint(scene.opacities[order].clip(0, 1) * 255).astype(np.uint8),
+        "gammas": gamma_codes.T,
+    }
+    if scene.limits is not None:
+        codes, sections["limits_scale"] = encode_limits(scene.limits[order])
+        sections["limits"] = codes.T
+    sections["sh"] = np.concatenate([band[0] for band in bands], axis=1).T
+    return sections
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
@@ -30,41 +57,35 @@ def morton_order(means: np.ndarray) -> np.ndarray:
     return np.argsort(code, kind="stable")
 
 
-def chunk_count(count: int) -> int:
-    """Return the number of chunks of N surfels."""
-    return -(-count // CHUNK)
-
-
-def encode_chunks(values: np.ndarray, dtype: type) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise (N, C) values.
+def encode_chunks(values: np.ndarray, dtype: type, size: int = CHUNK) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise (N, C) values, each column of each chunk of `size` rows with a range of its own.
 
     Returns:
         (N, C) codes, and (chunks, C, 2) float32: value of code 0 and difference between codes.
     """
-    starts = np.arange(0, len(values), CHUNK)
-    largest = np.iinfo(dtype).max
     if len(values) == 0:
         return np.zeros(values.shape, dtype), np.zeros((0, values.shape[1], 2), np.float32)
+    starts = np.arange(0, len(values), size)
+    largest = np.iinfo(dtype).max
     low = np.minimum.reduceat(values, starts).astype(np.float32)
     high = np.maximum.reduceat(values, starts).astype(np.float32)
     steps = ((high.astype(np.float64) - low) / largest).astype(np.float32)
-    ranges = np.stack([low, steps], axis=-1)
-    first, step = (np.repeat(x, CHUNK, axis=0)[: len(values)].astype(np.float64) for x in (low, steps))
+    first, step = (np.repeat(x, size, axis=0)[: len(values)].astype(np.float64) for x in (low, steps))
     codes = np.rint((values - first) / np.where(step > 0, step, 1.0))
-    return np.clip(codes, 0, largest).astype(dtype), ranges
+    return np.clip(codes, 0, largest).astype(dtype), np.stack([low, steps], axis=-1)
 
 
-def decode_chunks(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Return the (N, C) float32 values of codes."""
-    whole = np.repeat(ranges, CHUNK, axis=0)[: len(codes)]
-    return whole[..., 0] + whole[..., 1] * codes.astype(np.float32)
+def _encode_band(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantise SH coefficients (N, B, 3) of one degree to (N, 3 B) codes, with one range for all values of a chunk."""
+    count, width = len(coefficients), 3 * coefficients.shape[1]
+    codes, ranges = encode_chunks(coefficients.astype(np.float64).reshape(-1, 1), np.uint8, CHUNK * width)
+    return codes.reshape(count, width), ranges
 
 
-def _half_turns(
-    w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], ...]:
-    """Return a quaternion's products with 1, i, j, k."""
-    return (w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)
+def _half_turns(quats: np.ndarray) -> np.ndarray:
+    """Return the products (4, 4, N) of quaternions (4, N) with 1, i, j, k."""
+    w, x, y, z = quats
+    return np.array([(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)])
 
 
 def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,11 +97,10 @@ def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (N,) uint32 codes of x, y (11 bits each) and z (10 bits); and (N,) bool: whether the axes were swapped.
     """
-    w, x, y, z = quats.astype(np.float64).T
-    c = np.sqrt(0.5)
-    quarter = (c * (w - z), c * (x + y), c * (y - x), c * (z + w))
+    w, x, y, z = straight = quats.astype(np.float64).T
+    quarter = np.sqrt(0.5) * np.array([w - z, x + y, y - x, z + w])
     # The surfel's eight rotations: q, and q times a quarter turn, each times 1, i, j, k.
-    turned = np.stack([np.stack(one) for start in ((w, x, y, z), quarter) for one in _half_turns(*start)])
+    turned = np.concatenate([_half_turns(straight), _half_turns(quarter)])
     best = np.argmax(np.abs(turned[:, 0]), axis=0)
     swapped = best >= 4
     w, x, y, z = np.take_along_axis(turned, best[None, None], axis=0)[0]
@@ -93,20 +113,6 @@ def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         code |= np.clip(steps, 0, largest).astype(np.uint32) << np.uint32(shift)
         shift += bits
     return code, swapped
-
-
-def decode_quats(code: np.ndarray) -> np.ndarray:
-    """Return (N, 4) float32 unit quaternions, wxyz."""
-    parts, shift = [], 0
-    for bits, limit in zip(QUAT_BITS, (HALF_WIDTH, HALF_WIDTH, TURN), strict=True):
-        largest = 2**bits - 1
-        steps = (code >> np.uint32(shift)) & np.uint32(largest)
-        parts.append((steps / largest * 2 - 1) * limit)
-        shift += bits
-    xyz = np.stack(parts, axis=1)
-    w = np.sqrt(np.maximum(1 - (xyz**2).sum(1, keepdims=True), 0.0))
-    quats = np.concatenate([w, xyz], axis=1)
-    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
 def log_of(values: np.ndarray) -> np.ndarray:
@@ -128,12 +134,6 @@ def encode_limits(limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(limits >= NEVER, 65535, np.where(limits > 0, codes, 0)).astype(np.uint16), scale
 
 
-def decode_limits(codes: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return (N, 2) float32 detail limits."""
-    values = np.exp(scale[0] + scale[1] * (codes.astype(np.float32) - 1))
-    return np.where(codes == 65535, np.float32(NEVER), np.where(codes == 0, 0, values)).astype(np.float32)
-
-
 def encode_levels(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Quantise a hash grid (L, T, F), a range for each level.
 
@@ -146,9 +146,3 @@ def encode_levels(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     steps = np.where(ranges[:, 1:] > 0, ranges[:, 1:], 1.0)
     codes = np.clip(np.rint((flat - ranges[:, :1]) / steps), 0, 255)
     return codes.astype(np.uint8).reshape(grid.shape), ranges
-
-
-def decode_levels(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Return a (L, T, F) float16 grid."""
-    values = ranges[:, 0, None, None] + ranges[:, 1, None, None] * codes.astype(np.float32)
-    return values.astype(np.float16)

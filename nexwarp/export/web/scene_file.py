@@ -2,44 +2,30 @@
 
 import json
 import struct
+import zlib
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import camera_poses, focus
 from nexwarp.errors import FormatError, SettingError
-from nexwarp.export.web.quantise import (
-    CHUNK,
-    encode_chunks,
-    encode_levels,
-    encode_limits,
-    encode_quats,
-    log_of,
-    morton_order,
-)
-from nexwarp.export.web.scene_data import SceneData
-from nexwarp.export.web.sections import (
-    ALIGNMENT,
-    DTYPES,
-    FORMAT_VERSION,
-    LARGEST_HEADER,
-    MAGIC,
-    QUALITIES,
-    SURFEL_ARRAYS,
-    Quality,
-    pack,
-    sections_of,
-)
+from nexwarp.export.web.quantise import CHUNK, encode_levels, quantised
+from nexwarp.export.web.scene_data import SceneData, array_of
 from nexwarp.model.model import Model
 
 SCENE_FILE = "scene.nxw"
+QUALITIES = ("quantised", "full")
+MAGIC = b"NXWSCENE"
+FORMAT_VERSION = 1
+LARGEST_HEADER = 4 * 2**20
+ALIGNMENT = 8
+DTYPES = {"u1": "u8", "u2": "u16", "u4": "u32", "f2": "f16", "f4": "f32"}
 MOST_CAMERAS = 200
 
 
 def encode_scene(
-    model: Model | SceneData,
+    model: Model,
     cameras: Mapping[str, Camera],
     *,
     quality: str = "quantised",
@@ -60,57 +46,69 @@ def encode_scene(
     """
     if quality not in QUALITIES:
         raise SettingError(f"--quality: expected {' or '.join(QUALITIES)}, got {quality!r:.60}")
-    scene = SceneData.of(model) if isinstance(model, Model) else model
-    arrays = _arrays(scene, cast(Quality, quality))
-    header = scene_header(scene, cameras, cast(Quality, quality), title)
-    stored: list[tuple[dict[str, object], bytes]] = []
-    if poster is not None:
-        header["poster"] = {"type": "image/jpeg"}
-        stored.append(({"name": "poster", "dtype": "u8", "shape": [len(poster)], "encoding": "raw"}, poster))
-    for section in sections_of(header, scene.limits is not None):
-        array = np.ascontiguousarray(arrays[section.name], DTYPES[section.dtype])
-        if array.shape != section.shape:
-            raise FormatError(f"section {section.name}: expected shape {section.shape}, got {array.shape}")
-        encoding, content = pack(array.astype(array.dtype.newbyteorder("<")).tobytes())
-        entry: dict[str, object] = {
-            "name": section.name,
-            "dtype": section.dtype,
-            "shape": list(section.shape),
-            "encoding": encoding,
-        }
-        stored.append((entry, content))
-    return joined_file(MAGIC, header, stored)
+    scene = SceneData.of(model)
+    if quality == "full":
+        names = ("means", "quats", "scales", "opacities", "gammas", "limits", "sh")
+        arrays = {name: array for name in names if (array := getattr(scene, name)) is not None}
+    else:
+        arrays = quantised(scene)
+    if scene.exposures is not None:
+        arrays["exposures"] = scene.exposures["poses"]
+    if scene.texture is not None:
+        grid = array_of(scene.texture.grid).astype(np.float16)  # as in model files
+        weights = np.concatenate([array_of(matrix).ravel() for matrix in scene.texture.mlp.parameters()])
+        if quality == "full":
+            arrays |= {"mlp": weights, "grid": grid}
+        else:
+            codes, ranges = encode_levels(grid)
+            arrays |= {"mlp": weights.astype(np.float16), "grid_ranges": ranges, "grid": codes}
+    header = scene_header(scene, cameras, title) | {"quality": quality}
+    return joined_file(MAGIC, header, arrays, poster)
 
 
-def joined_file(magic: bytes, header: dict[str, object], stored: Sequence[tuple[dict[str, object], bytes]]) -> bytes:
-    """Return the file of a header and its sections, given as entries of the header with the bytes that are stored."""
+def joined_file(
+    magic: bytes, header: Mapping[str, object], arrays: Mapping[str, np.ndarray], poster: bytes | None = None
+) -> bytes:
+    """Return the file of a header and its sections; arrays are compressed where that saves at least 2 %."""
+    entries: list[dict[str, object]] = []
+    parts: list[bytes] = []
     # Offsets depend on the header's length and it on them: they are counted from the end of the header.
-    position, entries = 0, []
-    for entry, content in stored:
-        entries.append({**entry, "offset": position, "bytes": len(content)})
-        position += len(content) + -len(content) % ALIGNMENT
+    position = 0
+
+    def add(name: str, dtype: str, shape: Sequence[int], content: bytes, compress: bool) -> None:
+        nonlocal position
+        packed = zlib.compress(content, 9) if compress else content
+        encoding = "deflate" if len(packed) < 0.98 * len(content) else "raw"
+        stored = packed if encoding == "deflate" else content
+        entry = {"name": name, "dtype": dtype, "shape": list(shape), "encoding": encoding}
+        entries.append({**entry, "offset": position, "bytes": len(stored)})
+        parts.append(stored + bytes(-len(stored) % ALIGNMENT))
+        position += len(parts[-1])
+
+    if poster is not None:
+        header = {**header, "poster": {"type": "image/jpeg"}}
+        add("poster", "u8", [len(poster)], poster, compress=False)
+    for name, array in arrays.items():
+        content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+        add(name, DTYPES[array.dtype.str[1:]], array.shape, content, compress=True)
     text = json.dumps({**header, "sections": entries}, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % ALIGNMENT)
     if len(text) > LARGEST_HEADER:
         raise FormatError(f"header: expected at most {LARGEST_HEADER:,} bytes, got {len(text):,}")
-    parts = [magic, struct.pack("<II", FORMAT_VERSION, len(text)), text]
-    for _, content in stored:
-        parts += [content, bytes(-len(content) % ALIGNMENT)]
-    return b"".join(parts)
+    return b"".join([magic, struct.pack("<II", FORMAT_VERSION, len(text)), text, *parts])
 
 
-def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quality, title: str) -> dict[str, object]:
-    """Return the header without its sections."""
+def scene_header(scene: SceneData, cameras: Mapping[str, Camera], title: str) -> dict[str, object]:
+    """Return the header without quality and sections."""
     options, texture, exposures = scene.options, scene.texture, scene.exposures
     kept = list(cameras.items())[:: -(-len(cameras) // MOST_CAMERAS) or 1]
     views = [camera for _, camera in kept]
     low, high = (np.percentile(scene.means, q, axis=0) if len(scene) else np.zeros(3) for q in (2, 98))
     center, up = _surroundings(views, (low + high) / 2)
-    return {
+    header: dict[str, object] = {
         "format_version": FORMAT_VERSION,
         "generator": "nexwarp",
         "title": title,
-        "quality": quality,
         "surfels": len(scene),
         "sh_coefficients": scene.sh.shape[1],
         "chunk": CHUNK,
@@ -118,18 +116,12 @@ def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quali
             "max_hits": options.max_hits,
             "background": list(options.background),
             "sh_degree": options.sh_degree,
-            "low_pass": options.low_pass,
             "clamp_texture": options.clamp_texture,
             "exposure": options.exposure,
             "detail_limits": scene.limits is not None,
         },
-        "texture": None if texture is None else {**texture.shape, "resolutions": _floats(texture.resolutions)},
-        "exposures": None
-        if exposures is None
-        else {
-            "count": len(exposures.poses),
-            **{name: _floats(getattr(exposures, name)) for name in ("mean", "lengths", "falloff", "lowest", "highest")},
-        },
+        "texture": None,
+        "exposures": None,
         "near": views[0].near if views else 0.01,
         "cameras": [_camera_entry(name, camera) for name, camera in kept],
         "start": 0,
@@ -138,6 +130,12 @@ def scene_header(scene: SceneData, cameras: Mapping[str, Camera], quality: Quali
         "bounds": [_floats(low), _floats(high)],
         "poster": None,
     }
+    if texture is not None:
+        header["texture"] = {**texture.config, "resolutions": _floats(array_of(texture.resolutions))}
+    if exposures is not None:
+        numbers = {name: _floats(values) for name, values in exposures.items() if name != "poses"}
+        header["exposures"] = {"count": len(exposures["poses"]), **numbers}
+    return header
 
 
 def _surroundings(cameras: Sequence[Camera], middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +147,7 @@ def _surroundings(cameras: Sequence[Camera], middle: np.ndarray) -> tuple[np.nda
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     try:
         center = focus(cameras)
-    except ValueError:
+    except ValueError:  # parallel axes
         return middle, up
     ahead = (viewmats[:, :3, :3] @ center + viewmats[:, :3, 3])[:, 2] > 0
     return (center.numpy() if bool(ahead.float().mean() > 0.5) else middle), up
@@ -158,8 +156,8 @@ def _surroundings(cameras: Sequence[Camera], middle: np.ndarray) -> tuple[np.nda
 def _camera_entry(name: str, camera: Camera) -> dict[str, object]:
     return {
         "name": name,
-        "viewmat": [float(f"{x:.9g}") for x in camera.viewmat.detach().double().cpu().flatten().tolist()],
-        "K": [float(f"{x:.9g}") for x in (camera.fx, camera.fy, camera.cx, camera.cy)],
+        "viewmat": _floats(camera.viewmat.detach().double().cpu().numpy()),
+        "K": _floats(np.array([camera.fx, camera.fy, camera.cx, camera.cy])),
         "width": camera.width,
         "height": camera.height,
         "near": camera.near,
@@ -169,66 +167,3 @@ def _camera_entry(name: str, camera: Camera) -> dict[str, object]:
 def _floats(values: np.ndarray) -> list[float]:
     """Numbers with the digits that single precision needs."""
     return [float(f"{x:.9g}") for x in np.asarray(values, np.float64).ravel().tolist()]
-
-
-def _arrays(scene: SceneData, quality: Quality) -> dict[str, np.ndarray]:
-    """Return the arrays of the sections by name."""
-    arrays: dict[str, np.ndarray] = {}
-    if quality == "full":
-        for name in SURFEL_ARRAYS:
-            if (array := getattr(scene, name)) is not None:
-                arrays[name] = array
-    else:
-        arrays = _quantised(scene)
-    if scene.exposures is not None:
-        arrays["exposures"] = scene.exposures.poses
-    if (texture := scene.texture) is not None:
-        arrays["mlp"] = np.concatenate([matrix.ravel() for matrix in texture.matrices])
-        arrays["grid"] = texture.grid
-        if quality == "quantised":
-            arrays["grid"], arrays["grid_ranges"] = encode_levels(texture.grid)
-    return arrays
-
-
-def _quantised(scene: SceneData) -> dict[str, np.ndarray]:
-    """Return the quantised arrays of the surfels, in Morton order."""
-    order = morton_order(scene.means)
-    count, coefficients = len(order), scene.sh.shape[1]
-    quats, swapped = encode_quats(scene.quats[order])
-    scales, gammas = (np.where(swapped[:, None], x[order, ::-1], x[order]) for x in (scene.scales, scene.gammas))
-    means, mean_ranges = encode_chunks(scene.means[order].astype(np.float64), np.uint16)
-    scales, scale_ranges = encode_chunks(log_of(scales), np.uint16)
-    gammas, gamma_ranges = encode_chunks(log_of(gammas), np.uint8)
-    sh, ranges = [], [mean_ranges, scale_ranges, gamma_ranges]
-    for band in range(round(coefficients**0.5)):
-        values = scene.sh[order, band**2 : (band + 1) ** 2].reshape(count, 3 * (2 * band + 1)).astype(np.float64)
-        # One range for all values of a band: those of a chunk are quantised as one column.
-        codes, band_ranges = _encode_band(values)
-        sh.append(codes)
-        ranges.append(band_ranges)
-    arrays = {
-        "ranges": np.concatenate(ranges, axis=1),
-        "means": means.T,
-        "quats": quats,
-        "scales": scales.T,
-        "opacities": np.rint(scene.opacities[order].clip(0, 1) * 255),
-        "gammas": gammas.T,
-        "sh": np.concatenate(sh, axis=1).T,
-    }
-    if scene.limits is not None:
-        codes, arrays["limits_scale"] = encode_limits(scene.limits[order])
-        arrays["limits"] = codes.T
-    return arrays
-
-
-def _encode_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise (N, C) values, a range for each chunk; ranges (chunks, 1, 2)."""
-    extremes = np.stack([values.min(1), values.max(1)], 1) if values.size else values[:, :0]
-    if len(values) == 0:
-        return np.zeros(values.shape, np.uint8), np.zeros((0, 1, 2), np.float32)
-    starts = np.arange(0, len(values), CHUNK)
-    low = np.minimum.reduceat(extremes[:, 0], starts).astype(np.float32)
-    steps = ((np.maximum.reduceat(extremes[:, 1], starts) - low) / 255).astype(np.float32)
-    row_low, row_step = (np.repeat(x.astype(np.float64), CHUNK)[: len(values), None] for x in (low, steps))
-    codes = np.rint((values - row_low) / np.where(row_step > 0, row_step, 1.0)).clip(0, 255)
-    return codes.astype(np.uint8), np.stack([low, steps], 1)[:, None]

@@ -5,9 +5,8 @@ import json
 import re
 
 from nexwarp.export.web.export import INDEX, export_web, one_file, static_files
-from nexwarp.export.web.scene_data import SceneData
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
-from nexwarp.export.web.scene_reader import load_scene_file
+from tests.export.web.scene_reader import read_sections
 from tests.export.web.support import named_cameras, web_model
 
 
@@ -48,12 +47,10 @@ def test_the_page_names_no_other_server():
 
 
 def test_titles_are_text(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "nexwarp.export.web.export.importlib.util.find_spec", lambda name: None
-    )  # without the baked texture
+    monkeypatch.setattr("nexwarp.export.web.export.bake", lambda *_: {})
     model, camera = web_model(5)
     files = export_web(model, named_cameras(camera), tmp_path / "page", title="<b>R&D</b>")
     assert {file.relative_to(tmp_path / "page").as_posix() for file in files} == {*static_files(), SCENE_FILE}
     index = (tmp_path / "page" / INDEX).read_text(encoding="utf-8")
     assert "&lt;b&gt;R&amp;D&lt;/b&gt;" in index and "<b>R&D" not in index and "__TITLE__" not in index
-    assert len(load_scene_file(tmp_path / "page" / SCENE_FILE)) == len(SceneData.of(model))
+    assert read_sections((tmp_path / "page" / SCENE_FILE).read_bytes())[0]["surfels"] == 5

@@ -19,10 +19,10 @@ from nexwarp.export.bake.fit import bake as bake_model
 from nexwarp.export.web import atlas
 from nexwarp.export.web.export import one_file, page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
-from nexwarp.export.web.scene_reader import decode_scene
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from tests.export.web.baked_support import ring
+from tests.export.web.scene_reader import as_stored, read_sections
 from tests.scenes import make_surfels, make_texture, random_scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -79,15 +79,15 @@ def cameras() -> dict[str, nw.Camera]:
 
 @pytest.fixture(scope="module")
 def model(cameras) -> nw.Model:
-    """A small model with everything that a page has to show: exposures, vignetting, detail limits, SH of degree 6."""
-    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3, sh_degree=6))
+    """A small model with everything that a page has to show: exposures, vignetting, detail limits."""
+    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
     gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
     exposures = Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
     limits = DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
     texture = make_texture(residual=True)
     with torch.no_grad():
         texture.grid.mul_(0.3)
-    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3), sh_degree=6))
+    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def tab(browser) -> Iterator[Tab]:
 
 
 def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, cameras):
-    baked = atlas.as_stored(bake_model(model, list(cameras.values()), steps=10))
+    baked = as_stored(bake_model(model, list(cameras.values()), steps=10))
     tab.open(f"{site.url}?renderer=baked")
     picked = 0
     # Far away too: surfels are blurred beyond their detail limits.
@@ -288,26 +288,27 @@ def rebuilt(content: bytes, **changes: Any) -> bytes:
 
 def damaged_files(content: bytes) -> dict[str, tuple[bytes, str]]:
     size = struct.unpack("<I", content[12:16])[0]
-    sections = json.loads(content[16 : 16 + size])["sections"]
+    header = json.loads(content[16 : 16 + size])
 
     def with_section(name: str, **changes: Any) -> bytes:
+        sections = header["sections"]
         return rebuilt(content, sections=[{**one, **(changes if one["name"] == name else {})} for one in sections])
 
     return {
-        "empty": (b"", "expected a baked scene"),
-        "other": (b"GIF89a" + content[6:], "expected a baked scene"),
+        "empty": (b"", "the file ends before"),
+        "other": (b"GIF89a" + content[6:], "expected NXWBAKED at the start"),
         "version": (content[:8] + struct.pack("<I", 9) + content[12:], "expected format version 1, got 9"),
-        "header": (content[:100], "expected a whole header"),
+        "header": (content[:100], "the file ends before"),
         "json": (content[:16] + b"[" * size + content[16 + size :], "expected a JSON header"),
-        "cut": (content[:-2000], "expected it inside the file"),
-        "count": (rebuilt(content, surfels=2**40), "expected at most"),
-        "more": (rebuilt(content, surfels=41), "section means: expected"),
-        "bomb": (with_section("means", encoding="deflate", offset=0, bytes=len(zeros())), "section means: expected"),
-        "outside": (with_section("boxes", offset=2**50), "expected it inside the file"),
-        "negative": (with_section("boxes", offset=-8), "expected it inside the file"),
-        "none": (rebuilt(content, sections=[]), "expected the section means"),
-        "atlas": (rebuilt(content, atlas={"file": "../x", "width": 4, "height": 4, "scale": 1}), "expected an atlas"),
-        "cameras": (rebuilt(content, cameras=[{"name": "a"}]), "expected cameras"),
+        "cut": (content[:-2000], "the file ends before"),
+        "count": (rebuilt(content, surfels=2**40), "surfels: expected at most"),
+        "more": (rebuilt(content, surfels=41), "expected the sections that the header describes"),
+        "bomb": (with_section("means", encoding="deflate", offset=0, bytes=len(zeros())), "section means: "),
+        "outside": (with_section("boxes", offset=2**50), "section boxes: wrong offset"),
+        "negative": (with_section("boxes", offset=-8), "section boxes: wrong offset"),
+        "none": (rebuilt(content, sections=[]), "expected the sections that the header describes"),
+        "atlas": (rebuilt(content, atlas={**header["atlas"], "file": "../x"}), "atlas: expected a picture's file"),
+        "cameras": (rebuilt(content, cameras=[{"name": "a"}]), "expected name, viewmat, K"),
     }
 
 
@@ -328,12 +329,14 @@ def test_damaged_files_give_one_line(tab, site):
             content = content[: 16 + size] + bombs[name] + content[16 + size + len(bombs[name]) :]
         site.files["damaged.nxb"] = content
         text = tab.value(
-            "import('nexwarp/baked_scene.js').then(async m => { const answer = await fetch('damaged.nxb');"
-            " try { await m.readBaked(answer.body); return 'read'; } catch (e) { return `${e.name}: ${e.message}`; } })"
+            "import('nexwarp/scene.js').then(async m => { const answer = await fetch('damaged.nxb');"
+            " const reader = new m.SceneReader(answer.body, () => {}, m.BAKED);"
+            " try { await reader.readHeader(); await reader.readTo('shN'); return 'read'; }"
+            " catch (e) { return `${e.name}: ${e.message}`; } })"
         )
         assert text.startswith("SceneError: ") and expected in text and "\n" not in text, f"{name}: {text}"
     damaged: list[tuple[dict[str, bytes | None], str]] = [
-        ({atlas.BAKED_FILE: good[:50]}, "The baked scene is damaged"),
+        ({atlas.BAKED_FILE: good[:50]}, "the file ends before"),
         ({atlas.ATLAS_FILE: b"no picture"}, "expected a picture"),
         ({atlas.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
     ]
@@ -363,8 +366,8 @@ def test_the_live_demo_of_the_documentation(tab):
     site = Site({**static_files(), **files})
     tab.open(f"{site.url}?renderer=baked")
     assert tab.picture().std() > 0.1 and not tab.errors
-    model = decode_scene(files[SCENE_FILE])
-    assert len(model) == tab.value("nexwarp.renderer.info.surfels")
+    header, _ = read_sections(files[SCENE_FILE])
+    assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
     site.server.shutdown()
     site.server.server_close()
 

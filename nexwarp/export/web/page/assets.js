@@ -1,17 +1,8 @@
 // Files of the page: embedded in it, or beside it.
 
-function embedded(name) {
-    return document.getElementById(`asset:${name}`);
-}
-
-// Whether a file is embedded in the page.
-export function hasAsset(name) {
-    return embedded(name) !== null;
-}
-
 // A file's content as a ReadableStream of bytes.
 export async function asset(name) {
-    const element = embedded(name);
+    const element = document.getElementById(`asset:${name}`);
     if (element !== null) {
         const text = atob(element.textContent.trim());
         const bytes = new Uint8Array(text.length);

@@ -2,8 +2,9 @@
 // It has the interface of Renderer in renderer.js, for devices without WebGPU.
 
 import {asset} from "nexwarp/assets.js";
-import {SceneError} from "nexwarp/scene.js";
-import {BakedScene, readBaked} from "nexwarp/baked_scene.js";
+import {BakedScene} from "nexwarp/baked_scene.js";
+import {positionOf, resized} from "nexwarp/program.js";
+import {BAKED, SceneError, SceneReader} from "nexwarp/scene.js";
 import {QUADS_FRAGMENT, QUADS_VERTEX, RESOLVE_FRAGMENT, RESOLVE_VERTEX} from "nexwarp/baked_shaders.js";
 
 export const BAKED_FILE = "baked.nxb";
@@ -31,10 +32,12 @@ export class BakedRenderer {
         this.target = {width: 0, height: 0};
     }
 
-    async load(source = null) {
-        const stream = source instanceof ReadableStream ? source : await opened(source ?? BAKED_FILE);
-        const {header, arrays} = await readBaked(stream, this.onProgress);
-        this.scene = new BakedScene(header, arrays);
+    async load(source = BAKED_FILE) {
+        const progress = bytes => this.onProgress({bytes, total: reader.header ? reader.total : null, stage: "geometry"});
+        const reader = new SceneReader(await opened(source), progress, BAKED);
+        const header = await reader.readHeader();
+        await reader.readTo("shN");
+        this.scene = new BakedScene(header, reader.arrays);
         this.header = header;
         this.onStage("header");
         const image = await this.#atlasImage(header.atlas);
@@ -149,7 +152,7 @@ export class BakedRenderer {
         const width = Math.max(Math.round(canvas.width * resolutionScale), 1);
         const height = Math.max(Math.round(canvas.height * resolutionScale), 1);
         this.#resizeTarget(width, height);
-        this.last = {camera: fitted(camera, width, height), mode, exposure};
+        this.last = {camera: resized(camera, width, height), mode, exposure};
         this.#drawQuads();
         this.#drawResolved(null, canvas.width, canvas.height);
         await finished(gl);
@@ -265,17 +268,6 @@ async function opened(file) {
     } catch (error) {
         throw Object.assign(new SceneError(error.message), {missing: true});
     }
-}
-
-// The camera of an image of another size, with the same vertical field of view.
-function fitted({viewmat, K: [fx, fy, cx, cy], width, height, near}, newWidth, newHeight) {
-    const scale = newHeight / height;
-    const K = [fx * scale, fy * scale, (cx - width / 2) * scale + newWidth / 2, cy * scale];
-    return {viewmat, K, width: newWidth, height: newHeight, near};
-}
-
-function positionOf(m) {
-    return [0, 1, 2].map(i => -(m[i] * m[3] + m[4 + i] * m[7] + m[8 + i] * m[11]));
 }
 
 async function finished(gl) {

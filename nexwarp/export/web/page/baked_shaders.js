@@ -15,7 +15,7 @@ uniform mat4 viewmat;
 uniform vec4 intrinsics;
 uniform vec2 size;
 uniform vec3 eye;
-uniform float bands[6]; // ranges of degrees 1 to 6
+uniform float bands[3]; // ranges of degrees 1 to 3
 uniform float near;
 uniform int mode, coefficients;
 in uint surfel;
@@ -39,27 +39,6 @@ vec3 coefficient(int k, float range) {
   return sign(code) * code * code * (range / 16129.0);
 }
 
-// Basis function of degree 4 or more, by recurrences (nexwarp/kernels/sh.py).
-float harmonic(int k, int degree, vec3 d) {
-  int order = k - degree * degree - degree, m = abs(order);
-  float value = m == 0 ? 0.28209479177387814 : 0.39894228040143268;
-  float cosine = 1.0, sine = 0.0, before = 0.0;
-  for (int j = 1; j <= m; ++j) {
-    value *= -sqrt(float(2 * j + 1) / float(2 * j));
-    float turned = d.x * cosine - d.y * sine;
-    sine = d.x * sine + d.y * cosine;
-    cosine = turned;
-  }
-  for (int n = m + 1; n <= degree; ++n) {
-    float a = sqrt(float(4 * n * n - 1) / float(n * n - m * m));
-    float b = sqrt(float((n - 1) * (n - 1) - m * m) / float(4 * (n - 1) * (n - 1) - 1));
-    float following = a * (d.z * value - b * before);
-    before = value;
-    value = following;
-  }
-  return value * (order < 0 ? sine : cosine);
-}
-
 vec3 color(vec3 d, vec3 constant) {
   vec3 c = vec3(0.5) + 0.28209479177387814 * constant;
   if (coefficients >= 4) {
@@ -80,11 +59,6 @@ vec3 color(vec3 d, vec3 constant) {
     c += -0.4570457994644658 * d.x * (4.0 * zz - xx - yy) * coefficient(13, bands[2]);
     c += 1.445305721320277 * d.z * (xx - yy) * coefficient(14, bands[2]);
     c += -0.5900435899266435 * d.x * (xx - 3.0 * yy) * coefficient(15, bands[2]);
-  }
-  for (int degree = 4; (degree + 1) * (degree + 1) <= coefficients; ++degree) {
-    for (int k = degree * degree; k < (degree + 1) * (degree + 1); ++k) {
-      c += harmonic(k, degree, d) * coefficient(k, bands[degree - 1]);
-    }
   }
   return max(c, vec3(0.0));
 }

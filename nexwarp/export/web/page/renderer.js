@@ -1,4 +1,4 @@
-// The WebGPU renderer: the passes of nexwarp/export/web/renderer.py in the browser.
+// The WebGPU renderer: the passes of nexwarp/kernels in WGSL.
 
 import { assetText, asset } from "nexwarp/assets.js";
 import {
@@ -11,9 +11,9 @@ import {
     constantsOf,
     frameValues,
     isUniform,
-    number,
     packedMatrices,
     positionOf,
+    rayOf,
     resized,
     sourceOf,
 } from "nexwarp/program.js";
@@ -21,7 +21,7 @@ import { SceneError, SceneReader, toHalf, unpackGrid, unpackSurfels, unpackWeigh
 
 export { SceneError };
 
-const SHADERS = ["common", "project", "scan", "sort", "lists", "collect", "shade", "mlp", "compose", "blit"];
+const SHADERS = ["common", "project", "scan", "sort", "lists", "collect", "shade", "compose", "blit"];
 const FIRST_ENTRIES = 2 ** 18;
 const MOST_ENTRIES = 2 ** 28;
 const SPARE = 1.5;
@@ -76,22 +76,15 @@ async function openDevice() {
 
 export class Renderer {
     // Opens a GPU. Throws SceneError, with a line for people, where there is none.
-    static async create(target = null, { onProgress, onStage, onLost, half = true, unrolled = false } = {}) {
-        let device = target;
-        let adapter = null;
-        let canvas = null;
-        if (target === null || typeof target.createBuffer !== "function") {
-            ({ adapter, device } = await openDevice());
-            canvas = target;
-        }
+    static async create(canvas = null, { onProgress, onStage, onLost, half = true } = {}) {
+        const { adapter, device } = await openDevice();
         const renderer = new Renderer();
-        const info = device.adapterInfo ?? adapter?.info ?? {};
+        const info = device.adapterInfo ?? adapter.info ?? {};
         const software = info.isFallbackAdapter === true || /swiftshader|llvmpipe/i.test(`${info.architecture} ${info.description}`);
         renderer.device = device;
         renderer.canvas = canvas;
         renderer.adapter = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
         renderer.half = half && device.features.has("shader-f16");
-        renderer.unrolled = unrolled;
         renderer.onProgress = onProgress ?? (() => {});
         renderer.onStage = onStage ?? (() => {});
         renderer.buffers = {};
@@ -162,7 +155,7 @@ export class Renderer {
     checkLimits(header) {
         const texture = header.texture;
         const sizes = {
-            surfels: 80 * header.surfels,
+            surfels: 64 * header.surfels,
             "SH coefficients": 12 * header.surfels * header.sh_coefficients,
             "texture grid": texture === null ? 0 : 2 * texture.levels * texture.table_size * texture.features,
         };
@@ -205,7 +198,7 @@ export class Renderer {
     async pipeline(name, entry) {
         const texture = this.header.texture;
         const features = texture === null ? 2 : texture.features;
-        const code = sourceOf(name, this.constants, this.texts, features, this.half, this.unrolled);
+        const code = sourceOf(name, this.constants, this.texts, features, this.half);
         const module = this.device.createShaderModule({ label: name, code });
         const compute = { module, entryPoint: entry };
         this.pipelines[entry] = await this.device.createComputePipelineAsync({ label: entry, layout: "auto", compute });
@@ -241,10 +234,10 @@ export class Renderer {
         this.upload("seen", limits ?? new Float32Array(4));
         this.upload("sh", sh);
         this.makeBuffer("frame", FRAME_BYTES, true);
-        this.makeBuffer("records", (this.header.options.low_pass ? 80 : 64) * count);
+        this.makeBuffer("records", 64 * count);
         this.makeBuffer("polygons", 64 * count);
         this.makeBuffer("starts", 4 * count * SHARING);
-        this.makeBuffer("start_sums", 4 * (number(this.constants, "TOTAL") + 1));
+        this.makeBuffer("start_sums", 4 * (this.constants.TOTAL + 1));
         this.upload("surfel count", Uint32Array.of(count));
         for (const name of ["keys", "order", "keys2", "order2"]) {
             this.makeBuffer(name, 4 * count);
@@ -276,7 +269,7 @@ export class Renderer {
         if (this.destroyed || !this.buffers.records) {
             throw new SceneError("The renderer has no scene, or has been closed.");
         }
-        const { mode = "image", resolutionScale = 1, textureScale = 1, slot = 0, leastWeight = 0, exposure = "photos" } = options;
+        const { mode = "image", resolutionScale = 1, textureScale = 1, leastWeight = 0, exposure = "photos" } = options;
         if (!MODES.includes(mode)) {
             throw new SceneError(`mode: expected one of ${MODES.join(", ")}, got ${mode}`);
         }
@@ -291,7 +284,7 @@ export class Renderer {
         this.makeImageBuffers(width, height);
         for (;;) {
             this.makeLists();
-            const settings = { mode, slot, leastWeight, exposure, depths, step, textured, capacity: this.capacity };
+            const settings = { mode, leastWeight, exposure, depths, step, textured, capacity: this.capacity };
             this.device.queue.writeBuffer(this.buffers.frame, 0, frameValues(this.header, this.poses, view, settings));
             const entries = await this.submit(width, height, step);
             if (entries <= this.capacity) {
@@ -324,7 +317,7 @@ export class Renderer {
         if (this.canvas !== null && !this.copied) {
             this.show(encoder, width, height);
         }
-        encoder.copyBufferToBuffer(this.buffers.start_sums, 4 * number(this.constants, "TOTAL"), this.staging, 0, 4);
+        encoder.copyBufferToBuffer(this.buffers.start_sums, 4 * this.constants.TOTAL, this.staging, 0, 4);
         this.device.queue.submit([encoder.finish()]);
         await this.staging.mapAsync(GPUMapMode.READ, 0, 4);
         const entries = new Uint32Array(this.staging.getMappedRange(0, 4))[0];
@@ -368,7 +361,7 @@ export class Renderer {
     plan(width, height, step) {
         const count = this.header.surfels;
         const [columns, rows] = [Math.ceil(width / TILE), Math.ceil(height / TILE)];
-        const total = number(this.constants, "TOTAL");
+        const total = this.constants.TOTAL;
         const bits = columns * rows < 2 ** 16 ? 16 : 32;
         const passes = [
             this.bound("project", BINDINGS.project, grouped(count)),
@@ -490,11 +483,12 @@ export class Renderer {
         return content;
     }
 
-    // A buffer of the last frame: "image" (h, w, 4), "ids", "depths" and "weights" (h, w, K).
+    // A buffer of the last frame: "image" (h, w, 4), "colors" (h, w, 4), plain colour and alpha; "ids", "depths" and
+    // "weights" (h, w, K).
     async read(name) {
         await this.chain;
-        const widths = { image: 4, colors: 4, ids: this.header.options.max_hits, depths: this.header.options.max_hits, weights: this.header.options.max_hits };
-        const content = await this.readBuffer(name, 0, 4 * widths[name] * this.size[0] * this.size[1]);
+        const width = ["image", "colors"].includes(name) ? 4 : this.header.options.max_hits;
+        const content = await this.readBuffer(name, 0, 4 * width * this.size[0] * this.size[1]);
         return name === "ids" ? new Int32Array(content) : new Float32Array(content);
     }
 
@@ -516,11 +510,8 @@ export class Renderer {
             return null;
         }
         const view = resized(camera, width, height);
-        const ray = [(column + 0.5 - view.K[2]) / view.K[0], (row + 0.5 - view.K[3]) / view.K[1], 1];
-        const origin = positionOf(view.viewmat);
-        const position = [0, 1, 2].map(
-            (k) => origin[k] + depth * (view.viewmat[k] * ray[0] + view.viewmat[4 + k] * ray[1] + view.viewmat[8 + k] * ray[2]),
-        );
+        const ray = rayOf(view, column + 0.5, row + 0.5);
+        const position = positionOf(view.viewmat).map((x, k) => x + depth * ray[k]);
         return { id, depth, position };
     }
 

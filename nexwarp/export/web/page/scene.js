@@ -1,5 +1,5 @@
-// Reader of scene files (docs/web.md): checks what the header says before anything is allocated, and unpacks section
-// by section while the file arrives.
+// Reader of scene files and baked scenes (docs/web.md): checks what the header says before anything is allocated, and
+// unpacks section by section while the file arrives.
 
 export class SceneError extends Error {
     constructor(message) {
@@ -8,15 +8,15 @@ export class SceneError extends Error {
     }
 }
 
-const MAGIC = "NXWSCENE";
 const VERSION = 1;
 const LARGEST_HEADER = 4 * 2 ** 20;
 const LARGEST_SURFELS = 2 ** 24;
 const LARGEST_SECTION = 2 ** 30;
 const LARGEST_VALUE = 1e16;
+const LARGEST_SIDE = 16384; // of the atlas of a baked scene
 const NEVER = 1e30;
 const CHUNK = 256;
-const COEFFICIENTS = [1, 4, 9, 16, 25, 36, 49]; // of SH degrees 0 to 6
+const COEFFICIENTS = [1, 4, 9, 16]; // of SH degrees 0 to 3
 const SIZES = { u8: 1, u16: 2, u32: 4, f16: 2, f32: 4 };
 const ARRAYS = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f16: Uint16Array, f32: Float32Array };
 
@@ -42,26 +42,31 @@ function isObject(value) {
     return typeof value === "object" && value !== null && !Array.isArray(value);
 }
 
-// Throws SceneError unless the header describes a scene that this reader can show.
-export function checkHeader(header) {
+// Throws SceneError unless the header is one that scenes and baked scenes may have.
+function checkHeader(header) {
     expect(isObject(header), "expected a JSON object as the header");
     expect(header.format_version === VERSION, `expected format version ${VERSION}`);
-    expect(header.quality === "quantised" || header.quality === "full", "quality: expected quantised or full");
-    expect(isInteger(header.surfels, 0, LARGEST_SURFELS), `surfels: expected 0 to ${LARGEST_SURFELS}`);
+    expect(isInteger(header.surfels, 0, LARGEST_SURFELS), `surfels: expected at most ${LARGEST_SURFELS}`);
     expect(COEFFICIENTS.includes(header.sh_coefficients), `sh_coefficients: expected one of ${COEFFICIENTS}`);
     const options = header.options;
     expect(isObject(options), "options: expected an object");
-    expect(isInteger(options.max_hits, 0, 8), "options.max_hits: expected 0 to 8");
-    expect(isInteger(options.sh_degree, 0, 6), "options.sh_degree: expected 0 to 6");
+    expect(isInteger(options.sh_degree, 0, 3), "options.sh_degree: expected 0 to 3");
     expect(areNumbers(options.background, 3, -1e6, 1e6), "options.background: expected three numbers");
-    for (const name of ["low_pass", "clamp_texture", "detail_limits"]) {
-        expect(typeof options[name] === "boolean", `options.${name}: expected true or false`);
-    }
-    checkTexture(header.texture ?? null);
-    checkExposures(header.exposures ?? null);
+    expect(options.low_pass !== true, "options.low_pass: expected false, the filter has been removed");
+    checkExposures(header.exposures);
     checkCameras(header);
     expect(Array.isArray(header.sections) && header.sections.every(isObject), "sections: expected a list of objects");
     expect(header.sections.length <= 32, "sections: expected at most 32");
+}
+
+function checkScene(header) {
+    const { options, quality } = header;
+    expect(quality === "quantised" || quality === "full", "quality: expected quantised or full");
+    expect(isInteger(options.max_hits, 0, 8), "options.max_hits: expected 0 to 8");
+    for (const name of ["clamp_texture", "detail_limits"]) {
+        expect(typeof options[name] === "boolean", `options.${name}: expected true or false`);
+    }
+    checkTexture(header.texture);
 }
 
 function checkTexture(texture) {
@@ -75,8 +80,9 @@ function checkTexture(texture) {
     }
     expect((texture.table_size & (texture.table_size - 1)) === 0, "texture.table_size: expected a power of two");
     expect([1, 2, 4, 8].includes(texture.features), "texture.features: expected 1, 2, 4 or 8");
-    expect(typeof texture.residual === "boolean", "texture.residual: expected true or false");
-    expect(typeof texture.down_weighting === "boolean", "texture.down_weighting: expected true or false");
+    for (const name of ["residual", "down_weighting"]) {
+        expect(typeof texture[name] === "boolean", `texture.${name}: expected true or false`);
+    }
     expect(areNumbers(texture.resolutions, texture.levels, 1e-30, 1e10), "texture.resolutions: expected one a level");
 }
 
@@ -90,9 +96,9 @@ function checkExposures(exposures) {
     }
 }
 
-function checkCameras(header) {
-    expect(Array.isArray(header.cameras) && header.cameras.length <= 1000, "cameras: expected a list of at most 1000");
-    for (const camera of header.cameras) {
+function checkCameras({ cameras, start, center, up, near, bounds }) {
+    expect(Array.isArray(cameras) && cameras.length <= 1000, "cameras: expected a list of at most 1000");
+    for (const camera of cameras) {
         const good =
             isObject(camera) &&
             typeof camera.name === "string" &&
@@ -105,60 +111,52 @@ function checkCameras(header) {
             areNumbers([camera.near], 1, 0, 1e16);
         expect(good, "cameras: expected name, viewmat, K, width, height and near");
     }
-    const last = Math.max(header.cameras.length - 1, 0);
-    expect(isInteger(header.start, 0, last), "start: expected the index of a camera");
-    expect(areNumbers(header.center, 3) && areNumbers(header.up, 3), "center, up: expected three numbers each");
-    expect(areNumbers([header.near], 1, 0, 1e16), "near: expected a number");
-    const bounds = header.bounds;
-    expect(Array.isArray(bounds) && bounds.length === 2, "bounds: expected two points");
-    expect(areNumbers(bounds[0], 3) && areNumbers(bounds[1], 3), "bounds: expected two points");
+    expect(isInteger(start, 0, Math.max(cameras.length - 1, 0)), "start: expected the index of a camera");
+    expect(areNumbers(center, 3) && areNumbers(up, 3), "center, up: expected three numbers each");
+    expect(areNumbers([near], 1, 0, 1e16), "near: expected a number");
+    const points = Array.isArray(bounds) && bounds.length === 2 && bounds.every((point) => areNumbers(point, 3));
+    expect(points, "bounds: expected two points");
+}
+
+function checkBaked({ atlas, sh_coefficients: coefficients, sh_ranges: ranges }) {
+    const sizes = isObject(atlas) && isInteger(atlas.width, 1, LARGEST_SIDE) && isInteger(atlas.height, 1, LARGEST_SIDE);
+    expect(sizes && areNumbers([atlas.scale], 1) && /^[\w-]+\.webp$/.test(atlas.file), "atlas: expected a picture's file");
+    expect(areNumbers(ranges, Math.max(3, Math.sqrt(coefficients) - 1)), "sh_ranges: expected three numbers");
 }
 
 // Shapes (out, in) of the MLP's matrices.
 export function matrixShapes(texture) {
-    const sizes = [texture.levels * texture.features];
-    for (let i = 0; i < texture.hidden_layers; i++) {
-        sizes.push(texture.width);
-    }
-    sizes.push(3 * (texture.sh_degree + 1) ** 2);
+    const hidden = Array(texture.hidden_layers).fill(texture.width);
+    const sizes = [texture.levels * texture.features, ...hidden, 3 * (texture.sh_degree + 1) ** 2];
     return sizes.slice(1).map((out, i) => [out, sizes[i]]);
 }
 
-// The sections that a header describes, in order: [name, dtype, shape].
-export function expectedSections(header) {
-    const count = header.surfels;
-    const coefficients = header.sh_coefficients;
-    const limits = header.options.detail_limits;
-    const texture = header.texture ?? null;
+// The sections that a scene's header describes, in order: [name, dtype, shape].
+function sceneSections(header) {
+    const { surfels: count, sh_coefficients: coefficients, texture, options } = header;
     const full = header.quality === "full";
-    let sections;
-    if (full) {
-        sections = [
-            ["means", "f32", [count, 3]],
-            ["quats", "f32", [count, 4]],
-            ["scales", "f32", [count, 2]],
-            ["opacities", "f32", [count]],
-            ["gammas", "f32", [count, 2]],
-        ];
-        if (limits) {
-            sections.push(["limits", "f32", [count, 2]]);
-        }
-        sections.push(["sh", "f32", [count, coefficients, 3]]);
-    } else {
-        sections = [
-            ["ranges", "f32", [Math.ceil(count / CHUNK), 7 + Math.round(Math.sqrt(coefficients)), 2]],
-            ["means", "u16", [3, count]],
-            ["quats", "u32", [count]],
-            ["scales", "u16", [2, count]],
-            ["opacities", "u8", [count]],
-            ["gammas", "u8", [2, count]],
-        ];
-        if (limits) {
-            sections.push(["limits_scale", "f32", [2]], ["limits", "u16", [2, count]]);
-        }
-        sections.push(["sh", "u8", [coefficients * 3, count]]);
-    }
-    if (header.exposures) {
+    const limits = (...sections) => (options.detail_limits ? sections : []);
+    const sections = full
+        ? [
+              ["means", "f32", [count, 3]],
+              ["quats", "f32", [count, 4]],
+              ["scales", "f32", [count, 2]],
+              ["opacities", "f32", [count]],
+              ["gammas", "f32", [count, 2]],
+              ...limits(["limits", "f32", [count, 2]]),
+              ["sh", "f32", [count, coefficients, 3]],
+          ]
+        : [
+              ["ranges", "f32", [Math.ceil(count / CHUNK), 7 + Math.sqrt(coefficients), 2]],
+              ["means", "u16", [3, count]],
+              ["quats", "u32", [count]],
+              ["scales", "u16", [2, count]],
+              ["opacities", "u8", [count]],
+              ["gammas", "u8", [2, count]],
+              ...limits(["limits_scale", "f32", [2]], ["limits", "u16", [2, count]]),
+              ["sh", "u8", [coefficients * 3, count]],
+          ];
+    if (header.exposures !== null) {
         sections.push(["exposures", "f32", [header.exposures.count, 9]]);
     }
     if (texture !== null) {
@@ -171,6 +169,26 @@ export function expectedSections(header) {
     }
     return sections;
 }
+
+function bakedSections({ surfels: count, sh_coefficients: coefficients, exposures }) {
+    return [
+        ["means", "f32", [count, 3]],
+        ["quats", "u16", [count, 4]],
+        ["scales", "f32", [count, 2]],
+        ["opacities", "f32", [count]],
+        ["gammas", "f32", [count, 2]],
+        ["farthest", "f32", [count]],
+        ["boxes", "f32", [count, 4]],
+        ["rects", "u16", [count, 4]],
+        ["sh0", "f32", [count, 3]],
+        ...(exposures === null ? [] : [["exposures", "f32", [exposures.count, 9]]]),
+        ["shN", "u8", [count, coefficients - 1, 3]],
+    ];
+}
+
+// Kinds of files: the magic, what the header must hold beside, and the sections.
+export const SCENE = { magic: "NXWSCENE", check: checkScene, sections: sceneSections };
+export const BAKED = { magic: "NXWBAKED", check: checkBaked, sections: bakedSections };
 
 // Bytes from a stream, in pieces of the sizes that are asked for.
 class ByteReader {
@@ -241,7 +259,8 @@ async function inflate(bytes, size, name) {
 }
 
 export class SceneReader {
-    constructor(stream, onBytes = () => {}) {
+    constructor(stream, onBytes = () => {}, kind = SCENE) {
+        this.kind = kind;
         this.bytes = new ByteReader(stream, onBytes);
         this.arrays = {};
         this.header = null;
@@ -251,7 +270,7 @@ export class SceneReader {
     // Reads and checks the header, and the poster if there is one.
     async readHeader() {
         const start = await this.bytes.read(16);
-        expect(String.fromCharCode(...start.subarray(0, 8)) === MAGIC, "expected a scene file of nexwarp");
+        expect(String.fromCharCode(...start.subarray(0, 8)) === this.kind.magic, `expected ${this.kind.magic} at the start`);
         const view = new DataView(start.buffer);
         expect(view.getUint32(8, true) === VERSION, `expected format version ${VERSION}, got ${view.getUint32(8, true)}`);
         const length = view.getUint32(12, true);
@@ -260,24 +279,21 @@ export class SceneReader {
         try {
             header = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(await this.bytes.read(length)));
         } catch (error) {
-            throw error instanceof SceneError ? error : new SceneError("scene file: expected JSON as the header");
+            throw error instanceof SceneError ? error : new SceneError("scene file: expected a JSON header");
         }
+        header = isObject(header) ? { texture: null, exposures: null, ...header } : header;
         checkHeader(header);
-        header.texture = header.texture ?? null;
-        header.exposures = header.exposures ?? null;
+        this.kind.check(header);
         this.base = 16 + length;
-        this.entries = header.sections;
-        if (this.entries.length > 0 && this.entries[0].name === "poster") {
-            const entry = this.entries[0];
+        this.entries = [...header.sections];
+        if (this.entries[0]?.name === "poster") {
+            const entry = this.entries.shift();
             expect(isInteger(entry.bytes, 0, 2 ** 24) && entry.encoding === "raw", "poster: expected at most 16 MiB");
-            const bytes = await this.content(entry, entry.bytes);
-            const type = ["image/jpeg", "image/webp", "image/png"].includes(header.poster?.type) ? header.poster.type : "image/jpeg";
-            this.poster = new Blob([bytes], { type });
-            this.entries = this.entries.slice(1);
+            this.poster = new Blob([await this.content(entry, entry.bytes)], { type: "image/jpeg" });
         }
-        const expected = JSON.stringify(expectedSections(header));
-        const found = JSON.stringify(this.entries.map((entry) => [entry.name, entry.dtype, entry.shape]));
-        expect(found === expected, "expected the sections that the header describes");
+        const expected = JSON.stringify(this.kind.sections(header));
+        const listed = JSON.stringify(this.entries.map((entry) => [entry.name, entry.dtype, entry.shape]));
+        expect(listed === expected, "expected the sections that the header describes");
         this.header = header;
         return header;
     }
@@ -317,7 +333,7 @@ export class SceneReader {
     }
 }
 
-function checkValues(name, values, largest) {
+export function checkValues(name, values, largest) {
     for (let i = 0; i < values.length; i++) {
         if (!(Math.abs(values[i]) <= largest)) {
             throw new SceneError(`scene file: section ${name}: expected finite values of at most ${largest}`);

@@ -1,7 +1,7 @@
 // The page: chooses a renderer, shows loading, and connects camera, controls and settings.
 
 import {BAKED_FILE, BakedRenderer} from "nexwarp/baked.js";
-import {FOV, Pose, basisOf} from "nexwarp/cameras/camera.js";
+import {FOV, Pose, basisOf} from "nexwarp/camera.js";
 import {Controls} from "nexwarp/controls.js";
 import {Pacing} from "nexwarp/pacing.js";
 import {Renderer} from "nexwarp/renderer.js";

@@ -52,9 +52,6 @@ fn collect(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             batch[place * RECORD + lane % 4u] = records[i * RECORD + lane % 4u];
             if (lane % 4u == 0u) {
                 batch_ids[place] = i;
-                if (LOW_PASS) {
-                    batch[place * RECORD + RECORD - 1u] = records[i * RECORD + RECORD - 1u];
-                }
             }
         }
         workgroupBarrier();
@@ -71,30 +68,19 @@ fn collect(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             let n = batch[k * RECORD + 2u];
             let c = batch[k * RECORD + 3u];
             let cosine = dot(n.xyz, d);
-            if (abs(cosine) < 1e-18 && !LOW_PASS) {
+            if (abs(cosine) < 1e-18) {
                 continue;
             }
-            let inverse = 1.0 / select(cosine, 1e-18, abs(cosine) < 1e-18);
+            let inverse = 1.0 / cosine;
             let uv = vec2f(dot(a.xyz, d), dot(b.xyz, d)) * inverse;
             let square = min(uv * uv, vec2f(1e30));
             // Beyond 1, |u|^(2 gamma) is at least u^2.
-            if (!LOW_PASS && max(square.x, square.y) > FARTHEST) {
+            if (max(square.x, square.y) > FARTHEST) {
                 continue;
             }
-            var depth = c.w * inverse;
+            let depth = c.w * inverse;
             let powers = exp2(min(vec2f(b.w, n.w) * log2(max(square, vec2f(TINY))), vec2f(100.0)));
-            var exponent = powers.x + powers.y;
-            if (LOW_PASS) {
-                let center = batch[k * RECORD + RECORD - 1u];
-                if (center.w > 0.0) {
-                    let offset = vec2f(xy) + 0.5 - center.xy;
-                    let screen = 2.0 * dot(offset, offset);
-                    if (!(exponent < screen)) {
-                        exponent = screen;
-                        depth = center.z;
-                    }
-                }
-            }
+            let exponent = powers.x + powers.y;
             let alpha = min(a.w * exp2(-0.7213475204444817 * exponent), ALPHA_MAX);
             if (!(alpha >= ALPHA_MIN && depth > near)) {
                 continue;

@@ -1,14 +1,14 @@
-// Shared by all passes. The host puts constants before this text: see `prelude` in renderer.py and renderer.js.
+// Shared by all passes. The page puts constants before this text: see `sourceOf` in program.js.
 //
 // A surfel is stored for the walk along a ray as RECORD rows (nexwarp/kernels/surfel.py):
 //   row 0   a = (v2 x c) / s1, opacity        u = (a . d) / (n . d)
 //   row 1   b = (c x v1) / s2, gamma 1        v = (b . d) / (n . d)
 //   row 2   n, gamma 2                        t = m / (n . d)
 //   row 3   plain colour, m = c . n
-//   row 4   with the low-pass: projected centre in pixels, its depth, 1 where it lies before the camera
 // with c its centre and v1, v2, n its axes in the camera frame.
 
 const TILE: u32 = 16u;
+const RECORD: u32 = 4u;
 const ALPHA_MIN: f32 = 1.0 / 255.0;
 const ALPHA_MAX: f32 = 0.99;
 const TRANSMITTANCE_MIN: f32 = 1e-4;
@@ -33,7 +33,7 @@ struct Frame {
     falloff: vec4f,  // a, b, T of the lens; 1 where it has a falloff
     limits: vec4f,  // least weight of a textured second hit; depths at the ends of the colour scale; unused
     size: vec4u,  // width, height [pixels]; tile columns and rows
-    counts: vec4u,  // surfels; capacity of the tile lists; mode; slot that the mode shows
+    counts: vec4u,  // surfels; capacity of the tile lists; mode; unused
     texels: vec4u,  // width and height of the texel grid; pixels between texels; whether the texture is complete
 }
 
@@ -77,7 +77,7 @@ fn basis(block: u32, d: vec3f) -> vec4f {
                 -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y),
             );
         }
-        case 3u: {
+        default: {
             return vec4f(
                 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
                 -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y),
@@ -85,37 +85,5 @@ fn basis(block: u32, d: vec3f) -> vec4f {
                 -0.5900435899266435 * x * (x * x - 3.0 * y * y),
             );
         }
-        default: {
-            let k = 4u * block;
-            return vec4f(harmonic(k, d), harmonic(k + 1u, d), harmonic(k + 2u, d), harmonic(k + 3u, d));
-        }
     }
-}
-
-// Basis function of index 16 or more, by recurrences (nexwarp/kernels/sh.py).
-fn harmonic(k: u32, d: vec3f) -> f32 {
-    var degree = 4;
-    while ((degree + 1) * (degree + 1) <= i32(k)) {
-        degree++;
-    }
-    let order = i32(k) - degree * degree - degree;
-    let m = abs(order);
-    var value = select(0.39894228040143268, 0.28209479177387814, m == 0);
-    var cosine = 1.0; // times sin^m, of m times the azimuth
-    var sine = 0.0;
-    for (var j = 1; j <= m; j++) {
-        value *= -sqrt(f32(2 * j + 1) / f32(2 * j));
-        let turned = d.x * cosine - d.y * sine;
-        sine = d.x * sine + d.y * cosine;
-        cosine = turned;
-    }
-    var before = 0.0;
-    for (var n = m + 1; n <= degree; n++) {
-        let a = sqrt(f32(4 * n * n - 1) / f32(n * n - m * m));
-        let b = sqrt(f32((n - 1) * (n - 1) - m * m) / f32(4 * (n - 1) * (n - 1) - 1));
-        let following = a * (d.z * value - b * before);
-        before = value;
-        value = following;
-    }
-    return value * select(cosine, sine, order < 0);
 }

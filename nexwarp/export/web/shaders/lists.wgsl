@@ -15,7 +15,6 @@ struct Polygon {
     corners: array<vec2f, 5>,
     count: u32,
     margin: f32,
-    disc: vec3f,
     rows: vec2u,  // first, and one behind the last
 }
 
@@ -24,8 +23,7 @@ fn polygon_of(i: u32) -> Polygon {
     let p1 = polygons[4u * i + 1u];
     let p2 = polygons[4u * i + 2u];
     let p3 = polygons[4u * i + 3u];
-    let rows = bitcast<u32>(p3.w);
-    return Polygon(array<vec2f, 5>(p0.xy, p0.zw, p1.xy, p1.zw, p2.xy), u32(p2.w), p2.z, p3.xyz, vec2u(rows & 0xffffu, rows >> 16u));
+    return Polygon(array<vec2f, 5>(p0.xy, p0.zw, p1.xy, p1.zw, p2.xy), u32(p3.x), p2.z, vec2u(p3.yz));
 }
 
 fn tile_index(x: f32) -> i32 {
@@ -40,33 +38,24 @@ fn span(polygon: ptr<function, Polygon>, row: u32) -> vec2u {
     var low = HUGE;
     var high = -HUGE;
     let count = (*polygon).count;
-    if (count > 0u) {
-        var p = (*polygon).corners[count - 1u];
-        for (var k = 0u; k < count; k++) {
-            let q = (*polygon).corners[k];
-            if (q.y >= top && q.y <= bottom) {
-                low = min(low, q.x);
-                high = max(high, q.x);
-            }
-            if ((p.y < top) != (q.y < top)) {
-                let x = p.x + (q.x - p.x) * ((top - p.y) / (q.y - p.y));
-                low = min(low, x);
-                high = max(high, x);
-            }
-            if ((p.y > bottom) != (q.y > bottom)) {
-                let x = p.x + (q.x - p.x) * ((bottom - p.y) / (q.y - p.y));
-                low = min(low, x);
-                high = max(high, x);
-            }
-            p = q;
+    var p = (*polygon).corners[max(count, 1u) - 1u];
+    for (var k = 0u; k < count; k++) {
+        let q = (*polygon).corners[k];
+        if (q.y >= top && q.y <= bottom) {
+            low = min(low, q.x);
+            high = max(high, q.x);
         }
-    }
-    if (LOW_PASS) {
-        let disc = (*polygon).disc;
-        if (disc.z > 0.0 && disc.y + disc.z >= top && disc.y - disc.z <= bottom) {
-            low = min(low, disc.x - disc.z);
-            high = max(high, disc.x + disc.z);
+        if ((p.y < top) != (q.y < top)) {
+            let x = p.x + (q.x - p.x) * ((top - p.y) / (q.y - p.y));
+            low = min(low, x);
+            high = max(high, x);
         }
+        if ((p.y > bottom) != (q.y > bottom)) {
+            let x = p.x + (q.x - p.x) * ((bottom - p.y) / (q.y - p.y));
+            low = min(low, x);
+            high = max(high, x);
+        }
+        p = q;
     }
     if (!(low <= high)) {
         return vec2u(0u);

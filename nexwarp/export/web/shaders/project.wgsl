@@ -1,8 +1,8 @@
 // Projection: a thread is a surfel. Antialiasing, record, tile polygon, plain colour and sorting key
 // (nexwarp/kernels/antialias.py, project.py, tiles.py and sh.py).
 //
-// A tile polygon is four rows: corners 0 and 1; 2 and 3; corner 4, margin, corners; disc of the low-pass, tile rows
-// (first in the low, last + 1 in the high half of the word).
+// A tile polygon is four rows: corners 0 and 1; 2 and 3; corner 4, margin; number of corners, first tile row, and one
+// behind the last.
 
 @group(0) @binding(1) var<storage, read> geometry: array<vec4f>;  // mean, opacity; quaternion wxyz; scales, gammas
 @group(0) @binding(2) var<storage, read> seen: array<vec2f>;  // detail limits: nearest, farthest
@@ -65,7 +65,6 @@ fn project(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups:
     let center = rotate(mean) + vec3f(frame.row0.w, frame.row1.w, frame.row2.w);
     order[i] = i;
     keys[i] = 0xffffffffu;  // nothing to see: behind all others
-    polygons[4u * i + 2u] = vec4f(0.0);
     polygons[4u * i + 3u] = vec4f(0.0);
     if (LIMITS) {
         let size = center.z / frame.gains.w;
@@ -126,13 +125,7 @@ fn project(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups:
             }
         }
     }
-    var disc = vec3f(0.0);
-    if (LOW_PASS && center.z > near) {
-        disc = vec3f(pixel(center), sqrt(0.5 * limit));
-        low = min(low, disc.xy - disc.z);
-        high = max(high, disc.xy + disc.z);
-    }
-    if (count == 0u && !(disc.z > 0.0)) {
+    if (count == 0u) {
         return;
     }
     let size = max(max(abs(low.x), abs(low.y)), max(abs(high.x), abs(high.y)));
@@ -141,7 +134,7 @@ fn project(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups:
     if (size < HUGE) {
         // A corner is known to a rounding of the extent: pixels by the focal length over the depth.
         let blur = RELATIVE * extent * max(frame.intrinsics.x, frame.intrinsics.y) / nearest;
-        margin = MARGIN + RELATIVE * size + select(0.0, blur, count > 0u);
+        margin = MARGIN + RELATIVE * size + blur;
         // A tile's samples are its pixel centres, half a pixel inside its border.
         rows.x = max(tile_index((low.y - margin + 0.5) / f32(TILE) - 1.0, frame.size.w), 0);
         rows.y = min(tile_index((high.y + margin - 0.5) / f32(TILE), frame.size.w), i32(frame.size.w) - 1);
@@ -161,15 +154,12 @@ fn project(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups:
     }
     polygons[4u * i] = vec4f(corners[0], corners[1]);
     polygons[4u * i + 1u] = vec4f(corners[2], corners[3]);
-    polygons[4u * i + 2u] = vec4f(corners[4], margin, f32(count));
-    polygons[4u * i + 3u] = vec4f(disc, bitcast<f32>(u32(rows.x) | (u32(rows.y + 1) << 16u)));
+    polygons[4u * i + 2u] = vec4f(corners[4], margin, 0.0);
+    polygons[4u * i + 3u] = vec4f(f32(count), f32(rows.x), f32(rows.y + 1), 0.0);
     records[RECORD * i] = vec4f(cross(v2, center) * (1.0 / max(scales.x, TINY)), opacity);
     records[RECORD * i + 1u] = vec4f(cross(center, v1) * (1.0 / max(scales.y, TINY)), gammas.x);
     records[RECORD * i + 2u] = vec4f(n, gammas.y);
     records[RECORD * i + 3u] = vec4f(plain_color(i, mean), dot(center, n));
-    if (LOW_PASS) {
-        records[RECORD * i + RECORD - 1u] = vec4f(disc.xy, center.z, select(0.0, 1.0, center.z > near));
-    }
     // Sortable bits of the signed depth; adding 0 makes -0 and 0 tie.
     let bits = bitcast<u32>(center.z + 0.0);
     keys[i] = select(bits | 0x80000000u, ~bits, (bits & 0x80000000u) != 0u);

@@ -2,9 +2,9 @@
 // Hash lookup (nexwarp/kernels/hashgrid.py, paper Eq. 2 and 4), MLP, spherical harmonics of each of its K hits.
 //
 // The MLP's matrices `mlp` are in blocks of 4 x 4, a row of blocks after the other. The rows of the last one are by
-// channel, then coefficient, so that a block's dot product with the basis is a part of one channel. `mlp_color` is in
-// mlp.wgsl, or unrolled by the host. Weights and activations are in half precision where the device has it; weights that
-// fit are in a uniform buffer, which the host declares: GPUs have a cache for those.
+// channel, then coefficient, so that a block's dot product with the basis is a part of one channel. Weights and
+// activations are in half precision where the device has it; weights that fit are in a uniform buffer, which the page
+// declares: GPUs have a cache for those.
 
 @group(0) @binding(1) var<storage, read> seen: array<vec2f>;
 @group(0) @binding(2) var<storage, read> ids: array<i32>;
@@ -58,6 +58,42 @@ fn activation(sum: vec4f) -> Weight {
 // 1 for the coefficients of a block that the SH degree of the rendering includes.
 fn used(block: u32) -> vec4f {
     return select(vec4f(0.0), vec4f(1.0), vec4u(4u * block) + vec4u(0u, 1u, 2u, 3u) < vec4u(USED_COEFFICIENTS));
+}
+
+fn mlp_color(x: ptr<function, array<Weight, INPUTS>>, direction: vec3f) -> vec3f {
+    var h: array<Weight, max(INPUTS, WIDTH)>;
+    for (var i = 0u; i < INPUTS; i++) {
+        h[i] = (*x)[i];
+    }
+    var at = 0u;
+    var inputs = INPUTS;
+    for (var layer = 0u; layer < HIDDEN; layer++) {
+        var next: array<Weight, max(INPUTS, WIDTH)>;
+        for (var o = 0u; o < WIDTH; o++) {
+            var sum = vec4f(0.0);
+            for (var i = 0u; i < inputs; i++) {
+                sum += block_product(at, h[i]);
+                at += 1u;
+            }
+            next[o] = activation(sum);
+        }
+        h = next;
+        inputs = WIDTH;
+    }
+    var color = vec3f(0.0);
+    for (var channel = 0u; channel < 3u; channel++) {
+        for (var block = 0u; block < BLOCKS; block++) {
+            if (block < USED_BLOCKS) {
+                var sum = vec4f(0.0);
+                for (var i = 0u; i < inputs; i++) {
+                    sum += block_product(at + i, h[i]);
+                }
+                color[channel] += dot(sum, basis(block, direction) * used(block));
+            }
+            at += inputs;
+        }
+    }
+    return color;
 }
 
 @compute @workgroup_size(64)
