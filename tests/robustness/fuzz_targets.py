@@ -45,7 +45,6 @@ from tests.robustness.fuzz_models import (
     some_trainer,
     some_viewmats,
 )
-from tests.robustness.fuzz_web import make_scene_files, read_scene_files
 
 
 @dataclass(frozen=True)
@@ -403,7 +402,6 @@ TARGETS = {
         FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
         FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
-        FuzzTarget("web_scene", make_scene_files, read_scene_files, (".nxw",)),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }
