@@ -202,42 +202,6 @@ def _safetensors(rng: random.Random, data: bytes) -> bytes:
     return struct.pack("<Q", length) + header + body
 
 
-def strategy(valid: list[Files], fuzzed: tuple[str, ...]) -> Any:
-    """Hypothesis' strategy of a target's files: JSON with any values, other files with any bytes."""
-    from hypothesis import strategies as st
-
-    leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=40) | st.sampled_from(VALUES)
-    values = st.recursive(
-        leaves, lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.text(max_size=8), inner, max_size=6)
-    )
-    numbers = (
-        st.sampled_from(INTEGERS).map(lambda x: struct.pack("<Q", x))
-        | st.floats().map(lambda x: struct.pack("<d", x))
-        | st.integers(0, 2**32 - 1).map(lambda x: struct.pack("<I", x))
-        | st.binary(max_size=64)
-    )
-
-    @st.composite
-    def files(draw: Any) -> Files:
-        chosen = dict(draw(st.sampled_from(valid)))
-        name = draw(st.sampled_from([name for name in sorted(chosen) if name.endswith(fuzzed)]))
-        data = chosen[name]
-        if name.endswith(".json"):
-            value = json.loads(data)
-            for _ in range(draw(st.integers(1, 3))):
-                places = _places(value)
-                value = _replaced(value, places[draw(st.integers(0, len(places) - 1))], draw(values))
-            chosen[name] = json.dumps(value).encode("utf-8", "surrogatepass")
-            return chosen
-        for _ in range(draw(st.integers(1, 3))):
-            at, new = draw(st.integers(0, len(data))), draw(numbers)
-            data = data[:at] + new + data[at + draw(st.sampled_from((0, len(new)))) :]
-        chosen[name] = data
-        return chosen
-
-    return files()
-
-
 def _values(rng: random.Random, header: dict[str, Any], body: bytes) -> bytes:
     """The content of a safetensors file with numbers of some tensors replaced by extreme ones."""
     kinds = {"F16": ("<e", 65504.0), "F32": ("<f", 3e38), "F64": ("<d", 1e308)}

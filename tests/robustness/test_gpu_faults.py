@@ -16,11 +16,8 @@ from nexwarp.errors import DivergedError, OutOfMemoryError
 from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train import graphs as step_graphs
-from nexwarp.train import trainer as trainer_module
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.relocation import least_contributing
-from nexwarp.train.teachers import Teachers
 from nexwarp.train.trainer import Trainer
 from tests.faults import Allocator, allocating, failing_gpu
 from tests.narrowing import present
@@ -164,70 +161,6 @@ def test_a_step_is_repeated_without_graphs_only_if_it_has_updated_nothing(monkey
         with pytest.raises(type(error)):
             graphs.run("target", work, None)  # type: ignore[arg-type]
         assert not done
-
-
-@pytest.mark.parametrize(
-    ("error", "kept", "repeated"),
-    [(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True, True),
-     (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), False, False),
-     (RuntimeError("shape mismatch"), True, False)],
-)  # fmt: skip
-def test_a_teacher_that_lacks_memory_renders_again_without_graphs_if_there_are_any(
-    tiny_scene, monkeypatch, error, kept, repeated
-):
-    """The memory of a training's graphs may be what its teachers' renderings lack."""
-    config = small(iterations=8)
-    trainer = Trainer(tiny_scene, config, "cpu", teachers=[Trainer(tiny_scene, config, "cpu").finish()])
-    teachers, render = present(trainer.teachers), Teachers.target
-    done: list[str] = []
-    graphs = object.__new__(step_graphs.StepGraphs)
-    graphs.chances, graphs.keeper = 3, object() if kept else None  # type: ignore[assignment]  # stands for a graph
-
-    def render_once_in_vain(*given: Any) -> Any:
-        done.append("rendered")
-        if done == ["rendered"]:
-            raise error
-        return render(*given)
-
-    number = next(number for number in range(1, 8) if teachers.teaches(number))
-    expected = trainer._target(0, number, []).photo
-    monkeypatch.setattr(Teachers, "target", render_once_in_vain)
-    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
-    trainer.graphs = graphs
-    if repeated:
-        assert torch.equal(trainer._target(0, number, []).photo, expected)
-        assert done == ["rendered", "cleared", "rendered"] and graphs.chances == 2
-    else:
-        with pytest.raises(type(error)):
-            trainer._target(0, number, [])
-        assert done == ["rendered"]
-
-
-def test_relocation_that_lacks_memory_is_repeated_without_graphs(tiny_scene, monkeypatch):
-    """It renders all training views, for which the memory of the graphs may be missing; the training is the same."""
-    densify = DensifyConfig(every=3, relocate=0.2, prune_opacity=0.0, fraction=0.2)
-    config = small(iterations=120, max_surfels=50, densify=densify)
-    expected, trainer = Trainer(tiny_scene, config, "cpu"), Trainer(tiny_scene, config, "cpu")
-    expected.run(until=33)
-    done: list[str] = []
-
-    def find_once_in_vain(*given: Any) -> Any:
-        done.append("looked")
-        if done == ["looked"]:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-        return least_contributing(*given)
-
-    graphs = object.__new__(step_graphs.StepGraphs)
-    graphs.chances, graphs.keeper = 3, object()  # type: ignore[assignment]  # stands for a graph
-    monkeypatch.setattr(graphs, "run", lambda target, work, _: work(target))
-    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
-    monkeypatch.setattr(trainer_module, "least_contributing", find_once_in_vain)
-    monkeypatch.setattr(trainer, "_graph_key", lambda: None)
-    trainer.graphs = graphs
-    trainer.run(until=33)
-    assert done == ["looked", "cleared", "looked"] and graphs.chances == 2
-    trainer.graphs = None
-    assert_same_state(trainer, expected)
 
 
 def test_an_update_that_lacks_memory_is_told_apart(tiny_scene, monkeypatch, device):

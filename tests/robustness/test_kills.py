@@ -1,7 +1,4 @@
-"""SIGKILL at random moments and in each stage of the finishing; what is resumed ends as if nothing had happened.
-
-`python -m tests.robustness.kills` does the same to the demo, as often as one likes.
-"""
+"""SIGKILL at random moments and in each stage of the finishing; what is resumed ends as if nothing had happened."""
 
 import math
 import os
@@ -27,7 +24,7 @@ from nexwarp.train.finish import auto_exposure
 from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
-from tests.robustness.kills import Kills, kill_and_resume
+from tests.robustness.kills import kill_and_resume
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]
@@ -130,9 +127,3 @@ def test_a_kill_is_waited_for(tmp_path):
     with pytest.raises(RuntimeError, match="ended by itself, with exit code 7"):
         kill_and_resume(start, lambda _: 0, tmp_path / "run", 60.0, b"")
     assert time.perf_counter() - begun < 30
-
-
-def test_the_command_is_given_the_device_and_the_sums():
-    alone, on_gpu = Kills().command(), Kills(device="cuda", deterministic=True, iterations=600).command()
-    assert "--device=cpu" in alone and "--deterministic" not in alone
-    assert "--device=cuda" in on_gpu and "--deterministic" in on_gpu and "--iterations=600" in on_gpu
