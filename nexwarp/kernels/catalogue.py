@@ -27,9 +27,8 @@ from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.reduce import reduce_slots_kernel
 from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.splat_error import splat_error_kernel
-from nexwarp.kernels.ssim import SIMD_WIDTH, ssim_kernels
-from nexwarp.kernels.ssim_tiles import THREADS as SSIM_THREADS
-from nexwarp.kernels.ssim_tiles import ssim_tile_kernels
+from nexwarp.kernels.ssim import THREADS as SSIM_THREADS
+from nexwarp.kernels.ssim import ssim_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tile_lists import depth_keys_kernel, list_kernels, surfel_ids_kernel, tile_offsets_kernel
@@ -47,8 +46,7 @@ def all_kernels(
 ) -> Iterator[wp.Kernel]:
     """Yield each kernel for a scalar type, a texture storage type, a tile size and some K, for CUDA or for a CPU."""
     in_tiles = not cpu and real is wp.float32
-    lengths = () if in_tiles else (1, SIMD_WIDTH) if cpu else (1,)
-    yield from thread_kernels(real, storage, tile_size, ssim_lengths=lengths, cpu=cpu)
+    yield from thread_kernels(real, storage, tile_size, cpu=cpu)
     if in_tiles:
         yield from (kernel for kernel, _ in ssim_tile_builds())
     yield from walk_kernels(real, tile_size, max_hits, cpu=cpu)
@@ -70,7 +68,6 @@ def thread_kernels(
     features: Sequence[int] = (1, 2, 4, 8),
     clamps: Sequence[bool] = (False, True),
     low_passes: Sequence[bool] = (False, True),
-    ssim_lengths: Sequence[int] = (1, SIMD_WIDTH),
     layered: bool = True,
     cpu: bool = False,
     fixed_point: bool = True,
@@ -92,9 +89,6 @@ def thread_kernels(
     if not cpu:
         yield from (expose_kernels(real).forward, expose_kernels(real).backward)
     yield from (photometric_kernels(real).forward, photometric_kernels(real).backward)
-    for length in ssim_lengths:
-        ssim = ssim_kernels(real, length)
-        yield from (ssim.moments, ssim.score, ssim.blur, ssim.gradient)
     for degree in degrees:
         plain = plain_colors_kernels(real, degree)
         yield from (plain.forward, plain.coefficients_backward, plain.rays_backward)
@@ -116,7 +110,7 @@ def thread_kernels(
 
 def ssim_tile_builds() -> Iterator[tuple[wp.Kernel, int]]:
     """Yield the kernels of D-SSIM for GPUs in float32, with the threads of their blocks."""
-    kernels = ssim_tile_kernels()
+    kernels = ssim_kernels()
     yield from ((kernel, SSIM_THREADS) for kernel in (kernels.score, kernels.gradient))
 
 

@@ -1,4 +1,4 @@
-"""D-SSIM and its derivative: a blur down the columns, then one along the rows that goes on to the result; no atomics.
+"""D-SSIM and its derivative on GPUs, in float32: one kernel each way, without maps of blurs in memory; no atomics.
 
 With x, y the image and the target, mx, my their blurs, q = blur((x^2 + y^2) / 2) and p = blur(x y), the map of SSIM is
     s = a b / (c d),   a = mx my + C1 / 2,   b = p - mx my + C2 / 2,
@@ -7,13 +7,10 @@ so that four blurs suffice, and its derivatives are
     ds/dmx = my (b - a) / (c d) + mx (s / d - s / c),   ds/dq = -s / d,   ds/dp = a / (c d).
 The blur is its own adjoint, hence dS/dx = blur(ds/dmx) + x blur(ds/dq) + y blur(ds/dp).
 
-Images are read as they lie, rows of `width` = 3 W values, so that a neighbour in the same channel is 3 values away.
-What is blurred down the columns is written to padded rows, with PAD zeros on either side.
-
-A thread takes a block of `length` neighbouring values of a row. On CUDA that is 1, which makes neighbouring threads
-read neighbouring addresses, and 4 rows of them, which share what they read down the columns. On a CPU it is SIMD_WIDTH,
-which the compiler turns into vector instructions. Arrays of blocks overlap: there is a block at every address. The last
-block of a row ends where the row ends, and agrees with the one before it where both write.
+Images are read as they lie, rows of `width` = 3 W values, so that a neighbour in the same channel is 3 values away. A
+block of threads has a strip of PIXELS x ROWS pixels. A thread blurs one column of the strip, or of the 5 pixels on
+either side, down the rows; the result goes to shared memory, from where a thread blurs GROUP neighbours of one channel
+along a row; and what comes of that goes through shared memory again, so that neighbouring threads write neighbours.
 """
 
 import functools
@@ -22,18 +19,20 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.types import types
-
-SIMD_WIDTH = 16
-# A multiple of SIMD_WIDTH, at least the 5 pixels of 3 values by which the window reaches past the end of a row.
-PAD = 16
-
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
-_REACH = WINDOW_SIZE // 2
-_GAUSSIAN = [math.exp(-((i - _REACH) ** 2) / (2.0 * WINDOW_SIGMA**2)) for i in range(WINDOW_SIZE)]
+REACH = WINDOW_SIZE // 2
+_GAUSSIAN = [math.exp(-((i - REACH) ** 2) / (2.0 * WINDOW_SIGMA**2)) for i in range(WINDOW_SIZE)]
+
+PIXELS, ROWS, GROUP = 64, 8, 8
+COLUMNS = 3 * PIXELS
+# Columns that are read, and what fills up the last warp.
+THREADS = 224
+MOMENTS = 4
+
+assert COLUMNS + 6 * REACH <= THREADS and COLUMNS == ROWS * 3 * (PIXELS // GROUP)
 
 
 def tap(i: int) -> float:
@@ -41,156 +40,234 @@ def tap(i: int) -> float:
     return _GAUSSIAN[i] / sum(_GAUSSIAN) if 0 <= i < WINDOW_SIZE else 0.0
 
 
-def rows_a_thread(length: int) -> int:
-    """Rows that a thread blurs down the columns: more save reading, but must fit in registers."""
-    return 4 if length == 1 else 1
+# A shared array belongs to the function that declares it: one function writes and reads.
+_CELL = f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ float cells[{MOMENTS * ROWS * THREADS}];
+    if (write) cells[at] = x;
+    return cells[at];
+#else
+    return x;
+#endif
+"""
+
+_SYNC = """
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+"""
+
+
+@wp.func_native(_CELL)
+def cell(write: wp.bool, at: wp.int32, x: wp.float32) -> wp.float32:
+    """Write to one of the block's cells, or read it."""
+    ...
+
+
+@wp.func_native(_SYNC)
+def sync_block():
+    """Wait for all threads of the block, and make their cells visible to each other."""
+    ...
+
+
+def blocks_of(height: int, width: int) -> int:
+    """Return the number of blocks for rows of `width` values, 3 a pixel."""
+    return -(-width // COLUMNS) * -(-height // ROWS)
 
 
 @functools.cache
-def ssim_kernels(real: type, length: int) -> SimpleNamespace:
-    """Make the kernels `moments` and `score` of the forward pass, `blur` and `gradient` of the backward pass.
-
-    Args:
-        real: scalar type.
-        length: values of a block, 1 or SIMD_WIDTH.
-    """
-    t = types(real)
-    HALF, ONE, ZERO = t.HALF, t.ONE, t.ZERO
-    HALF_C1, HALF_C2 = wp.constant(real(C1 / 2.0)), wp.constant(real(C2 / 2.0))
-    vec = wp.types.vector(length=length, dtype=real)
-    rows = rows_a_thread(length)
+def ssim_kernels() -> SimpleNamespace:
+    """Make the kernels `score` of the forward pass and `gradient` of the backward pass, for blocks of THREADS."""
+    rows = wp.types.vector(length=ROWS, dtype=wp.float32)
+    group = wp.types.vector(length=GROUP, dtype=wp.float32)
+    HALF_C1, HALF_C2 = wp.constant(C1 / 2.0), wp.constant(C2 / 2.0)
 
     @wp.func
-    def padded_block(thread: wp.int32, width: wp.int32):
-        """Which `rows` rows a thread has, and where its block starts in a row: in [0, width), or else in the pads."""
-        count = (width + length - 1) // length
-        padded = count + wp.static(2 * PAD // length)
-        block = thread % padded - wp.static(PAD // length)
-        start = block * length
-        if block >= 0:
-            start = wp.min(start, width - length)
-        if block >= count:
-            start = width + (block - count) * length
-        return (thread // padded) * wp.static(rows), start
+    def place(thread: wp.int32, width: wp.int32):
+        """(thread of its block, left column, top row) of the block's strip."""
+        block = thread // THREADS
+        strips = (width + COLUMNS - 1) // COLUMNS
+        return wp.vec3i(thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS)
 
     @wp.func
-    def inner_block(thread: wp.int32, width: wp.int32):
-        """Where a thread's block lies: the address in rows without pads, and that of its window in padded rows."""
-        count = (width + length - 1) // length
-        row = thread // count
-        at = row * width + wp.min((thread % count) * length, width - length)
-        return at, at + row * wp.static(2 * PAD) + wp.static(PAD - 3 * _REACH)
+    def put(plane: wp.int32, lane: wp.int32, values: rows):
+        """Share a column's values."""
+        for j in range(wp.static(ROWS)):
+            cell(True, (plane * ROWS + j) * THREADS + lane, values[j])
 
-    def column_blur(count: int) -> wp.Kernel:
-        """Make the kernel that blurs 4 moments of 2 images, or 3 maps, down the columns."""
-        mat = wp.types.matrix(shape=(count * rows, length), dtype=real)
-        of_images = count == 4
+    @wp.func
+    def put_group(plane: wp.int32, lane: wp.int32, values: group):
+        """Share a group's values, at the columns that they are for."""
+        for o in range(wp.static(GROUP)):
+            cell(True, plane * wp.static(ROWS * THREADS) + group_start(lane) + 3 * o, values[o])
 
-        @wp.kernel(enable_backward=False, module="unique")
-        def blur_columns(
-            first: wp.int32,
-            plane0: wp.array(dtype=vec),
-            plane1: wp.array(dtype=vec),
-            plane2: wp.array(dtype=vec),
-            height: wp.int32,
-            width: wp.int32,
-            # outputs
-            blurred: wp.array2d(dtype=vec),
-        ):
-            top, start = padded_block(first + wp.tid(), width)
-            sums = mat()
-            if start >= 0 and start < width:
-                for i in range(wp.static(rows + WINDOW_SIZE - 1)):
-                    # A row outside the image weighs nothing. It reads the nearest one instead, which is in the window
-                    # too, so that an infinity spreads no further; without branches all the reads go out at once.
-                    row = top + i - wp.static(_REACH)
-                    near = wp.clamp(row, 0, height - 1)
-                    at = near * width + start
-                    x = plane0[at]
-                    y = plane1[at]
-                    if wp.static(of_images):
-                        q = (wp.cw_mul(x, x) + wp.cw_mul(y, y)) * HALF
-                        p = wp.cw_mul(x, y)
-                    else:
-                        q = plane2[at]
-                    for j in range(wp.static(rows)):
-                        if wp.static(tap(i - j) > 0.0):
-                            weight = wp.where(row == near, wp.static(real(tap(i - j))), ZERO)
-                            sums[wp.static(count) * j] += x * weight
-                            sums[wp.static(count) * j + 1] += y * weight
-                            sums[wp.static(count) * j + 2] += q * weight
-                            if wp.static(of_images):
-                                sums[wp.static(count) * j + 3] += p * weight
-            for j in range(wp.static(rows)):
-                if top + j < height:
-                    at = (top + j) * (width + wp.static(2 * PAD)) + wp.static(PAD) + start
-                    for k in range(wp.static(count)):
-                        blurred[k, at] = sums[wp.static(count) * j + k]
+    @wp.func
+    def group_start(lane: wp.int32):
+        """Where in a plane a thread's group begins: a row, and a column relative to the strip's left."""
+        return (lane // wp.static(COLUMNS // GROUP)) * THREADS + group_column(lane)
 
-        return blur_columns
+    @wp.func
+    def group_column(lane: wp.int32):
+        return lane % 3 + (lane // 3) % wp.static(PIXELS // GROUP) * wp.static(3 * GROUP)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.func
+    def blur(plane: wp.int32, lane: wp.int32):
+        """Blur a thread's group of a plane along its row."""
+        start = plane * wp.static(ROWS * THREADS) + group_start(lane)
+        sums = group()
+        for i in range(wp.static(GROUP + 2 * REACH)):
+            x = cell(False, start + 3 * i, 0.0)
+            for o in range(wp.static(GROUP)):
+                if wp.static(tap(i - o) > 0.0):
+                    sums[o] += x * wp.static(wp.float32(tap(i - o)))
+        return sums
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
     def score(
         first: wp.int32,
-        moments: wp.array2d(dtype=vec),
+        image: wp.array(dtype=wp.float32),
+        target: wp.array(dtype=wp.float32),
+        height: wp.int32,
         width: wp.int32,
-        scale: real,
+        scale: wp.float32,
         # outputs
-        losses: wp.array(dtype=vec),
-        derivatives: wp.array2d(dtype=vec),
+        losses: wp.array(dtype=wp.float32),
+        derivatives: wp.array2d(dtype=wp.float32),
     ):
-        """(1 - s) scale, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
-        at, window = inner_block(first + wp.tid(), width)
-        mx = vec()
-        my = vec()
-        q = vec()
-        p = vec()
-        for i in range(wp.static(WINDOW_SIZE)):
-            weight = wp.static(real(tap(i)))
-            mx += moments[0, window + 3 * i] * weight
-            my += moments[1, window + 3 * i] * weight
-            q += moments[2, window + 3 * i] * weight
-            p += moments[3, window + 3 * i] * weight
-        product = wp.cw_mul(mx, my)
-        square = (wp.cw_mul(mx, mx) + wp.cw_mul(my, my)) * HALF
-        variance = q - square
-        for i in range(length):  # rounding can take a variance below zero; wp.max would hide NaN
-            variance[i] = wp.where(variance[i] < ZERO, ZERO, variance[i])
-        a = product + vec(HALF_C1)
-        b = p - product + vec(HALF_C2)
-        c = square + vec(HALF_C1)
-        d = variance + vec(HALF_C2)
-        ds_dp = wp.cw_div(a, wp.cw_mul(c, d))
-        s = wp.cw_mul(ds_dp, b)
-        losses[at] = (vec(ONE) - s) * scale
-        if derivatives:
-            s_d = wp.cw_div(s, d)
-            derivatives[0, at] = wp.cw_mul(wp.cw_div(b - a, wp.cw_mul(c, d)), my) + wp.cw_mul(s_d - wp.cw_div(s, c), mx)
-            derivatives[1, at] = -s_d
-            derivatives[2, at] = ds_dp
+        """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
+        thread = first + wp.tid()
+        at = place(thread, width)
+        lane = at[0]
+        column = at[1] - 3 * REACH + lane
+        mx = rows()
+        my = rows()
+        q = rows()
+        p = rows()
+        if column >= 0 and column < width:
+            for i in range(wp.static(ROWS + 2 * REACH)):
+                row = at[2] + i - REACH
+                x = float(0.0)
+                y = float(0.0)
+                if row >= 0 and row < height:
+                    x = image[row * width + column]
+                    y = target[row * width + column]
+                xy = x * y
+                square = 0.5 * (x * x + y * y)
+                for j in range(wp.static(ROWS)):
+                    if wp.static(tap(i - j) > 0.0):
+                        mx[j] += x * wp.static(wp.float32(tap(i - j)))
+                        my[j] += y * wp.static(wp.float32(tap(i - j)))
+                        q[j] += square * wp.static(wp.float32(tap(i - j)))
+                        p[j] += xy * wp.static(wp.float32(tap(i - j)))
+        put(0, lane, mx)
+        put(1, lane, my)
+        put(2, lane, q)
+        put(3, lane, p)
+        sync_block()
+        total = float(0.0)
+        ds_dmx = group()
+        ds_dq = group()
+        ds_dp = group()
+        if lane < COLUMNS:
+            gx = blur(0, lane)
+            gy = blur(1, lane)
+            gq = blur(2, lane)
+            gp = blur(3, lane)
+            row = at[2] + lane // wp.static(COLUMNS // GROUP)
+            for o in range(wp.static(GROUP)):
+                product = gx[o] * gy[o]
+                mean = 0.5 * (gx[o] * gx[o] + gy[o] * gy[o])
+                variance = gq[o] - mean
+                variance = wp.where(variance < 0.0, 0.0, variance)  # rounding; wp.max would hide NaN
+                a = product + HALF_C1
+                b = gp[o] - product + HALF_C2
+                c = mean + HALF_C1
+                d = variance + HALF_C2
+                inverse = 1.0 / (c * d)
+                s = a * b * inverse
+                ds_dmx[o] = (b - a) * inverse * gy[o] + (s / d - s / c) * gx[o]
+                ds_dq[o] = -s / d
+                ds_dp[o] = a * inverse
+                if row < height and at[1] + group_column(lane) + 3 * o < width:
+                    total += (1.0 - s) * scale
+        losses[thread] = total
+        if not derivatives:
+            return
+        sync_block()
+        if lane < COLUMNS:
+            put_group(0, lane, ds_dmx)
+            put_group(1, lane, ds_dq)
+            put_group(2, lane, ds_dp)
+        sync_block()
+        column = at[1] + lane
+        if lane < COLUMNS and column < width:
+            for j in range(wp.static(ROWS)):
+                row = at[2] + j
+                if row < height:
+                    for k in range(wp.static(3)):
+                        derivatives[k, row * width + column] = cell(False, (k * ROWS + j) * THREADS + lane, 0.0)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
     def gradient(
         first: wp.int32,
-        blurred: wp.array2d(dtype=vec),
-        image: wp.array(dtype=vec),
-        target: wp.array(dtype=vec),
+        derivatives: wp.array2d(dtype=wp.float32),
+        image: wp.array(dtype=wp.float32),
+        target: wp.array(dtype=wp.float32),
+        height: wp.int32,
         width: wp.int32,
-        scale: real,
-        grad_loss: wp.array(dtype=real),
+        scale: wp.float32,
+        grad_loss: wp.array(dtype=wp.float32),
         # outputs
-        grad_image: wp.array(dtype=vec),
+        grad_image: wp.array(dtype=wp.float32),
     ):
-        at, window = inner_block(first + wp.tid(), width)
-        dmx = vec()
-        dq = vec()
-        dp = vec()
-        for i in range(wp.static(WINDOW_SIZE)):
-            weight = wp.static(real(tap(i)))
-            dmx += blurred[0, window + 3 * i] * weight
-            dq += blurred[1, window + 3 * i] * weight
-            dp += blurred[2, window + 3 * i] * weight
-        change = dmx + wp.cw_mul(dq, image[at]) + wp.cw_mul(dp, target[at])
-        grad_image[at] = change * (-scale * grad_loss[0])
+        at = place(first + wp.tid(), width)
+        lane = at[0]
+        column = at[1] - 3 * REACH + lane
+        dmx = rows()
+        dq = rows()
+        dp = rows()
+        if column >= 0 and column < width:
+            for i in range(wp.static(ROWS + 2 * REACH)):
+                row = at[2] + i - REACH
+                x = float(0.0)
+                y = float(0.0)
+                z = float(0.0)
+                if row >= 0 and row < height:
+                    x = derivatives[0, row * width + column]
+                    y = derivatives[1, row * width + column]
+                    z = derivatives[2, row * width + column]
+                for j in range(wp.static(ROWS)):
+                    if wp.static(tap(i - j) > 0.0):
+                        dmx[j] += x * wp.static(wp.float32(tap(i - j)))
+                        dq[j] += y * wp.static(wp.float32(tap(i - j)))
+                        dp[j] += z * wp.static(wp.float32(tap(i - j)))
+        put(0, lane, dmx)
+        put(1, lane, dq)
+        put(2, lane, dp)
+        sync_block()
+        gmx = group()
+        gq = group()
+        gp = group()
+        if lane < COLUMNS:
+            gmx = blur(0, lane)
+            gq = blur(1, lane)
+            gp = blur(2, lane)
+        sync_block()
+        if lane < COLUMNS:
+            put_group(0, lane, gmx)
+            put_group(1, lane, gq)
+            put_group(2, lane, gp)
+        sync_block()
+        column = at[1] + lane
+        if lane < COLUMNS and column < width:
+            factor = -scale * grad_loss[0]
+            for j in range(wp.static(ROWS)):
+                row = at[2] + j
+                if row < height:
+                    k = row * width + column
+                    cells = j * THREADS + lane
+                    change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
+                    change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
+                    grad_image[k] = change * factor
 
-    return SimpleNamespace(moments=column_blur(4), score=score, blur=column_blur(3), gradient=gradient)
+    return SimpleNamespace(score=score, gradient=gradient)

@@ -17,7 +17,6 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.kernels.catalogue import fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
 from nexwarp.kernels.launch import get_num_threads
-from nexwarp.kernels.ssim import SIMD_WIDTH
 from nexwarp.kernels.walk import BLOCK_DIM
 from nexwarp.ops.fused_texture import supported, takes_shape
 from nexwarp.ops.startup import start_warp
@@ -58,7 +57,6 @@ def needed(config: Config, device: torch.device) -> list[Build]:
         features=(config.texture.features,) * textured,
         clamps=(False,) * textured,
         low_passes=(False,),
-        ssim_lengths=(SIMD_WIDTH,) * cpu,
         cpu=cpu,
         fixed_point=config.deterministic,
     )
