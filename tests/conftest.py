@@ -19,7 +19,6 @@ import nexwarp as nw
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
 from nexwarp.train import presets
-from nexwarp.train.finish import auto_exposure
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
 
@@ -77,15 +76,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def few_places() -> Iterator[None]:
-    """Places of predicted exposures are few: they take seconds, which few tests are about."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto_exposure, "PLACES", 12)
-        yield
-
-
-@pytest.fixture(scope="module")
-def small_preset(request: pytest.FixtureRequest, one_torch_thread: None, few_places: None) -> Iterator[None]:
+def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iterator[None]:
     """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.PRESETS, "default", request.module.SMALL)

@@ -32,7 +32,7 @@ BUFFERS = ("log_gains", "positions", "directions", "coefficients", "mean", "leng
 class Exposures(nn.Module):
     """Gaussian process with a Matern 3/2 kernel that predicts gains from camera poses, fitted to V photos.
 
-    The V photos may include virtual ones between the cameras, with gains from `nexwarp.train.finish.auto_exposure`.
+    The V photos of older models may include virtual ones between the cameras.
 
     Buffers:
         log_gains: (V, 3) logarithms of the photos' gains.

@@ -116,9 +116,8 @@ class Config:
     trained."""
     exposures: bool = True
     """Estimate each photo's exposure and white balance, as gains of red, green and blue, and the vignetting of the lens
-    before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos and,
-    where those of the photos follow the brightness of what they show, from brightness (auto exposure). Each is left out
-    where the photos do not show it."""
+    before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos.
+    Each is left out where the photos do not show it."""
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
     background."""

@@ -13,7 +13,7 @@ from tests.cli.support import FLAGS, SMALL
 
 
 @pytest.fixture(scope="module")
-def small_preset(one_torch_thread: None, few_places: None) -> Iterator[None]:
+def small_preset(one_torch_thread: None) -> Iterator[None]:
     """A small default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.PRESETS, "default", SMALL)

@@ -13,7 +13,7 @@ from nexwarp.train.initial import initial_surfels
 from tests.reference.collect import rotations
 from tests.trainer_support import rescaled, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
 @pytest.fixture(scope="module")
-def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory, few_places: None) -> Path:
+def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with a small model of the demo and its cameras."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
     config = nw.Config(

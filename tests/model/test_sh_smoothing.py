@@ -187,7 +187,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return nw.load_scene(write_demo(folder, width=48, height=36, views=12, points=200))
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_places")
+@pytest.mark.usefixtures("one_torch_thread")
 def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.device) -> None:
     """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
@@ -215,7 +215,7 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
         assert torch.equal(x, kept[name]), name
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_places")
+@pytest.mark.usefixtures("one_torch_thread")
 def test_presets_without_it_keep_what_was_learnt(scene: Scene) -> None:
     assert preset("paper").smooth_sh == 0.0 and preset("default").smooth_sh == 0.01
     trainer = Trainer(scene, Config(iterations=20, max_surfels=200, smooth_sh=0.0), "cpu")

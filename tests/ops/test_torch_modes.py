@@ -90,7 +90,7 @@ def test_inference_mode_leaves_nothing_to_a_later_training(device):
     assert_equal(gradients(fresh, camera), after)
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_places")
+@pytest.mark.usefixtures("one_torch_thread")
 def test_training_goes_on_after_a_rendering_in_inference_mode(tiny_scene, device):
     runs = [Trainer(tiny_scene, small(deterministic=True), device) for _ in range(2)]
     for _ in range(4):
@@ -166,7 +166,7 @@ def test_the_texture_alone_ignores_autocast(dtype, device):
         assert all(torch.equal(a, b) for a, b in zip(evaluate(), expected, strict=True))
 
 
-@pytest.mark.usefixtures("one_torch_thread", "few_places")
+@pytest.mark.usefixtures("one_torch_thread")
 def test_training_steps_inside_of_autocast_are_those_outside(tiny_scene, device):
     runs = [Trainer(tiny_scene, small(deterministic=True), device) for _ in range(2)]
     for i in range(4):

@@ -106,7 +106,6 @@ def test_gradients_that_lack_memory_can_be_repeated(device):
 # Memory, training
 
 
-@pytest.mark.usefixtures("few_places")
 def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scene, device):
     """It ends with our error or, where CUDA graphs can be given up, goes on; the end has the bits of no fault."""
     config = small(deterministic=True)
@@ -292,7 +291,6 @@ def poisoned(trainer: Trainer, iterations: range, monkeypatch: pytest.MonkeyPatc
     return found
 
 
-@pytest.mark.usefixtures("few_places")
 def test_a_nan_of_a_kernel_takes_training_back_once(tiny_scene, monkeypatch, device):
     trainer = Trainer(tiny_scene, small(cuda_graphs=False, iterations=60), device)
     found = poisoned(trainer, range(22, 23), monkeypatch, once=True)
@@ -304,7 +302,6 @@ def test_a_nan_of_a_kernel_takes_training_back_once(tiny_scene, monkeypatch, dev
     trainer.check()
 
 
-@pytest.mark.usefixtures("few_places")
 def test_a_kernel_that_keeps_giving_nan_ends_training_in_its_last_good_state(tiny_scene, monkeypatch, device):
     trainer = Trainer(tiny_scene, small(cuda_graphs=False, iterations=60), device)
     poisoned(trainer, range(22, 100), monkeypatch, once=False)

@@ -20,7 +20,6 @@ from nexwarp.train import presets
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.finish import auto_exposure
 from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
@@ -30,9 +29,8 @@ from tests.subprocesses import python_path
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--checkpoint-every", "1"]
 # Stages of the finishing, and numbers of views after which a kill comes; the last is that of all training views.
-STAGES = ("smoothing SH", "measuring detail limits", "predicting auto exposure")
+STAGES = ("smoothing SH", "measuring detail limits", "ordering surfels")
 VIEWS = (1, 4, 8)
-PLACES = 12  # of predicted exposures, so that the last stage takes no longer than the others
 KILL_AT = "NEXWARP_TEST_KILL_AT"  # of a subprocess: "views stage"
 
 SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
@@ -42,7 +40,6 @@ Moment = float | tuple[str, int]  # a share of the training's time, or a stage a
 
 def main() -> None:
     """The command line, whose default preset is a small one; it may kill itself in a stage of the finishing."""
-    auto_exposure.PLACES = PLACES
     presets.PRESETS["default"] = SMALL
     if KILL_AT in os.environ:
         count, stage = os.environ[KILL_AT].split(" ", 1)
@@ -62,7 +59,6 @@ def main() -> None:
 
 @pytest.fixture(autouse=True)
 def small_preset(monkeypatch):
-    monkeypatch.setattr(auto_exposure, "PLACES", PLACES)
     monkeypatch.setitem(presets.PRESETS, "default", SMALL)
 
 
@@ -84,7 +80,7 @@ def moments(count: int) -> list[Moment]:
 )
 def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, device: str, count: int) -> None:
     scene = write_demo(tmp_path / "scene", width=48, height=36, views=10, points=200)
-    expose_photos(scene)  # else nothing predicts an auto exposure
+    expose_photos(scene)
     flags = ["--device", device, *(["--deterministic"] if device == "cuda" else [])]
     arguments = ["train", str(scene), *FLAGS, *flags]
     command = [sys.executable, "-c", "from tests.robustness.test_kills import main; main()", *arguments]

@@ -22,7 +22,7 @@ from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 CONFIG = Config(
     iterations=12,

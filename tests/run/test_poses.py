@@ -29,7 +29,7 @@ from tests.cli.support import FLAGS, SMALL
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 # Surfels and texture stay as they are.
 STILL: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(LearningRates)}

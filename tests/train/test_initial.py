@@ -14,7 +14,7 @@ from nexwarp.train.presets import preset
 from tests.reference.collect import rotations
 from tests.trainer_support import TEXTURE, rescaled, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 @pytest.fixture(scope="session")

@@ -45,7 +45,7 @@ from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 # The command line has no flags for the texture's shape.
 SMALL = Config(

@@ -17,7 +17,7 @@ from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import mean_color
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 

@@ -20,7 +20,7 @@ from tests.exposed import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
 

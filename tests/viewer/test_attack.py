@@ -15,7 +15,7 @@ from tests.viewer.attack import attacked, resources
 from tests.viewer.support import Client, serving, wait_for
 from tests.viewer.test_training import trainer_of
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 FULL = {"iterations": 300, "pixels": pacing.MOST_PIXELS, "flood": connections.FLOOD_SECONDS}
 SMALL = {"iterations": 20, "pixels": 2**18, "flood": 1.0}

@@ -16,7 +16,7 @@ from nexwarp.viewer.session import Session
 from nexwarp.viewer.world import camera_to_world
 from tests.viewer.support import serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 PAGE = b"<!doctype html><title>scene</title>"

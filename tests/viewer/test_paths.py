@@ -14,7 +14,7 @@ from nexwarp.viewer.pacing import SMALLEST, Pace, Share
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, vertical_fov
 from tests.viewer.support import ring
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 # Pace

@@ -16,7 +16,7 @@ from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def drawn(model: nw.Model, bands: Sequence[nw.Camera], settings: Settings) -> Picture:

@@ -12,7 +12,7 @@ from nexwarp.run.folder import keep_camera_path
 from nexwarp.viewer.modes import draw
 from tests.viewer.support import Client, serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:

@@ -18,7 +18,7 @@ from nexwarp.viewer import Viewer
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS, Client, ring, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread", "few_places")
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def trainer_of(run: Path, **changes: Any) -> Trainer:

@@ -12,7 +12,6 @@ from nexwarp.machine import deterministic
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
-from nexwarp.train.finish.auto_exposure import with_auto_exposure
 from nexwarp.train.finish.detail_limits import measure_detail_limits
 from nexwarp.train.finish.order import ordered
 from nexwarp.train.finish.sh_smoothing import smooth_sh
@@ -59,7 +58,7 @@ def finish_model(
     raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
     finished = Model(Surfels(raw), model.texture, options=model.options)
     if settings.smooth_sh > 0:
-        # Detail limits and brightness are the same whatever the order of threads.
+        # Detail limits are the same whatever the order of threads.
         with deterministic(settings.deterministic and model.device.type == "cuda"):
             sh0, shN = smooth_sh(finished, views, settings.smooth_sh, partial(observe, "smoothing SH"))
         finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
@@ -67,9 +66,7 @@ def finish_model(
         seen = counted(cameras, "measuring detail limits", observe)
         finished.detail_limits = measure_detail_limits(finished, seen)
     if exposures is not None:
-        progress = partial(observe, "predicting auto exposure")
-        exposures = with_auto_exposure(copy.deepcopy(exposures), finished, cameras, progress=progress)
-        finished.exposures = exposures.to(model.device)
+        finished.exposures = copy.deepcopy(exposures).to(model.device)
     finished.meta = model.meta | {"smooth_sh": settings.smooth_sh}
     with deterministic(settings.deterministic and model.device.type == "cuda"):
         return ordered(finished, counted(cameras, "ordering surfels", observe))
