@@ -16,7 +16,7 @@ from nexwarp.run.contents import teacher_folder
 from nexwarp.run.folder import SceneSource, create_run, is_run, read_metrics, read_run, rewrite_config
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.config import Config
-from nexwarp.train.exposure_calibration import CalibrateOnce
+from nexwarp.train.exposure import CalibrateOnce
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.stages import OwnTeachers, divide, training_teacher

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 
 import torch
 
@@ -11,7 +10,7 @@ from nexwarp.model.model import Model
 from nexwarp.train.config import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
-from nexwarp.train.stages import counted_from, student_trainer
+from nexwarp.train.stages import InMemory, stage_runner
 from nexwarp.train.step_losses import OwnLoss
 
 Callback = Callable[[StepReport], object]
@@ -73,10 +72,10 @@ def train(
     def warn(message: str) -> None:
         warnings.warn(message, stacklevel=2)
 
-    make_student = partial(student_trainer, losses=losses, optimizer=optimizer, teachers=teachers)
-    trainer = make_student(scene, config, device, observe=observe, warn=warn)
-    trainer.run(counted_from(config.iterations - trainer.config.iterations, observe), warn)
-    return trainer.finish()
+    store = InMemory(observe, warn)
+    runner = stage_runner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers)
+    runner.train()
+    return runner.finish()
 
 
 def _observer(callbacks: Iterable[Callback]) -> Callable[[StepReport], None]:

@@ -22,7 +22,7 @@ from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.config import Config
-from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
+from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer

@@ -4,10 +4,11 @@ Not in the paper. What a student learns from teachers is in `nexwarp.train.teach
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from typing import Any, Protocol
 
 import torch
 
@@ -16,7 +17,9 @@ from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
-from nexwarp.train.exposure_calibration import CalibrateOnce
+from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
+from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.step_losses import OwnLoss
@@ -34,6 +37,8 @@ SHARE = 0.4  # of the iterations that the teachers have together
 TEACHER_SURFELS = 40_000
 TEACHER_TIMES = 4  # at most so many times the student's
 STREAM = 3  # series of seeds, as `derived_seed` counts them
+
+Observer = Callable[[StepReport], None]
 
 
 @dataclass(frozen=True)
@@ -55,16 +60,32 @@ NO_TEACHERS = OwnTeachers(0, 0)
 
 
 @dataclass(frozen=True)
-class Stages:
-    """Settings of the trainings of a run, in their order; none of them has teachers of its own.
+class Stage:
+    """One of the trainings of a run.
 
     Attributes:
-        teachers: settings of the teachers.
-        student: settings of the training whose model is the run's.
+        config: its settings; none of them asks for teachers.
+        teachers: how many teachers the run trains.
+        number: of the teacher, from 1; 0 for the student, whose model is the run's.
+        before: iterations that earlier stages have.
     """
 
-    teachers: tuple[Config, ...]
-    student: Config
+    config: Config
+    teachers: int = 0
+    number: int = 0
+    before: int = 0
+
+    @property
+    def teacher(self) -> bool:
+        """Whether it trains a teacher."""
+        return self.number > 0
+
+    @property
+    def name(self) -> str:
+        """Name for the progress display and messages."""
+        if self.teacher:
+            return f"teacher {self.number} of {self.teachers}"
+        return "student" if self.teachers else "training"
 
 
 def teacher_count(config: Config, photos: int) -> int:
@@ -92,18 +113,38 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
     return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels) if count else NO_TEACHERS
 
 
+@dataclass(frozen=True)
+class Stages:
+    """Settings of the trainings of a run, in their order; none of them has teachers of its own.
+
+    Attributes:
+        teachers: settings of the teachers.
+        student: settings of the training whose model is the run's.
+    """
+
+    teachers: tuple[Config, ...]
+    student: Config
+
+    def in_order(self) -> list[Stage]:
+        """Return the stages, the student last."""
+        stages, before = [], 0
+        for number, config in enumerate(self.teachers, 1):
+            stages.append(Stage(config, len(self.teachers), number, before))
+            before += config.iterations
+        return [*stages, Stage(self.student, len(self.teachers), before=before)]
+
+
 def divide(config: Config, own: OwnTeachers) -> Stages:
     """Return the stages of a run: teachers, and the student, which has the rest of the iterations.
 
     Raises:
         SettingError: nothing is left for the student.
     """
-    taken = own.count * own.iterations
+    taken, surfels = own.count * own.iterations, own.max_surfels or config.max_surfels
     if config.iterations <= taken:
         raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
     # Seeds of settings have 32 bits.
     seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
-    surfels = own.max_surfels or config.max_surfels
     teachers = (
         dataclasses.replace(config, seed=seed, iterations=own.iterations, max_surfels=surfels, teachers=0)
         for seed in seeds
@@ -111,74 +152,161 @@ def divide(config: Config, own: OwnTeachers) -> Stages:
     return Stages(tuple(teachers), dataclasses.replace(config, iterations=config.iterations - taken, teachers=0))
 
 
+class StageStore(Protocol):
+    """How the stages of a run are trained, and what is kept of them."""
+
+    def complete(self, stage: Stage) -> Model | None:
+        """Return the model of a teacher that an earlier session has finished; None where none has."""
+
+    def begin(self, stage: Stage, trainer: Trainer) -> None:
+        """Prepare a stage, before the first step of its trainer: restore what an earlier session has kept of it."""
+
+    def train(self, stage: Stage, trainer: Trainer) -> None:
+        """Do all steps of a stage."""
+
+    def finish(self, stage: Stage, trainer: Trainer) -> Model:
+        """Return the finished model of a trained stage."""
+
+
+class StageRunner:
+    """Runs the trainings of a run in their order.
+
+    Attributes:
+        stages: all of them.
+        stage: the one that runs, or comes next.
+        trainer: of this stage.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[Stage],
+        make: Callable[[Config, Sequence[Model]], Trainer],
+        store: StageStore,
+        teachers: Sequence[Model] = (),
+    ) -> None:
+        """Make the trainer of the first stage that is not complete; no step is done yet.
+
+        Args:
+            stages: see `divide`.
+            make: makes a trainer of settings and of models to learn from.
+            store: what is kept.
+            teachers: models that the student learns from where the run trains none of its own.
+        """
+        self.stages, self.make, self.store, self.given = stages, make, store, teachers
+        self.models: list[Model] = []
+        for stage in stages[:-1]:
+            model = store.complete(stage)
+            if model is None:
+                break
+            self.models.append(model)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.stage = self.stages[len(self.models)]
+        self.trainer = self.make(self.stage.config, () if self.stage.teacher else self.models or self.given)
+        self.store.begin(self.stage, self.trainer)
+
+    def train_teachers(self) -> None:
+        """Train and finish the teachers; the student's trainer is then before its first step.
+
+        Raises:
+            OutOfMemoryError: it names the teacher, and says how to train without.
+        """
+        while self.stage.teacher:
+            with training_teacher(self.stage.number, self.stage.teachers):
+                self.store.train(self.stage, self.trainer)
+            self.models.append(self.store.finish(self.stage, self.trainer))
+            del self.trainer  # before the next one takes memory
+            self._begin()
+
+    def train(self) -> None:
+        """Do all steps that are left of the run, those of teachers first."""
+        self.train_teachers()
+        self.store.train(self.stage, self.trainer)
+
+    def finish(self) -> Model:
+        """Return the finished model of the student."""
+        return self.store.finish(self.stage, self.trainer)
+
+
 @contextmanager
 def training_teacher(number: int, count: int) -> Iterator[None]:
-    """Name the teacher in an OutOfMemoryError of its training, and say how to train without teachers.
-
-    Args:
-        number: of the teacher, counted from 1.
-        count: of teachers.
-    """
+    """Name a teacher, counted from 1, in an OutOfMemoryError of its training, and say how to do without."""
     try:
         yield
     except OutOfMemoryError as error:
-        told = f"teacher {number} of {count}: {error}, or do without teachers (--set teachers=0)"
-        raise OutOfMemoryError(told, error.needed) from error
+        message = f"teacher {number} of {count}: {error}, or do without teachers (--set teachers=0)"
+        raise OutOfMemoryError(message, error.needed) from error
 
 
-def student_trainer(
+class InMemory:
+    """Trains stages in one go and keeps nothing on the disk; iterations are reported counted over all stages."""
+
+    def __init__(self, observe: Observer | None = None, warn: Callable[[str], None] = lambda _: None) -> None:
+        self.observe, self.warn = observe, warn
+
+    def complete(self, _: Stage) -> Model | None:
+        """Return None: nothing was trained before."""
+        return None
+
+    def begin(self, stage: Stage, trainer: Trainer) -> None:
+        """Do nothing."""
+
+    def train(self, stage: Stage, trainer: Trainer) -> None:
+        """Do all steps of a stage."""
+        trainer.run(self.observe and partial(self._report, stage.before), self.warn)
+
+    def _report(self, before: int, report: StepReport) -> None:
+        assert self.observe is not None
+        self.observe(dataclasses.replace(report, iteration=report.iteration + before) if before else report)
+
+    def finish(self, stage: Stage, trainer: Trainer) -> Model:
+        """Return the finished model; a teacher's is rounded as files are: `nexwarp train` reads it from one."""
+        model = trainer.finish()
+        if stage.teacher and model.texture is not None:
+            with torch.no_grad():
+                for parameter in model.texture.parameters():
+                    parameter.copy_(parameter.half())
+        return model
+
+
+def stage_runner(
     scene: Scene,
     config: Config,
     device: torch.device | str,
+    store: StageStore,
     *,
+    own: OwnTeachers | None = None,
+    ranks: Ranks | None = None,
     losses: Mapping[str, OwnLoss] | None = None,
     optimizer: OptimizerMaker | None = None,
     teachers: Iterable[Model] = (),
-    observe: Callable[[StepReport], None] | None = None,
-    warn: Callable[[str], None] = lambda _: None,
-) -> Trainer:
-    """Train the teachers of a run, and return the trainer of its student, before its first step.
+) -> StageRunner:
+    """Return the runner of a training; what is not said here is as of `nexwarp.train`.
 
-    Args:
-        scene: what to learn from.
-        config: of the run.
-        device: where to train.
-        losses: see `nexwarp.train`.
-        optimizer: see `nexwarp.train`.
-        teachers: models that take the place of teachers of its own.
-        observe: called after each step of a teacher; iterations are counted over all of them.
-        warn: see `Trainer.run`.
-
-    Raises:
-        SceneError, TypeError, ValueError, DivergedError, OutOfMemoryError: as of `nexwarp.train`.
+    `store` decides what is kept. `own` are the teachers that the run trains; None plans them, or none where `teachers`
+    are given. `ranks` are the processes that train together; None is this one alone.
     """
-    found = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` tells what is wrong with a model
-    stages = divide(config, NO_TEACHERS if found else plan_teachers(config, len(scene.train)))
-    make = partial(Trainer, scene, device=device, losses=losses, optimizer=optimizer, calibrate=CalibrateOnce())
-    own: list[Model] = []
-    for number, settings in enumerate(stages.teachers):
-        trainer = make(config=settings)
-        with training_teacher(number + 1, len(stages.teachers)):
-            trainer.run(counted_from(number * settings.iterations, observe), warn)
-        own.append(_as_saved(trainer.finish()))
-        del trainer  # before the next one takes memory
-    return make(config=stages.student, teachers=own or found)
+    models = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with a model
+    if own is None:
+        own = NO_TEACHERS if models else plan_teachers(config, len(scene.train))
+
+    @cache
+    def calibration() -> ExposureCalibration | None:
+        return calibrate_exposures(scene, config)
+
+    options = {"losses": losses, "optimizer": optimizer, "calibrate": lambda *_: calibration()}
+
+    def make(settings: Config, learned_from: Sequence[Model]) -> Trainer:
+        if ranks is None or ranks.size == 1:
+            return Trainer(scene, settings, device, teachers=learned_from, **options)
+        return ParallelTrainer(scene, settings, device, ranks, teachers=learned_from, **options)
+
+    return StageRunner(divide(config, own).in_order(), make, store, models)  # type: ignore[arg-type]
 
 
-@torch.no_grad()
-def _as_saved(model: Model) -> Model:
-    """Round what a file keeps in half precision: `nexwarp train` reads a resumed run's teachers from files."""
-    for parameter in () if model.texture is None else model.texture.parameters():
-        parameter.copy_(parameter.half())
-    return model
-
-
-def counted_from(done: int, observe: Callable[[StepReport], None] | None) -> Callable[[StepReport], None] | None:
-    """Return an observer that adds the iterations of earlier stages to those of each step."""
-    if observe is None or done == 0:
-        return observe
-
-    def observe_later(report: StepReport) -> None:
-        observe(dataclasses.replace(report, iteration=report.iteration + done))
-
-    return observe_later
+def student_trainer(scene: Scene, config: Config, device: torch.device | str, **options: Any) -> Trainer:
+    """Train the teachers of a run, and return the trainer of its student, before its first step."""
+    runner = stage_runner(scene, config, device, InMemory(), **options)
+    runner.train_teachers()
+    return runner.trainer

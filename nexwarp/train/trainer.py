@@ -24,7 +24,7 @@ from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
-from nexwarp.train.exposure_calibration import Calibrate, calibrate_exposures
+from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, FinishSettings, finish_model
 from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors

@@ -12,7 +12,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
 from nexwarp.model.exposures import DECIMALS, Exposures
 from nexwarp.model.poses import PoseCorrections
-from nexwarp.train.exposure_calibration import ExposureCalibration
+from nexwarp.train.exposure import ExposureCalibration
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25

@@ -15,21 +15,21 @@ from nexwarp.data import Scene, View, write_demo
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import exposures
 from nexwarp.model.buffers import load_buffers, render_buffers, save_buffers
-from nexwarp.model.exposures import EVEN, Exposures
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train import exposure_calibration
+from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.exposure_calibration import (
+from nexwarp.train.exposure import (
     PRIOR,
     CalibrateOnce,
     ExposureCalibration,
-    SharedPoints,
+    Observations,
     calibrate_exposures,
     choose_fit,
     fit_exposures,
     observations,
-    photo_gains,
+    solve_gains,
 )
 from nexwarp.train.losses import LossWeights
 from nexwarp.train.step_losses import as_taken, step_losses
@@ -87,6 +87,25 @@ def photographs(
         photos.append(photo)
         seen.append(points[kept])
     return cameras, photos, seen
+
+
+def views(
+    cameras: list[Camera],
+    photos: list[torch.Tensor],
+    points: list[torch.Tensor],
+    masks: list[torch.Tensor | None] | None = None,
+) -> list[View]:
+    masks = masks or [None] * len(cameras)
+    parts = zip(cameras, photos, masks, points, strict=True)
+    return [View(camera, photo, mask, f"{i}", None, seen) for i, (camera, photo, mask, seen) in enumerate(parts)]
+
+
+def photo_gains(*photographs: Any) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Log gains (V, 3) and falloff that are fitted to photographs."""
+    shown = views(*photographs)
+    fit = fit_exposures(observations(shown), [view.camera for view in shown])
+    a, b = fit.lens.tolist()
+    return fit.gains, (a, b, fit.largest)
 
 
 def test_gains_are_found_up_to_their_mean():
@@ -161,7 +180,7 @@ def test_known_gains_are_found_beside_saturated_skies():
     gains = torch.linspace(-0.5, 0.5, 11)[:, None].expand(11, 3).double()
     cameras, photos, points = photographs(gains)
     sky = [torch.where((p > 0) & (torch.arange(48)[:, None, None] < 16), (p * 2.0).clamp(max=255), p) for p in photos]
-    seen = observations(cameras, [p.to(torch.uint8) for p in sky], points, None)
+    seen = observations(views(cameras, [p.to(torch.uint8) for p in sky], points))
     fit = present(choose_fit(seen, cameras))
     assert np.abs(np.exp(fit.gains - gains.numpy()) - 1).max() < 0.02 and (fit.lens == 0).all()
 
@@ -171,7 +190,7 @@ def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=160, height=120, views=20, points=1500))
     assert calibrate_exposures(scene, Config()) is None
     cameras, photos, points = photographs(torch.zeros(8, 3))
-    even = observations(cameras, photos, points, None)
+    even = observations(views(cameras, photos, points))
     assert choose_fit(even, cameras) is None
     side = np.where(even.places[even.point, 1] < 0.1, 1.0, -1.0)
     shaded = even._replace(color=even.color + 0.1 * (side * np.linspace(-1, 1, 8)[even.view])[:, None])
@@ -184,7 +203,7 @@ def test_a_single_point_tells_no_exposures():
     cameras, photos, points = photographs(torch.linspace(-0.3, 0.3, 5)[:, None].expand(5, 3).double())
     shared = set.intersection(*({tuple(place) for place in seen.tolist()} for seen in points))
     chosen = torch.tensor(sorted(shared)[:1])
-    seen = observations(cameras, photos, [chosen] * 5, None)
+    seen = observations(views(cameras, photos, [chosen] * 5))
     assert len(seen.view) == 5 and choose_fit(seen, cameras) is None
 
 
@@ -192,7 +211,7 @@ def test_the_falloff_has_a_gate_of_its_own():
     gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
     for lens, expected in (((0.0, 0.0), False), ((-0.5, 0.0), True)):
         cameras, photos, points = photographs(gains, 0.1, lens)
-        seen = observations(cameras, photos, points, None)
+        seen = observations(views(cameras, photos, points))
         assert (present(choose_fit(seen, cameras)).lens != 0).any() == expected
 
 
@@ -229,10 +248,9 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     prior = np.sqrt(PRIOR) * np.eye(photos, photos + points)
     together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
     expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
-    shared = SharedPoints(view, point, photos)
-    for scale in (1.0, 3.0):  # the second problem of the same points leaves nothing of the first
-        found = shared.solve_gains(scale * observed, weights)
-        np.testing.assert_allclose(found, scale * (expected - expected.mean()), rtol=0, atol=1e-10)
+    seen = Observations(view, point, observed[:, None], np.zeros(count), np.zeros((points, 3)))
+    gains = solve_gains(seen, observed, weights, photos)
+    np.testing.assert_allclose(gains, expected - expected.mean(), rtol=0, atol=1e-10)
 
 
 def test_trainings_of_a_run_share_one_calibration(tmp_path, monkeypatch):
@@ -261,12 +279,11 @@ def test_that_photos_have_one_exposure_is_kept_too(tiny_scene, monkeypatch):
 def test_photos_that_share_nothing_keep_their_colours():
     cameras, photos, points = photographs(torch.tensor([[0.2] * 3, [-0.2] * 3]))
     nothing = [points[0][:0]] * 2
-    found, falloff = photo_gains(cameras, photos, nothing)
-    assert (found == 0).all() and falloff == EVEN
+    assert choose_fit(observations(views(cameras, photos, nothing)), cameras) is None
     apart = [points[0][:100], points[1] + 1e-3]  # no point twice
     assert abs(photo_gains(cameras, photos, apart)[0]).max() < 1e-6
     white = [torch.full_like(photo, 255) for photo in photos]
-    assert (photo_gains(cameras, white, points)[0] == 0).all()
+    assert choose_fit(observations(views(cameras, white, points)), cameras) is None
 
 
 def test_what_masks_leave_out_tells_nothing():

@@ -19,10 +19,11 @@ from nexwarp.data import write_demo
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
 from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
-from nexwarp.train import exposure_calibration
+from nexwarp.train import exposure
+from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.config import TextureConfig
-from nexwarp.train.exposure_calibration import ExposureCalibration, calibrate_exposures
+from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
@@ -163,7 +164,8 @@ def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
         seen.append(config)
         return calibrate_exposures(scene, config)
 
-    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", calibrate)
+    monkeypatch.setattr(exposure, "calibrate_exposures", calibrate)
+    monkeypatch.setattr(train_stages, "calibrate_exposures", calibrate)
     return seen
 
 
