@@ -3,43 +3,68 @@
 python -m tests.compile_cuda 90 usual FOLDER      # prints the size of the machine code by module, as JSON
 """
 
+import importlib
+import inspect
+import itertools
 import json
+import pkgutil
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.catalogue import all_kernels, walk_kernels
-from nexwarp.kernels.fused_scatter import fused_scatter_kernel
-from nexwarp.kernels.hashgrid import hashgrid_kernels
-from nexwarp.kernels.types import MAX_HITS
-from nexwarp.ops.tiles import TILE_SIZE
+import nexwarp.kernels
+from nexwarp.kernels.types import MAX_HITS, types
+
+# What the factories in nexwarp.kernels are called with, by the name of their parameters.
+VALUES: dict[str, tuple[Any, ...]] = {
+    "real": (wp.float32,),
+    "storage": (wp.float16,),
+    "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
+    "tile_size": (16,),
+    "max_hits": (0, 1, 2, MAX_HITS),
+    "degree": range(4),
+    "features": (1, 2, 4, 8),
+    "clamp": (False, True),
+    "with_errors": (False, True),
+    "fixed_point": (False, True),
+    "low_pass": (False,),
+    "by_place": (False,),  # True is for CPUs
+}
+ALL = VALUES | {"max_hits": range(MAX_HITS + 1)}
+FUSED = VALUES | {"features": (2, 4)}
+# Their atomics depend on the architecture.
+ATOMIC = ("hashgrid", "fused_scatter")
 
 
-def usual() -> Iterator[wp.Kernel]:
-    """Yield all kernels for K = 2, and for other K those that depend on it, in the form of a default run.
-
-    K and the other constants of a kernel do not depend on each other.
-    """
-    found = [*all_kernels(max_hits=(2,))]
-    found += walk_kernels(wp.float32, TILE_SIZE, (0, 1, 3, 4, MAX_HITS), low_passes=(False,), fixed_point=False)
-    yield from {kernel.module.name: kernel for kernel in found}.values()
+def made_by(factory: Any, values: dict[str, tuple[Any, ...]]) -> Iterator[wp.Kernel]:
+    """Yield the kernels that a factory makes of all combinations of values."""
+    names = inspect.signature(factory).parameters
+    for chosen in itertools.product(*(values[name] for name in names)):
+        made = factory(*chosen)
+        yield from [made] if isinstance(made, wp.Kernel) else vars(made).values()
 
 
-def atomic() -> Iterator[wp.Kernel]:
-    """Yield the kernels whose atomics depend on the architecture."""
-    for count in (2, 4):
-        for storage in (wp.float16, wp.float32):
-            yield hashgrid_kernels(wp.float32, storage, count).backward
-        yield fused_scatter_kernel(count)
+def kernels(choice: str) -> Iterator[wp.Kernel]:
+    """Yield the kernels of the modules of nexwarp.kernels: "all", "usual" (some K), "atomic"."""
+    for info in pkgutil.iter_modules(nexwarp.kernels.__path__):
+        if choice == "atomic" and info.name not in ATOMIC:
+            continue
+        module = importlib.import_module(f"nexwarp.kernels.{info.name}")
+        values = FUSED if info.name.startswith("fused") else ALL if choice == "all" else VALUES
+        for name, member in vars(module).items():
+            if getattr(member, "__module__", None) != module.__name__:
+                continue
+            if isinstance(member, wp.Kernel):
+                yield member
+            elif name.endswith(("_kernel", "_kernels")):
+                yield from made_by(member, values)
 
 
-CHOICES = {"all": all_kernels, "usual": usual, "atomic": atomic}
-
-
-def compile_for(arch: int, kernels: list[wp.Kernel], folder: Path) -> dict[str, int]:
+def compile_for(arch: int, chosen: list[wp.Kernel], folder: Path) -> dict[str, int]:
     """Return bytes of machine code by module."""
 
     def compile_one(kernel: wp.Kernel) -> int:
@@ -48,13 +73,11 @@ def compile_for(arch: int, kernels: list[wp.Kernel], folder: Path) -> dict[str, 
         return sum(path.stat().st_size for path in where.glob("*.cubin"))
 
     with ThreadPoolExecutor(2) as pool:
-        return dict(zip((kernel.module.name for kernel in kernels), pool.map(compile_one, kernels), strict=True))
+        return dict(zip((kernel.module.name for kernel in chosen), pool.map(compile_one, chosen), strict=True))
 
 
 if __name__ == "__main__":
     arch, choice, folder = sys.argv[1:]
     wp.config.log_level = wp.LOG_ERROR
-    chosen = list(CHOICES[choice]())
-    if len({kernel.module.name for kernel in chosen}) != len(chosen):
-        sys.exit("kernels share a module")
+    chosen = list({kernel.module.name: kernel for kernel in kernels(choice)}.values())
     print(json.dumps(compile_for(int(arch), chosen, Path(folder))))

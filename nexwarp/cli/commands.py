@@ -226,18 +226,12 @@ class Warmup:
         if self.max_hits is not None:
             config = dataclasses.replace(config, max_hits=self.max_hits)
         before = warmup.cached_binaries()
-        builds = warmup.needed(config, device)
-        with display.counting(console, "compiling", len(builds) + 1) as done:
-            warmup.compile_all(builds, device, done)
-            listed = warmup.cached_binaries()
-            warmup.rehearse(config, device)
-            done()
-        cached = warmup.cached_binaries()
-        total = len(builds) + len(cached - listed)
-        new = min(len(cached - before), total)  # another process may be compiling too
+        with display.counting(console, "compiling", warmup.ITERATIONS) as done:
+            warmup.rehearse(config, device, done)
+        compiled = len(warmup.cached_binaries() - before)
         console.print(
-            f"{total} kernels ready on {device_name(device)}, preset {config.preset}: {new} compiled, "
-            f"{total - new} found in the cache, {time.perf_counter() - start:.1f} s",
+            f"kernels ready on {device_name(device)}, preset {config.preset}: {compiled} compiled, "
+            f"{time.perf_counter() - start:.1f} s",
             soft_wrap=True,
         )
 

@@ -7,10 +7,9 @@ import ctypes
 import functools
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any
 
 import warp as wp
 
@@ -23,10 +22,6 @@ EVEN_CHUNKS_A_THREAD = 2
 SMALLEST_CHUNK = 256
 # Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
 LIGHT_CHUNK = 4096
-
-CpuForm = Literal["simd", "scalar"]
-
-_cpu_form: CpuForm = "simd"
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -42,29 +37,6 @@ def set_num_threads(count: int) -> None:
 def get_num_threads() -> int:
     """Return how many CPU threads kernels use."""
     return _threads
-
-
-@contextmanager
-def cpu_form(form: CpuForm) -> Iterator[None]:
-    """Choose, inside the context and for all threads, which form of a stage a CPU runs.
-
-    Args:
-        form: "simd" is the form written for CPUs, where a stage has one, and what is used outside of any such context.
-            "scalar" is the body that runs on CUDA, compiled for the CPU. The forms agree to rounding.
-    """
-    global _cpu_form
-    if form not in ("simd", "scalar"):
-        raise ValueError(f"form: expected 'simd' or 'scalar', got {form!r}")
-    before, _cpu_form = _cpu_form, form
-    try:
-        yield
-    finally:
-        _cpu_form = before
-
-
-def uses_simd(device: wp.Device) -> bool:
-    """Whether stages run on a device in the form written for CPUs."""
-    return device.is_cpu and _cpu_form == "simd"
 
 
 @functools.lru_cache(maxsize=1)

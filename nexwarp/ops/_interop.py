@@ -152,11 +152,6 @@ def launch(
     )
 
 
-def uses_simd(like: torch.Tensor) -> bool:
-    """Whether stages run on a tensor's device in the form written for CPUs; see `nexwarp.kernels.launch.cpu_form`."""
-    return launching.uses_simd(device_of(like))
-
-
 def sums_in_fixed_point(like: torch.Tensor) -> bool:
     """Whether sums by atomics must not depend on their order: on CUDA, under torch's deterministic algorithms."""
     return like.is_cuda and torch.are_deterministic_algorithms_enabled()

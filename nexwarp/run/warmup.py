@@ -1,109 +1,33 @@
-"""Ahead-of-time compilation: fill Warp's kernel cache with the kernels that training and rendering need.
-
-First the kernels of the catalogue are compiled, several at a time. Then a short training, an evaluation and a rendering
-run on a tiny scene and compile any kernel that the catalogue lacks. A gap in the catalogue thus costs time only.
-"""
+"""Compilation ahead of time: training, evaluating and rendering a tiny scene fills Warp's kernel cache."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
-from nexwarp.kernels.catalogue import fused_kernel_builds, ssim_tile_builds, thread_kernels, walk_kernels
-from nexwarp.kernels.launch import get_num_threads
-from nexwarp.kernels.walk import BLOCK_DIM
-from nexwarp.ops.fused_texture import supported, takes_shape
 from nexwarp.ops.startup import start_warp
-from nexwarp.ops.tiles import TILE_SIZE
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 
-BINARIES = (".o", ".cubin", ".ptx")
-
 WIDTH, HEIGHT, POINTS = 64, 48, 100
-
 ITERATIONS = 8
 
 
-class Build(NamedTuple):
-    """A kernel to compile.
-
-    Attributes:
-        kernel: the kernel.
-        block_dim: threads per block of its launches; CUDA binaries depend on it.
-    """
-
-    kernel: wp.Kernel
-    block_dim: int
-
-
-def needed(config: Config, device: torch.device) -> list[Build]:
-    """Return the catalogue's kernels that training and rendering with these settings need on a device."""
-    textured, cpu = config.max_hits > 0, device.type == "cpu"
-    shape = config.texture
-    threads = thread_kernels(
-        wp.float32,
-        wp.float32 if cpu else wp.float16,
-        TILE_SIZE,
-        degrees=range(config.sh_degree + 1),
-        features=(config.texture.features,) * textured,
-        clamps=(False,) * textured,
-        low_passes=(False,),
-        cpu=cpu,
-        fixed_point=config.deterministic,
-    )
-    hits, fixed = {config.hits_at(0), config.max_hits}, config.deterministic
-    if config.footprints:
-        hits.add(max(config.max_hits, 1))  # detail limits render with K >= 1
-    walks = walk_kernels(wp.float32, TILE_SIZE, sorted(hits), low_passes=(False,), cpu=cpu, fixed_point=fixed)
-    builds = [*(Build(kernel, 256) for kernel in threads), *(Build(kernel, BLOCK_DIM) for kernel in walks)]
-    if not cpu:
-        builds += (Build(*build) for build in ssim_tile_builds())
-    if textured and supported(device) and takes_shape(shape.levels, shape.features, shape.width, shape.hidden_layers):
-        builds += (Build(*build) for build in fused_kernel_builds((shape.features,)))
-    return builds
-
-
-def compile_all(builds: Iterable[Build], device: torch.device, done: Callable[[], None] | None = None) -> None:
-    """Compile kernels, or load them from the cache, in as many threads as kernels may use.
-
-    Unlike `wp.force_load`, it reports its progress. The compilers release the GIL, but NVRTC parses one program at a
-    time: two threads save a third of the time on a CPU, and a tenth on CUDA.
-
-    Args:
-        builds: the kernels to compile.
-        device: the device to compile for.
-        done: called in this thread after each kernel.
-    """
-    name = "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
-    wp.synchronize_device(name)  # creates the device's context, which the threads must not create concurrently
-
-    def load(build: Build) -> None:
-        wp.load_module(build.kernel.module, device=name, block_dim=build.block_dim)
-
-    with ThreadPoolExecutor(get_num_threads()) as pool:
-        for _ in pool.map(load, builds):
-            if done is not None:
-                done()
-
-
-def rehearse(config: Config, device: torch.device) -> None:
+def rehearse(config: Config, device: torch.device, done: Callable[[], None] = lambda: None) -> None:
     """Train for a few steps, evaluate and render on a tiny scene with these settings; seed the generators like a run.
 
-    The steps cover every SH degree, both photo sizes, rounds of density control and steps after the last round, in the
-    order of a full run. The choice of surfels to relocate runs too.
+    The steps cover every SH degree, rounds of density control and steps after the last round, in the order of a full
+    run. The choice of surfels to relocate runs too. `done` is called after each of the `ITERATIONS` steps.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
-    trainer.run()
+    trainer.run(lambda _: done())
     if config.densify.relocate:
         least_contributing(trainer.model(), trainer.views.cameras, config.densify.relocate)
     model = trainer.finish()
@@ -150,4 +74,6 @@ def tiny_scene() -> Scene:
 def cached_binaries() -> set[Path]:
     """Return the compiled kernels in Warp's cache."""
     start_warp()  # sets the folder of the cache
-    return {path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in BINARIES}
+    return {
+        path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in (".o", ".cubin", ".ptx")
+    }

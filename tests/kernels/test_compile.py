@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[2]
     ("arch", "choice", "least"),
     [
         (80, "atomic", 6),
-        (90, "usual", 100),
-        *(pytest.param(arch, "all", 150, marks=pytest.mark.slow) for arch in (80, 90)),
+        (90, "usual", 80),
+        *(pytest.param(arch, "all", 120, marks=pytest.mark.slow) for arch in (80, 90)),
     ],
 )
 def test_kernels_compile_for_cuda(arch: int, choice: str, least: int, tmp_path: Path) -> None:
