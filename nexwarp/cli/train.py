@@ -270,18 +270,14 @@ class Train:
         scene = session.trainer.scene
         if not self.view or not session.ranks.first:
             return nullcontext()
-        from nexwarp.viewer import Viewer
+        from nexwarp.viewer import Viewer, ViewerOptions
 
         sets = {"train": scene.train, "test": scene.test}
         viewer = Viewer(
             lambda: session.trainer.model(),
             {group: {view.name: view.camera for view in views} for group, views in sets.items()},
-            near=scene.train[0].camera.near,
-            title=title,
-            host=self.host,
-            port=self.port,
+            ViewerOptions(scene.train[0].camera.near, title, self.host, self.port, config.iterations),
             photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
-            total=config.iterations,
             save_path=partial(keep_camera_path, run),
         )
         print_url(viewer, console)

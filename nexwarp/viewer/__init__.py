@@ -1,7 +1,6 @@
 """The viewer: shows a model in the browser, during or after training (extra `viewer`)."""
 
-from nexwarp.viewer.gradual import GradualModel
 from nexwarp.viewer.server import check_server
-from nexwarp.viewer.viewer import Viewer
+from nexwarp.viewer.viewer import Viewer, ViewerOptions
 
-__all__ = ["GradualModel", "Viewer", "check_server"]
+__all__ = ["Viewer", "ViewerOptions", "check_server"]

@@ -65,12 +65,7 @@ class Access:
         return Access(local, "" if local else secrets.token_urlsafe(TOKEN_BYTES))
 
     def refusal(self, target: str, headers: Headers) -> str | None:
-        """Return why a request is refused, for whom has sent it; None if it may pass.
-
-        Args:
-            target: path and query of the request, such as "/?token=...".
-            headers: of the request.
-        """
+        """Return why a request for `target`, such as "/?token=...", is refused, for its sender; None if it may pass."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         host = authority(hosts[0]) if len(hosts) == 1 else None
         if host is None:
@@ -81,7 +76,9 @@ class Access:
             scheme, _, own = origin.partition("://")
             if len(origins) > 1 or scheme != "http" or authority(own) != host:
                 return "the request comes from a page of another server: expected the viewer's own page"
-        if self.token and not self._has_token(target, headers, host[1]):
+        cookies = (pair.strip().partition("=") for line in headers.get_all("Cookie") for pair in line.split(";"))
+        tokens = [_query_token(target), *(value for name, _, value in cookies if name == _cookie_name(host[1]))]
+        if self.token and not any(self._is_token(token) for token in tokens):
             return "the viewer needs its token: open the address with ?token=, as nexwarp has printed it"
         return None
 
@@ -91,12 +88,6 @@ class Access:
         if not self.token or host is None or not self._is_token(_query_token(target)):
             return None
         return f"{_cookie_name(host[1])}={self.token}; Path=/; HttpOnly; SameSite=Strict"
-
-    def _has_token(self, target: str, headers: Headers, port: int) -> bool:
-        """Whether the URL or a cookie of the request holds the token."""
-        pairs = (pair.strip().partition("=") for line in headers.get_all("Cookie") for pair in line.split(";"))
-        kept = [value for name, _, value in pairs if name == _cookie_name(port)]
-        return any(self._is_token(token) for token in [_query_token(target), *kept])
 
     def _is_token(self, text: str) -> bool:
         """Compare in constant time."""
@@ -109,5 +100,4 @@ def _cookie_name(port: int) -> str:
 
 
 def _query_token(target: str) -> str:
-    """The token in a URL's query; "" without one."""
     return parse_qs(target.partition("?")[2]).get("token", [""])[0]

@@ -32,21 +32,14 @@ Handler: TypeAlias = Callable[[ServerConnection], Awaitable[None]]
 
 
 class Gate:
-    """Admits requests by the rules of access and up to the largest numbers of connections and clients.
-
-    Attributes:
-        access: the rules.
-        connections: open TCP connections.
-        clients: those of them that are WebSockets.
-        attached: viser's server runs behind this gate.
-        is_open: requests are answered; False at first.
-    """
+    """Admits requests by the rules of access and up to the largest numbers of connections and clients."""
 
     def __init__(self, access: Access) -> None:
         self.access = access
-        self.connections: set[Connection] = set()
-        self.clients: set[Connection] = set()
-        self.attached = self.is_open = False
+        self.connections: set[Connection] = set()  # TCP
+        self.clients: set[Connection] = set()  # those of them that are WebSockets
+        self.attached = False  # viser's server runs behind this gate
+        self.is_open = False  # requests are answered
 
     @contextlib.contextmanager
     def before_viser(self) -> Iterator[None]:
@@ -102,16 +95,12 @@ async def _handle(handler: Handler, connection: ServerConnection) -> None:
 
 
 class Connection(ServerConnection):
-    """A connection that is read slowly if it sends fast, and closed if it goes on to, or does not read.
-
-    Attributes:
-        sending: number of messages that the client has not taken yet.
-    """
+    """A connection that is read slowly if it sends fast, and closed if it goes on to, or does not read."""
 
     def __init__(self, gate: Gate, *arguments: object, **options: object) -> None:
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
         self.gate = gate
-        self.sending = 0
+        self.sending = 0  # messages that the client has not taken yet
         self.next_due = self.in_time = 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

@@ -1,7 +1,7 @@
 """Display modes of the viewer: each shows one buffer of a rendering as a picture, with a legend."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderChanges
+from nexwarp.model.options import Exposure
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
 
@@ -31,6 +31,7 @@ BY_SLOT = ("ids", "depth", "weights", "normal")
 """Modes that show one of the K hits."""
 COUNTED = 0.02  # smallest weight that "hit count" counts; nearly all pixels have more than 8 hits in total
 QUANTILE_SAMPLES = 100_000
+RANGES = {"max_hits": (0, MAX_HITS), "sh_degree": (0, MAX_SH_DEGREE), "slot": (1, MAX_HITS)}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Settings:
     Attributes:
         mode: a key of `MODES`.
         max_hits: K, 0 to 8.
-        sh_degree: 0 to 6.
+        sh_degree: largest SH degree.
         slot: rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8.
         as_trained: where the picture's resolution is finer than the photos', weight the texture's levels as at the
             photos' resolution.
@@ -54,43 +55,21 @@ class Settings:
     as_trained: bool = True
     photo_exposure: bool = True
 
-    def changed(self, **values: object) -> "Settings":
-        """Return these settings with other values; an integer out of range is clamped.
+    def changed(self, name: str, value: object) -> "Settings":
+        """Return these settings with another value, as a browser sent it; an integer out of range is clamped.
 
         Raises:
             ValueError: a value of the wrong type, or an unknown mode.
-            TypeError: an unknown name.
         """
-        current: dict[str, object] = dict(vars(self))
-        unknown = sorted(values.keys() - current.keys())
-        if unknown:
-            raise TypeError(f"{unknown[0]}: expected one of {', '.join(current)}")
-        merged = current | values
-        mode = merged["mode"]
-        if not isinstance(mode, str) or mode not in MODES:
-            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
-        return Settings(
-            mode=mode,
-            max_hits=_clamped(merged, "max_hits", 0, MAX_HITS),
-            sh_degree=_clamped(merged, "sh_degree", 0, MAX_SH_DEGREE),
-            slot=_clamped(merged, "slot", 1, MAX_HITS),
-            as_trained=_switch(merged, "as_trained"),
-            photo_exposure=_switch(merged, "photo_exposure"),
-        )
-
-
-def _clamped(values: Mapping[str, object], name: str, low: int, high: int) -> int:
-    value = values[name]
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{name}: expected an integer, got {value!r}")
-    return min(max(value, low), high)
-
-
-def _switch(values: Mapping[str, object], name: str) -> bool:
-    value = values[name]
-    if not isinstance(value, bool):
-        raise ValueError(f"{name}: expected True or False, got {value!r}")
-    return value
+        expected = type(getattr(self, name))
+        if type(value) is not expected:
+            raise ValueError(f"{name}: expected {expected.__name__}, got {value!r:.60}")
+        if name == "mode" and value not in MODES:
+            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {value!r:.60}")
+        if isinstance(value, int) and name in RANGES:
+            low, high = RANGES[name]
+            value = min(max(value, low), high)
+        return replace(self, **{name: value})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -108,10 +87,7 @@ class Picture:
 
 @torch.no_grad()
 def draw(
-    model: Model,
-    bands: Iterable[Camera],
-    settings: Settings,
-    stale: Callable[[], bool] = lambda: False,
+    model: Model, bands: Iterable[Camera], settings: Settings, stale: Callable[[], bool] = lambda: False
 ) -> Picture | None:
     """Render one view in the mode of the settings.
 
@@ -125,97 +101,79 @@ def draw(
     Returns:
         The picture, or None if it was cancelled.
     """
-    hits = settings.max_hits
-    if settings.mode in BY_SLOT:
+    mode, hits = settings.mode, settings.max_hits
+    if mode in BY_SLOT:
         hits = max(hits, settings.slot)
-    elif settings.mode == "hit count":
+    elif mode == "hit count":
         hits = MAX_HITS
-    if settings.mode not in TEXTURED:
+    if mode not in TEXTURED:
         model = Model(model.surfels, None, model.exposures, model.detail_limits, model.options)
-    changes: RenderChanges = {
-        "max_hits": hits,
-        "sh_degree": min(settings.sh_degree, model.options.sh_degree),
-        "exposure": "photos" if settings.photo_exposure else "mean",
-    }
+    degree = min(settings.sh_degree, model.options.sh_degree)
+    exposure: Exposure = "photos" if settings.photo_exposure else "mean"
     parts: list[torch.Tensor] = []
     for camera in bands:
         if parts and stale():
             return None
-        out = model.render(camera, **changes)
-        parts.append(_values(out, model.surfels, camera, settings))
-    span = _span(parts, settings.mode)
+        rendering = model.render(camera, max_hits=hits, sh_degree=degree, exposure=exposure)
+        parts.append(_values(rendering, model.surfels, camera, settings))
+    span = None
+    if mode == "depth":
+        span = _depth_span(torch.cat([part[~part.isnan()] for part in parts]))
+    elif parts[0].ndim == 2:
+        span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
     # Band by band: temporary tensors of a large picture would need several times its memory.
     return Picture(np.concatenate([_eight_bit(_colours(part, span)) for part in parts]), span)
 
 
 def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
-    """The buffer of a mode: (H, W, 3) colours, or (H, W) numbers that are NaN in pixels without a hit."""
+    """Return the buffer of a mode: (H, W, 3) colours, or (H, W) numbers that are NaN in pixels without a hit."""
     mode, slot = settings.mode, settings.slot - 1
-    if mode in ("image", "plain", "textured"):
+    if mode in ("image", "plain", "textured", "alpha"):
         return getattr(out, mode)
-    if mode == "alpha":
-        return out.alpha
     if mode == "hit count":
         count = (out.weights >= COUNTED).sum(dim=2).to(out.weights)
-        return _where_any(count > 0, count)
+        return count.masked_fill(count == 0, torch.nan)
     ids = out.ids[..., slot].long()
-    if mode == "weights":
-        return _where_any(ids >= 0, out.weights[..., slot])
-    if mode == "depth":
-        return _where_any(ids >= 0, out.depths[..., slot])
+    if mode in ("weights", "depth"):
+        values = out.weights if mode == "weights" else out.depths
+        return values[..., slot].masked_fill(ids < 0, torch.nan)
     if mode == "ids" or len(surfels) == 0:
-        return _id_colours(ids) * (ids >= 0)[..., None]
-    normals = _normals(surfels, camera.position)[ids.clamp_min(0)]
+        return id_colours(ids) * (ids >= 0)[..., None]
+    normals = facing_normals(surfels, camera.position)[ids.clamp_min(0)]
     return (normals * 0.5 + 0.5) * (ids >= 0)[..., None]
 
 
-def _where_any(there: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    return torch.where(there, values, values.new_tensor(torch.nan))
-
-
-def _span(parts: Sequence[torch.Tensor], mode: str) -> tuple[float, float] | None:
-    """Values at the two ends of the colour scale; None for a mode that shows colours."""
-    if parts[0].ndim == 3:
-        return None
-    if mode == "depth":
-        return _depth_span(torch.cat([part[~part.isnan()] for part in parts]))
-    return (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
-
-
 def _colours(values: torch.Tensor, span: tuple[float, float] | None) -> torch.Tensor:
-    """(H, W, 3) colours in [0, 1]: the values, or those of a colour scale, black where values are NaN."""
-    return values if span is None else _scale(values, *span) * ~values.isnan()[..., None]
+    """Return (H, W, 3) colours: the values, or those of a scale from violet to yellow, black where they are NaN."""
+    if span is None:
+        return values
+    table = viridis().to(values.device)
+    steps = ((values - span[0]) / (span[1] - span[0]) * (len(table) - 1)).nan_to_num().round()
+    return table[steps.clamp(0, len(table) - 1).long()] * ~values.isnan()[..., None]
 
 
 def _eight_bit(colours: torch.Tensor) -> np.ndarray:
     return (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
 
 
-def _normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
-    """(N, 3) unit normals in the world frame that face `position`."""
+def facing_normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
+    """Return (N, 3) unit normals in the world frame that face `position`."""
     normals = surfels.normals
     behind = ((surfels.means - position) * normals).sum(dim=-1, keepdim=True) > 0
     return torch.where(behind, -normals, normals)
 
 
 def _depth_span(depths: torch.Tensor) -> tuple[float, float]:
-    """The 2nd and 98th percentile of depths (n,), from a sample of at most twice `QUANTILE_SAMPLES`."""
+    """Return the 2nd and 98th percentile of depths (n,), from a sample of at most twice `QUANTILE_SAMPLES`."""
     if depths.numel() == 0:
         return 0.0, 1.0
-    some = depths[:: max(depths.numel() // QUANTILE_SAMPLES, 1)]
-    low, high = torch.quantile(some, some.new_tensor([0.02, 0.98])).tolist()
+    sample = depths[:: max(depths.numel() // QUANTILE_SAMPLES, 1)]
+    low, high = torch.quantile(sample, sample.new_tensor([0.02, 0.98])).tolist()
     return low, max(high, low + 1e-6 * max(abs(low), 1e-6))
 
 
-def _scale(values: torch.Tensor, low: float, high: float) -> torch.Tensor:
-    """Viridis colours (..., 3) of values, from dark violet at `low` to yellow at `high`."""
-    table = viridis().to(values.device)
-    steps = ((values - low) / (high - low) * (len(table) - 1)).nan_to_num().round()
-    return table[steps.clamp(0, len(table) - 1).long()]
-
-
-def _id_colours(ids: torch.Tensor) -> torch.Tensor:
-    """Colours (..., 3) of integers by three multiplicative hashes, each channel at least 0.2."""
+def id_colours(ids: torch.Tensor) -> torch.Tensor:
+    """Return colours (..., 3) of integers by three multiplicative hashes, each channel at least 0.2."""
     factors = ids.new_tensor([2654435761, 2246822519, 3266489917])
     hashes = ((ids[..., None] + 1) * factors) % 2**32 // 2**16 % 256
     return 0.2 + 0.8 * hashes.float() / 255.0
@@ -223,7 +181,7 @@ def _id_colours(ids: torch.Tensor) -> torch.Tensor:
 
 @lru_cache(maxsize=1)
 def viridis() -> torch.Tensor:
-    """(256, 3) float32 colours in [0, 1]."""
+    """Return (256, 3) float32 colours in [0, 1]."""
     from kornia.color import ColorMap
 
     return ColorMap("viridis", 256).colors.T.float().contiguous()

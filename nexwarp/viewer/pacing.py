@@ -32,22 +32,20 @@ class Pace:
 
     def observe(self, kind: object, pixels: int, seconds: float) -> None:
         """Update the estimate with one picture."""
-        new, old = seconds / max(pixels, 1), self.seconds_per_pixel.get(kind)
-        self.seconds_per_pixel[kind] = new if old is None or new < old else old + (new - old) / 3.0
+        new = seconds / max(pixels, 1)
+        old = self.seconds_per_pixel.get(kind, new)
+        self.seconds_per_pixel[kind] = min(new, old + (new - old) / 3.0)
 
     def seconds(self, kind: object, pixels: float) -> float:
-        """Predicted time of a picture in seconds; 0 for a kind that was never drawn."""
+        """Predict the time of a picture in seconds; 0 for a kind that was never drawn."""
         return self.seconds_per_pixel.get(kind, 0.0) * pixels
 
     def bands(self, kind: object, pixels: float) -> int:
-        """Number of bands of a picture, each of about `BAND_SECONDS` and of at most `BAND_PIXELS`.
-
-        A picture can be cancelled between two bands.
-        """
+        """Return the number of bands of a picture, each of about `BAND_SECONDS` and of at most `BAND_PIXELS`."""
         return max(math.ceil(self.seconds(kind, pixels) / BAND_SECONDS), math.ceil(pixels / BAND_PIXELS), 1)
 
     def scale(self, kind: object, width: int, height: int, limit: float) -> float:
-        """Largest scale of 1, 0.71, 0.5, ... at which a picture of a window should take at most `limit` seconds.
+        """Return the largest scale of 1, 0.71, 0.5, ... at which a picture of a window should take `limit` seconds.
 
         The scale is at most 0.25, and the picture has at most `FIRST_PIXELS`, for a kind that was never drawn. The
         shorter side has at least `SMALLEST` pixels.
@@ -67,12 +65,6 @@ class Share:
     def __init__(self, share: float) -> None:
         self.share = share
         self.free_at = -math.inf
-
-    def set(self, percent: float) -> None:
-        """Set the share in percent, clamped to 1 to 90; ValueError unless it is finite."""
-        if not math.isfinite(percent):
-            raise ValueError(f"share: expected a number, got {percent}")
-        self.share = min(max(percent / 100.0, 0.01), 0.9)
 
     def due(self, now: float) -> bool:
         """Whether a picture may start at `now`, in seconds."""

@@ -31,21 +31,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Server:
-    """A running server.
-
-    Attributes:
-        viser: the server.
-        url: address to open, with the token if it needs one.
-        gate: admits connections.
-    """
+    """A running server: viser's, the address to open, with the token if it needs one, and what admits connections."""
 
     viser: "viser.ViserServer"
     url: str
     gate: "Gate"
-
-    def open(self) -> None:
-        """Answer requests from now on; earlier ones are refused."""
-        self.gate.is_open = True
 
     def waiting(self, client_id: int) -> int:
         """Number of messages that a client has not taken yet; 0 for one that has left."""
@@ -65,7 +55,7 @@ class Server:
 
 
 def start_server(host: str, port: int) -> Server:
-    """Start viser on exactly this address; it refuses all requests until `Server.open` is called.
+    """Start viser on exactly this address; it refuses all requests until `gate.is_open` is set.
 
     Args:
         host: name or address of an interface of this machine. `nexwarp.viewer.access` says who may connect.
@@ -134,22 +124,20 @@ def _url(address: str, port: int, token: str) -> str:
 
 
 def _accept_only_known(server: "viser.ViserServer") -> None:
-    """Drop messages that the viewer does not use, and ignore invalid ones."""
+    """Drop messages that the viewer does not use, and ignore invalid ones; viser has no public way to do so."""
     server.get_event_loop().set_exception_handler(lambda _loop, context: log.debug("dropped: %s", context))
-    _filter(server._websock_server)
-    server._websock_server.on_client_connect(_filter)
 
+    def watch(handler: "viser.infra.WebsockMessageHandler") -> None:
+        handle = handler._handle_incoming_message
 
-def _filter(handler: "viser.infra.WebsockMessageHandler") -> None:
-    """Make a viser message handler ignore all messages but valid ones of `ACCEPTED`."""
-    handle = handler._handle_incoming_message
+        async def accept(client_id: "viser.infra.ClientId", message: "viser.infra.Message") -> None:
+            if _is_valid(message):
+                await handle(client_id, message)
 
-    async def accept(client_id: "viser.infra.ClientId", message: "viser.infra.Message") -> None:
-        if _is_valid(message):
-            await handle(client_id, message)
+        handler._handle_incoming_message = accept  # type: ignore[method-assign]
 
-    # viser has no public way to filter messages.
-    handler._handle_incoming_message = accept  # type: ignore[method-assign]
+    watch(server._websock_server)
+    server._websock_server.on_client_connect(watch)
 
 
 def _is_valid(message: "viser.infra.Message") -> bool:

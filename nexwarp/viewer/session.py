@@ -3,7 +3,8 @@
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from nexwarp.cameras.camera import Camera
 from nexwarp.viewer.camera_path import Keyframe, interpolate, path_json
 from nexwarp.viewer.modes import Settings
-from nexwarp.viewer.panel import Panel, set_value
+from nexwarp.viewer.panel import Panel, set_changed
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, frustum_size, vertical_fov
 
 if TYPE_CHECKING:
@@ -29,7 +30,17 @@ MOST_WAITING = 2000  # messages that a client has not taken yet, above which it 
 
 
 class Session:
-    """The state of a client. viser's event loop calls its methods; another thread draws its pictures."""
+    """The state of a client. viser's event loop calls its methods; another thread draws its pictures.
+
+    Attributes:
+        waiting: returns the number of messages that the client has not taken yet.
+        save: writes a camera path into the run and returns the file's name; None only sends it to the browser.
+        make_page: returns the scene as a web page; None offers none.
+    """
+
+    waiting: Callable[[], int]
+    save: Callable[[bytes], str] | None
+    make_page: Callable[[], bytes] | None
 
     def __init__(
         self,
@@ -39,11 +50,8 @@ class Session:
         settings: Settings,
         home: Viewpoint,
         wake: Callable[[], None],
-        waiting: Callable[[], int],
-        save: Callable[[bytes], str] | None,
-        make_page: Callable[[], bytes] | None,
     ) -> None:
-        """Add the panel and the frustums of a client.
+        """Take up a client, whose panel and frustums `start` adds.
 
         Args:
             client: the connected client.
@@ -52,17 +60,14 @@ class Session:
             settings: initial display settings.
             home: initial view.
             wake: called when a new picture is needed.
-            waiting: returns the number of messages that the client has not taken yet.
-            save: writes a camera path into the run and returns the file's name; None only sends it to the browser.
-            make_page: returns the scene as a web page; None offers none.
         """
         self.client, self.world, self.cameras, self.home = client, world, cameras, home
-        self.settings, self.wake, self.waiting, self.save = settings, wake, waiting, save
-        self.make_page = make_page
+        self.settings, self.wake = settings, wake
         self.viewpoint: Viewpoint | None = None
         self.version = 0
         self.changed_at = time.perf_counter()
-        self.drawn_version, self.drawn_step, self.drawn_scale, self.drawn_at = -1, -1, 0.0, 0.0
+        self.drawn_version = self.drawn_step = -1
+        self.drawn_scale = self.drawn_at = 0.0
         self.screenshots: list[int] = []
         self.has_download = False  # a file was sent and may not have arrived
         # Replaced, never changed: handlers of several threads read it, each once.
@@ -70,14 +75,17 @@ class Session:
         self.closed = threading.Event()
         self.playing = self.saving = False
         self.frustums: dict[str, viser.CameraFrustumHandle] = {}
-        self.frustum_shape = (True, 1.0)
-        size = (home.width // 2 * 2, home.height // 2 * 2)  # video codecs need even sizes
-        self.panel = Panel(client.gui, self, list(cameras), float(np.rad2deg(home.fov)), size)
-        self._add_frustums()
-        client.camera.on_update(self.moved)
-        self.look_from(client.camera)
 
-    # Messages of the browser
+    def start(
+        self, waiting: Callable[[], int], save: Callable[[bytes], str] | None, make_page: Callable[[], bytes] | None
+    ) -> None:
+        """Add the panel and the frustums; the arguments become the attributes of their names."""
+        self.waiting, self.save, self.make_page = waiting, save, make_page
+        size = (self.home.width // 2 * 2, self.home.height // 2 * 2)  # video codecs need even sizes
+        self.panel = Panel(self, list(self.cameras), float(np.rad2deg(self.home.fov)), size)
+        self._add_frustums()
+        self.client.camera.on_update(self.moved)
+        self.look_from(self.client.camera)
 
     async def moved(self, camera: "viser.CameraHandle") -> None:
         """Take over the browser's camera."""
@@ -85,19 +93,15 @@ class Session:
 
     def look_from(self, camera: "viser.CameraHandle") -> None:
         """Take over a camera; an invalid one is ignored."""
-        try:
-            here = Viewpoint.of(
-                camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height, self.world
-            )
-        except (TypeError, ValueError):
-            return
-        self.viewpoint = here
-        self._changed()
-        self._hide_near()
+        size = (camera.image_width, camera.image_height)
+        with suppress(TypeError, ValueError):
+            self.viewpoint = Viewpoint.of(camera.wxyz, camera.position, camera.fov, *size, self.world)
+            self._changed()
+            self._hide_near()
 
-    def change(self, **values: object) -> None:
-        """Change display settings; ValueError for an invalid value."""
-        settings = self.settings.changed(**values)
+    def change(self, name: str, value: object) -> None:
+        """Change a display setting; ValueError for an invalid value."""
+        settings = self.settings.changed(name, value)
         if settings != self.settings:
             self.settings = settings
             self._changed()
@@ -130,19 +134,16 @@ class Session:
             pose: (4, 4) float64, x right, y down, z forward.
             fov: vertical field of view, radians.
         """
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         position, forward = self.world.to_browser(pose[:3, 3]), pose[:3, 2]
         distance = max(float((self.world.to_browser(self.world.focus) - position) @ forward), 0.5)
         camera = self.client.camera
-        try:
+        with suppress(ValueError):  # the browser had sent an invalid camera
             with self.client.atomic():
                 camera.position = position
-                camera.wxyz = np.array([w, x, y, z])
+                camera.wxyz = np.array(_wxyz(pose))
                 camera.look_at = position + forward * distance
                 camera.fov = fov
-        except ValueError:  # the browser had sent an invalid camera
-            return
-        set_value(self.panel.fov, float(round(float(np.rad2deg(fov)))))
+            set_changed(self.panel.fov, "value", float(round(float(np.rad2deg(fov)))))
 
     # Frustums
 
@@ -151,13 +152,12 @@ class Session:
         chosen = names[:: -(-len(names) // MOST_FRUSTUMS) or 1]
         poses = np.array([camera_to_world(self.cameras[name]) for name in chosen]).reshape(-1, 4, 4)
         self.places = self.world.to_browser(poses[:, :3, 3])
-        self.frustum_size = frustum_size(self.places)
+        self.frustum_size, self.frustum_scale = frustum_size(self.places), 1.0
         self.shown = np.ones(len(chosen), dtype=bool)
         self.group = self.client.scene.add_frame("/cameras", show_axes=False)
         for name, pose, place in zip(chosen, poses, self.places, strict=True):
             camera = self.cameras[name]
-            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-            frustum = self.client.scene.add_camera_frustum(
+            self.frustums[name] = self.client.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov=vertical_fov(camera),
                 aspect=camera.width / camera.height * camera.fy / camera.fx,
@@ -165,14 +165,13 @@ class Session:
                 thickness=1.5,
                 thickness_units="screen",
                 color=COLOURS.get(name.partition("/")[0], (160, 160, 160)),
-                wxyz=(w, x, y, z),
+                wxyz=_wxyz(pose),
                 position=place,
                 format="jpeg",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            frustum.on_click(partial(self._clicked, name))
-            self.frustums[name] = frustum
+            self.frustums[name].on_click(partial(self._clicked, name))
 
     async def _clicked(self, name: str, _: object) -> None:
         self.jump(name)
@@ -182,13 +181,12 @@ class Session:
         if name in self.frustums:
             self.frustums[name].image = pixels
 
-    def show_cameras(self, visible: bool, size: float) -> None:
-        """Show or hide the frustums; `size` is relative to their first one."""
+    def show_cameras(self, visible: bool, scale: float) -> None:
+        """Show or hide the frustums, at `scale` times their first size."""
         self.group.visible = visible
-        if size != self.frustum_shape[1]:
-            for frustum in self.frustums.values():
-                frustum.scale = self.frustum_size * size
-        self.frustum_shape = (visible, size)
+        self.frustum_scale = scale
+        for frustum in self.frustums.values():
+            set_changed(frustum, "scale", self.frustum_size * scale)
         self._hide_near()
 
     def _hide_near(self) -> None:
@@ -196,20 +194,13 @@ class Session:
         if self.viewpoint is None:
             return
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
-        reach = 1.5 * self.frustum_size * self.frustum_shape[1]
-        far = np.linalg.norm(self.places - eye, axis=1) > reach
+        far = np.linalg.norm(self.places - eye, axis=1) > 1.5 * self.frustum_size * self.frustum_scale
         frustums = list(self.frustums.values())
         for i in np.flatnonzero(far != self.shown):
             frustums[i].visible = bool(far[i])
         self.shown = far
 
-    # Screenshot and path
-
-    def take_screenshot(self, height: int) -> None:
-        """Request a picture of this height in pixels, unless `MOST_SCREENSHOTS` are requested already."""
-        if len(self.screenshots) < MOST_SCREENSHOTS:
-            self.screenshots.append(height)
-            self.wake()
+    # Camera path
 
     def add_keyframe(self) -> None:
         """Append the current view to the path."""
@@ -226,37 +217,23 @@ class Session:
             self._show_path()
 
     def _show_path(self) -> None:
-        keys = self.keyframes
+        keys, scene = self.keyframes, self.client.scene
         self.panel.count_keyframes(len(keys))
-        self.client.scene.remove_by_name("/path")
+        scene.remove_by_name("/path")
         if not keys:
             return
-        points = [key.pose[:3, 3] for key in keys]
-        self.client.scene.add_point_cloud(
-            "/path/views",
-            points=self.world.to_browser(np.stack(points)).astype(np.float32),
-            colors=PATH_COLOUR,
-            point_size=0.03,
-            point_shape="circle",
-        )
+        points = self._positions(keys)
+        scene.add_point_cloud("/path/views", points, PATH_COLOUR, point_size=0.03, point_shape="circle")
         if len(keys) > 1:
-            way = interpolate(keys, 24 * len(keys))
-            line = self.world.to_browser(np.stack([key.pose[:3, 3] for key in way])).astype(np.float32)
-            self.client.scene.add_line_segments(
-                "/path/way",
-                points=np.stack([line[:-1], line[1:]], axis=1),
-                colors=PATH_COLOUR,
-                thickness=2.0,
-                thickness_units="screen",
-            )
+            line = self._positions(interpolate(keys, 24 * len(keys)))
+            way = np.stack([line[:-1], line[1:]], axis=1)
+            scene.add_line_segments("/path/way", way, PATH_COLOUR, thickness=2.0, thickness_units="screen")
+
+    def _positions(self, keys: Sequence[Keyframe]) -> np.ndarray:
+        return self.world.to_browser(np.stack([key.pose[:3, 3] for key in keys])).astype(np.float32)
 
     async def play(self, seconds: float, closed: bool) -> None:
-        """Move along the path once; if that is in progress, stop it.
-
-        Args:
-            seconds: duration.
-            closed: return to the first view.
-        """
+        """Move along the path once, back to the first view if `closed`; if that is in progress, stop it."""
         if self.playing:
             self.playing = False
             return
@@ -278,10 +255,16 @@ class Session:
         self.panel.play.label = "Play"
         self._show_path()
 
+    # Files; a request is ignored while another file is made or on its way.
+
+    def take_screenshot(self, height: int) -> None:
+        """Request a picture of this height in pixels, unless `MOST_SCREENSHOTS` are requested already."""
+        if len(self.screenshots) < MOST_SCREENSHOTS:
+            self.screenshots.append(height)
+            self.wake()
+
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
         """Send the path to the browser as a file, and write it into the run.
-
-        A request is ignored while the client has not received its previous file.
 
         Args:
             width: width of the frames, pixels.
@@ -294,39 +277,50 @@ class Session:
         if len(keys) < 2:
             self.tell("Add at least two views first", "")
             return
-        if self.saving or (self.has_download and self.waiting()):
-            return
-        self.saving = True
-        try:
+        where = None
+
+        def make() -> bytes:
+            nonlocal where
             content = path_json(keys, width, height, fps, seconds, closed)
             where = self.save(content) if self.save is not None else None
-        except (OSError, ValueError, MemoryError) as error:
-            self.tell("The path was not saved", str(error))
-            return
-        finally:
-            self.saving = False
-        self.has_download = True
-        self.client.send_file_download("camera_path.json", content, save_immediately=True)
-        self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
+            return content
+
+        if self._send("camera_path.json", make, "The path was not saved"):
+            self.panel.saved.content = f"`{where or 'nexwarp render RUN --path camera_path.json'}`"
 
     def save_page(self) -> None:
-        """Send the scene as a web page; ignored while another file is made or on its way."""
-        if self.make_page is None or self.saving or (self.has_download and self.waiting()):
+        """Send the scene as a web page."""
+        if self.make_page is None or self._is_busy():
             return
-        self.saving = True
         self.tell("The web page is being made", "The download starts when it is ready.")
+        self._send("scene.html", self.make_page, "There is no web page")
+
+    def _is_busy(self) -> bool:
+        return self.saving or (self.has_download and bool(self.waiting()))
+
+    def _send(self, name: str, make: Callable[[], bytes], failure: str) -> bool:
+        """Make a file and send it to the browser; False, and a notification of an error, if it is not sent."""
+        if self._is_busy():
+            return False
+        self.saving = True
         try:
-            content = self.make_page()
+            content = make()
         except (OSError, ValueError, MemoryError) as error:
-            self.tell("There is no web page", str(error))
-            return
+            self.tell(failure, str(error))
+            return False
         finally:
             self.saving = False
         self.has_download = True
-        self.client.send_file_download("scene.html", content, save_immediately=True)
+        self.client.send_file_download(name, content, save_immediately=True)
+        return True
 
     def tell(self, title: str, text: str) -> None:
         """Show a notification in the browser, unless it takes no messages."""
-        if self.waiting() > MOST_WAITING:
-            return
-        self.client.add_notification(title, text, auto_close_seconds=10.0)
+        if self.waiting() <= MOST_WAITING:
+            self.client.add_notification(title, text, auto_close_seconds=10.0)
+
+
+def _wxyz(pose: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the rotation of a (4, 4) pose as a quaternion."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return w, x, y, z

@@ -9,18 +9,14 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.model.model import Model
 from nexwarp.viewer.modes import Settings, draw
-from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
+from nexwarp.viewer.world import Viewpoint
 
 SIDE = 96  # pixels along the longer side
 log = logging.getLogger(__name__)
 
 
 def of_photos(photos: Mapping[str, Callable[[], torch.Tensor]]) -> dict[str, np.ndarray]:
-    """Reduce photos to thumbnails; one that cannot be read has none.
-
-    Args:
-        photos: functions that return an (H, W, 3) uint8 photo, by name.
-    """
+    """Reduce photos to thumbnails; `photos` returns an (H, W, 3) uint8 photo by name, and unreadable ones have none."""
     from PIL import Image
 
     thumbnails: dict[str, np.ndarray] = {}
@@ -35,17 +31,11 @@ def of_photos(photos: Mapping[str, Callable[[], torch.Tensor]]) -> dict[str, np.
 
 
 def of_camera(model: Model, camera: Camera, near: float) -> np.ndarray:
-    """Render a thumbnail; a black one if that fails, for example out of memory.
-
-    Args:
-        model: the model to render.
-        camera: the camera of a photo.
-        near: near depth, world units.
-    """
-    here = Viewpoint(camera_to_world(camera), vertical_fov(camera), camera.width, camera.height)
+    """Render a thumbnail of a photo's camera; a black one if that fails, for example out of memory."""
     try:
-        small = here.bands(min(SIDE / max(camera.width, camera.height), 1.0), near, model.surfels.means)
-        picture = draw(model, small, Settings(max_hits=model.options.max_hits))
+        scale = min(SIDE / max(camera.width, camera.height), 1.0)
+        bands = Viewpoint.of_camera(camera).bands(scale, near, model.surfels.means)
+        picture = draw(model, bands, Settings(max_hits=model.options.max_hits))
     except (ValueError, RuntimeError, MemoryError) as error:
         log.warning("a camera has no thumbnail: %s", error)
         return np.zeros((1, 1, 3), dtype=np.uint8)

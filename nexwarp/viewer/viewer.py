@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,10 +18,10 @@ from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing, thumbnails
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
+from nexwarp.viewer.panel import TrainingPanel
 from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session
-from nexwarp.viewer.training_panel import TrainingPanel
-from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, vertical_fov
+from nexwarp.viewer.world import Viewpoint, World, clearest
 
 if TYPE_CHECKING:
     import viser
@@ -32,6 +33,25 @@ MOST_PATHS = 100  # written into the run
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class ViewerOptions:
+    """Options of a viewer.
+
+    Attributes:
+        near: near depth of the viewer's cameras, world units.
+        title: text above the panel.
+        host: interface to listen on.
+        port: port to listen on; 0 is any free port.
+        total: number of iterations of the training that is shown; None for a finished model.
+    """
+
+    near: float
+    title: str = "nexwarp"
+    host: str = "127.0.0.1"
+    port: int = 8080
+    total: int | None = None
+
+
 class Viewer:
     """A web page that shows a model. Pictures are drawn on the thread that calls `show` or `between_steps`."""
 
@@ -39,13 +59,9 @@ class Viewer:
         self,
         model: Callable[[], Model],
         cameras: Mapping[str, Mapping[str, Camera]],
+        options: ViewerOptions,
         *,
-        near: float,
-        title: str = "nexwarp",
-        host: str = "127.0.0.1",
-        port: int = 8080,
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
-        total: int | None = None,
         save_path: Callable[[bytes], str] | None = None,
         make_page: Callable[[], bytes] | None = None,
     ) -> None:
@@ -54,13 +70,9 @@ class Viewer:
         Args:
             model: returns the current model; called for each picture.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
-            near: near depth of the viewer's cameras, world units.
-            title: text above the panel.
-            host: interface to listen on.
-            port: port to listen on; 0 is any free port.
+            options: title, address and the like.
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails; None renders the
                 thumbnails.
-            total: number of iterations of the training that is shown; None for a finished model.
             save_path: writes a camera path, JSON in UTF-8, into the run and returns the file's name.
             make_page: returns the scene as a web page, one HTML file, which browsers may download; called once, on
                 another thread.
@@ -68,10 +80,9 @@ class Viewer:
         Raises:
             ValueError: the package viser is missing, or the address cannot be used.
         """
-        self.model, self.near, self.title = model, near, title
+        self.model, self.options = model, options
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
-        self.photos, self.save_path = photos, save_path
-        self._make_page, self._page, self._page_lock = make_page, b"", threading.Lock()
+        self.photos, self.save_path, self.make_page = photos, save_path, make_page
         self.world = World.around(list(self.cameras.values()), model().surfels.means)
         self.home = self._home()
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
@@ -80,18 +91,17 @@ class Viewer:
         self.thumbnails: dict[str, np.ndarray] = {}
         self.step = 0
         self.training: TrainingPanel | None = None
-        self._paths = 0
+        self._paths, self._page = 0, b""
         self._news = threading.Event()
-        self._lock = threading.Lock()
-        self._photos_lock = threading.Lock()
-        self.web = start_server(host, port)
+        self._lock, self._photos_lock, self._page_lock = threading.Lock(), threading.Lock(), threading.Lock()
+        self.web = start_server(options.host, options.port)
         self.server, self.url = self.web.viser, self.web.url
         self._set_scene()
-        if total is not None:
-            self.training = TrainingPanel(self.server.gui, total, self.share, self._news.set)
+        if options.total is not None:
+            self.training = TrainingPanel(self.server.gui, options.total, self.share, self._news.set)
         self.server.on_client_disconnect(self._goodbye)
         self.server.on_client_connect(self._welcome)
-        self.web.open()
+        self.web.gate.is_open = True
 
     def __enter__(self) -> "Viewer":
         return self
@@ -153,15 +163,11 @@ class Viewer:
             model: returns the current model, as in the constructor.
         """
         self.model = model
-        self.redraw()
-        if self.training is not None:
-            self.training.finish(text)
-
-    def redraw(self) -> None:
-        """Draw all pictures anew: the model has changed."""
         for session in list(self.sessions.values()):
             session.drawn_version = -1  # its picture shows the previous model
         self._news.set()
+        if self.training is not None:
+            self.training.finish(text)
 
     # Drawing
 
@@ -205,24 +211,24 @@ class Viewer:
         if here is None:
             return 0.0
         kind, size = _kind(session.settings), (here.width, here.height)
-        finest = pacing.limited(1.0, here.width, here.height)
+        finest = pacing.limited(1.0, *size)
         if longest is not None:
             finest = min(finest, self.pace.scale(kind, *size, longest))
         if session.version != session.drawn_version:
             return min(self.pace.scale(kind, *size, pacing.MOVING_SECONDS), finest)
-        still = now - session.changed_at
+        is_still = now - session.changed_at > pacing.STILL_AFTER
+        is_current = session.drawn_step == self.step
         if longest is not None:
-            return finest if session.drawn_step != self.step and still > pacing.STILL_AFTER else 0.0
-        if session.drawn_scale >= finest and session.drawn_step == self.step:
+            return finest if is_still and not is_current else 0.0
+        if not is_still or (is_current and session.drawn_scale >= finest):
             return 0.0
-        return min(2.0 * session.drawn_scale, finest) if still > pacing.STILL_AFTER else 0.0
+        return min(2.0 * session.drawn_scale, finest)
 
     def _draw(self, session: Session, scale: float) -> None:
         # Read before drawing: a later change makes the picture stale.
         version, settings, here = session.version, session.settings, session.viewpoint
         assert here is not None  # `_due` returns 0 without a viewpoint
-        session.drawn_at = time.perf_counter()
-        start = time.perf_counter()
+        session.drawn_at = start = time.perf_counter()
         picture = self._picture(here, scale, settings, lambda: session.version != version or session.closed.is_set())
         seconds = time.perf_counter() - start
         if picture is None:
@@ -241,7 +247,7 @@ class Viewer:
         model = self.model()
         kind, pixels = _kind(settings), here.width * here.height * scale**2
         limit = self.focal_limit if settings.as_trained else math.inf
-        bands = here.bands(scale, self.near, model.surfels.means, self.pace.bands(kind, pixels), limit)
+        bands = here.bands(scale, self.options.near, model.surfels.means, self.pace.bands(kind, pixels), limit)
         if model.device.type == "cuda":
             torch.cuda.synchronize(model.device)  # excludes the queued work of the training from the measured time
         start = time.perf_counter()
@@ -261,18 +267,16 @@ class Viewer:
         assert picture is not None  # never stale
         file = io.BytesIO()
         Image.fromarray(picture.pixels).save(file, format="PNG")
-        name = f"{self.title}_{settings.mode}.png".replace(" ", "_")
+        name = f"{self.options.title}_{settings.mode}.png".replace(" ", "_")
         session.has_download = True
         session.client.send_file_download(name, file.getvalue(), save_immediately=True)
 
     def _draw_thumbnail(self) -> bool:
         """Draw one thumbnail if a browser is connected; False if there is none left to draw."""
-        if self.photos is not None or not self.sessions:
-            return False
         name = next((name for name in self.cameras if name not in self.thumbnails), None)
-        if name is None:
+        if self.photos is not None or not self.sessions or name is None:
             return False
-        pixels = thumbnails.of_camera(self.model(), self.cameras[name], self.near)
+        pixels = thumbnails.of_camera(self.model(), self.cameras[name], self.options.near)
         with self._lock:
             self.thumbnails[name] = pixels
             for session in self.sessions.values():
@@ -283,23 +287,22 @@ class Viewer:
 
     def _home(self) -> Viewpoint:
         """The initial view: the camera with the clearest one, or one of the surfels' middle if there are no cameras."""
-        first = clearest(list(self.cameras.values())) if self.cameras else None
-        if first is not None:
-            return Viewpoint(camera_to_world(first), vertical_fov(first), first.width, first.height)
+        if self.cameras:
+            return Viewpoint.of_camera(clearest(list(self.cameras.values())))
         pose = np.eye(4)
         pose[:3, 3] = self.world.focus - np.array([0.0, 0.0, 3.0 * self.world.unit])
         return Viewpoint(pose, DEFAULT_FOV, 1280, 720)
 
     def _set_scene(self) -> None:
-        server, start, position = self.server, self.server.initial_camera, self.home.pose[:3, 3]
-        server.scene.set_up_direction(self.world.up)
-        forward = self.home.pose[:3, 2]
+        server, start = self.server, self.server.initial_camera
+        position, forward = self.home.pose[:3, 3], self.home.pose[:3, 2]
         distance = max(float((self.world.focus - position) @ forward), 0.1 * self.world.unit)
+        server.scene.set_up_direction(self.world.up)
         start.position = self.world.to_browser(position)
         start.look_at = self.world.to_browser(position + forward * distance)
         start.fov = self.home.fov
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
-        server.gui.set_panel_label(f"nexwarp · {self.title}")
+        server.gui.set_panel_label(f"nexwarp · {self.options.title}")
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
         try:
@@ -312,11 +315,12 @@ class Viewer:
         with self._photos_lock:  # one of the first clients reads the photos
             if self.photos and not self.thumbnails:
                 self.thumbnails = thumbnails.of_photos(self.photos)
-        waiting = partial(self.web.waiting, client.client_id)
-        save = None if self.save_path is None else self._save_path
-        page = None if self._make_page is None else self._web_page
-        started = (self._settings(), self.home, self._news.set, waiting, save, page)
-        session = Session(client, self.world, self.cameras, *started)
+        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set)
+        session.start(
+            partial(self.web.waiting, client.client_id),
+            None if self.save_path is None else self._save_path,
+            None if self.make_page is None else self._web_page,
+        )
         with self._lock:
             if client.client_id not in self.server.get_clients():  # it has disconnected
                 return
@@ -336,10 +340,9 @@ class Viewer:
 
     def _web_page(self) -> bytes:
         """Return the web page, which the first request makes and others wait for."""
-        assert self._make_page is not None
+        assert self.make_page is not None
         with self._page_lock:
-            if not self._page:
-                self._page = self._make_page()
+            self._page = self._page or self.make_page()
             return self._page
 
     def _settings(self) -> Settings:

@@ -21,6 +21,7 @@ MOST_COMPARED = 300  # cameras, for the first view
 FRUSTUM_SHARE = 0.4  # size of a frustum, in distances of neighbouring cameras
 SMALLEST_FRUSTUM, LARGEST_FRUSTUM = 0.02, 0.16  # browser units; all cameras lie within RADIUS of the origin
 BAND_ROWS = 16  # rows of a tile
+UP = np.array([0.0, -1.0, 0.0])  # where the cameras do not say
 
 FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
@@ -48,14 +49,14 @@ class World:
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         if not cameras:
             spread = np.median(np.linalg.norm(points - middle, axis=1)) if len(points) else 1.0
-            return World(middle, float(spread) or 1.0, np.array([0.0, -1.0, 0.0]), middle)
+            return World(middle, float(spread) or 1.0, UP, middle)
         poses = np.stack([camera_to_world(camera) for camera in cameras])
         centres, axes = poses[:, :3, 3], poses[:, :3, 2]
         centre = centres.mean(axis=0)
-        radius = np.linalg.norm(centres - centre, axis=1).max()
-        radius = radius if radius > 1e-6 * np.linalg.norm(middle - centre) else np.linalg.norm(middle - centre)
+        radius, away = np.linalg.norm(centres - centre, axis=1).max(), np.linalg.norm(middle - centre)
+        radius = radius if radius > 1e-6 * away else away
         up = -poses[:, :3, 1].mean(axis=0)
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, -1.0, 0.0])
+        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else UP
         try:
             target = focus(cameras).numpy()
         except ValueError:  # parallel axes
@@ -90,6 +91,11 @@ class Viewpoint:
     height: int
 
     @staticmethod
+    def of_camera(camera: Camera) -> "Viewpoint":
+        """Return the view of a camera of the scene."""
+        return Viewpoint(camera_to_world(camera), vertical_fov(camera), camera.width, camera.height)
+
+    @staticmethod
     def of(wxyz: FloatVector, position: FloatVector, fov: float, width: int, height: int, world: World) -> "Viewpoint":
         """Convert a browser's camera, after a check of its values.
 
@@ -119,7 +125,7 @@ class Viewpoint:
     def bands(
         self, scale: float, near: float, like: torch.Tensor, count: int = 1, focal_limit: float = math.inf
     ) -> list[Camera]:
-        """Cameras of a picture with `scale` times the canvas's size, as bands of rows from top to bottom.
+        """Return cameras of a picture with `scale` times the canvas's size, as bands of rows from top to bottom.
 
         Args:
             scale: of the picture, relative to the canvas.
@@ -142,11 +148,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class LimitedCamera(Camera):
-    """A camera with an upper limit on the focal length by which the texture's levels are weighted.
-
-    Attributes:
-        focal_limit: the limit in pixels.
-    """
+    """A camera with an upper limit, in pixels, on the focal length by which the texture's levels are weighted."""
 
     focal_limit: float = math.inf
 

@@ -1,6 +1,5 @@
 """Level of detail: the order of surfels, coarse models, and what a part of a model file gives."""
 
-import threading
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from nexwarp.model.detail import coarse_texture, surfel_count, texture_levels
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.run.opened import open_model
 from nexwarp.train.finish.order import ordered, picture_shares
-from nexwarp.viewer.gradual import GradualModel
 from tests.cameras.test_paths import ring
 from tests.cli.support import refused
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -141,29 +139,3 @@ def test_a_finished_training_is_ordered(tmp_path: Path) -> None:
     shares = picture_shares(model, [view.camera for view in scene.train])
     assert model.meta["ordered"] is True
     assert bool((shares[1:] <= shares[:-1] + 1e-6).all())
-
-
-def test_the_viewer_has_a_coarse_model_first_and_the_whole_one_later(model: nw.Model, cameras: list[nw.Camera]) -> None:
-    whole = ordered(model, cameras)
-    gate, ready = threading.Event(), threading.Event()
-
-    def read() -> nw.Model:
-        gate.wait(10.0)
-        return whole
-
-    gradual = GradualModel(whole.at_detail(0.1), read)
-    thread = gradual.read_rest(ready.set)
-    assert thread is not None and len(gradual().surfels) == 6 and not ready.is_set()
-    gate.set()
-    thread.join(10.0)
-    assert ready.is_set() and gradual() is whole and gradual.whole() is whole
-
-    def fail() -> nw.Model:
-        raise OSError("gone")
-
-    coarse = GradualModel(whole.at_detail(0.1), fail)
-    thread = coarse.read_rest(lambda: pytest.fail("it was not read"))
-    assert thread is not None
-    thread.join(10.0)
-    assert len(coarse().surfels) == 6
-    assert GradualModel(whole).read_rest(ready.set) is None

@@ -14,10 +14,11 @@ import pytest
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp.viewer import Viewer
+from nexwarp.viewer import Viewer, ViewerOptions
 from tests.scenes import intrinsics, rigid
 
 OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
+WATCHED = ViewerOptions(0.01, port=0, total=10)  # of a training
 
 
 def ring(count: int = 6) -> dict[str, dict[str, nw.Camera]]:
@@ -96,11 +97,11 @@ class Client:
 
 
 @contextmanager
-def serving(model: nw.Model, **arguments: Any) -> Iterator[Viewer]:
+def serving(model: nw.Model, host: str = "127.0.0.1", **arguments: Any) -> Iterator[Viewer]:
     """A viewer that draws on a thread of its own."""
     pytest.importorskip("viser")
     over = threading.Event()
-    with Viewer(lambda: model, ring(), near=0.01, port=0, **arguments) as viewer:
+    with Viewer(lambda: model, ring(), ViewerOptions(0.01, host=host, port=0), **arguments) as viewer:
         thread = threading.Thread(target=viewer.show, args=(over.is_set,))
         thread.start()
         try:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.viewer import Viewer, connections, pacing
+from nexwarp.viewer import Viewer, ViewerOptions, connections, pacing
 from nexwarp.viewer.session import Session
 from tests.viewer.attack import attacked, resources
 from tests.viewer.support import Client, serving, wait_for
@@ -38,10 +38,8 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
     with Viewer(
         trainer.model,
         {"train": {name: view.camera for name, view in views.items()}},
-        near=0.01,
-        port=0,
+        ViewerOptions(0.01, port=0, total=size["iterations"]),
         photos={f"train/{name}": functools.partial(getattr, view, "image") for name, view in views.items()},
-        total=size["iterations"],
     ) as viewer:
         with attacked(viewer) as counts:
             wait_for(lambda: len(viewer.sessions) > 1 and all(counts.values()))

@@ -22,7 +22,7 @@ from nexwarp.viewer.camera_path import Keyframe, path_json
 from nexwarp.viewer.modes import Picture, draw
 from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
 from nexwarp.viewer.session import Session
-from tests.viewer.support import Client, ring, serving, wait_for
+from tests.viewer.support import WATCHED, Client, ring, serving, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -251,7 +251,7 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
         raise error
 
     pytest.importorskip("viser")
-    with Viewer(lambda: model, ring(), near=0.01, port=0, total=10) as viewer:
+    with Viewer(lambda: model, ring(), WATCHED) as viewer:
         if where == "draw":
             monkeypatch.setattr(viewer_module, "draw", fail)
         if where == "welcome":
@@ -274,7 +274,7 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
             monkeypatch.setattr(viewer_module, "draw", draw)
             over = threading.Event()
             if where != "welcome":
-                session_of(viewer).change(mode="alpha")
+                session_of(viewer).change("mode", "alpha")
                 thread = threading.Thread(target=viewer.show, args=(over.is_set,))
                 thread.start()
                 try:
@@ -294,7 +294,7 @@ def test_a_screenshot_counts_in_full_for_the_share_of_time(model, monkeypatch):
 
     monkeypatch.setattr(viewer_module, "draw", slow)
     monkeypatch.setattr(pacing, "FIRST_SECONDS", 0.1)
-    with Viewer(lambda: model, ring(), near=0.01, port=0, total=10, photos={}) as viewer, Client(viewer) as client:
+    with Viewer(lambda: model, ring(), WATCHED, photos={}) as viewer, Client(viewer) as client:
         client.look()
         session = session_of(viewer)
         counted: list[float] = []

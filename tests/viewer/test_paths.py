@@ -31,8 +31,6 @@ def test_the_share_of_time_is_kept_whatever_pictures_cost():
                 budget.spend(now, cost)
             now += 0.03
         assert 0.5 * share < spent / now <= share + 0.01
-    with pytest.raises(ValueError, match="share"):
-        Share(0.2).set(math.nan)
 
 
 def test_pictures_are_sized_to_come_in_time():

@@ -16,7 +16,7 @@ from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.trainer import Trainer
 from nexwarp.viewer import Viewer
 from tests.scenes import make_surfels, make_texture, random_scene
-from tests.viewer.support import OPTIONS, Client, ring, wait_for
+from tests.viewer.support import OPTIONS, WATCHED, Client, ring, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -38,10 +38,8 @@ def test_looking_changes_nothing_about_a_training(run):
         Viewer(
             trainer.model,
             {"train": {view.name: view.camera for view in scene.train}},
-            near=0.01,
-            port=0,
+            WATCHED,
             photos={f"train/{view.name}": functools.partial(getattr, view, "image") for view in scene.train},
-            total=12,
         ) as viewer,
         Client(viewer) as client,
     ):
@@ -88,7 +86,7 @@ def test_looking_changes_nothing_about_a_training(run):
 
 def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
     pytest.importorskip("viser")
-    with Viewer(lambda: TINY, ring(), near=0.01, port=0, total=10, photos={}) as viewer:
+    with Viewer(lambda: TINY, ring(), WATCHED, photos={}) as viewer:
         start = time.perf_counter()
         for i in range(1000):
             viewer.between_steps(i, lambda: pytest.fail("asked although nobody looks"))

@@ -15,7 +15,7 @@ import nexwarp as nw
 from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import encode_scene
 from nexwarp.model.options import RenderOptions
-from nexwarp.viewer.modes import _id_colours, _normals
+from nexwarp.viewer.modes import facing_normals, id_colours
 from tests.export.web.support import CHROMIUM, FLAGS, named_cameras, psnr, serving, web_model
 from tests.export.web.test_scene_file import damaged
 from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
@@ -201,8 +201,8 @@ def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
     expected = model.render(camera)
     ids = expected.ids[..., 0].long()
     hit = (ids >= 0)[..., None]
-    normals = _normals(model.surfels, camera.position)[ids.clamp_min(0)]
-    pictures = {"ids": _id_colours(ids) * hit, "normals": (0.5 + 0.5 * normals) * hit}
+    normals = facing_normals(model.surfels, camera.position)[ids.clamp_min(0)]
+    pictures = {"ids": id_colours(ids) * hit, "normals": (0.5 + 0.5 * normals) * hit}
     pictures["alpha"] = expected.alpha[..., None].expand(*ids.shape, 3)
     for mode, picture in pictures.items():
         shown = tab.render(camera, mode=mode)[1]["image"]
