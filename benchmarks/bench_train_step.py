@@ -11,7 +11,7 @@ from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, synchronize
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
-from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.recipe import Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 
 MIDDLE = 10_000  # iteration

@@ -20,9 +20,9 @@ from nexwarp.data import Scene
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.exposures import Exposures
 from nexwarp.ops.ssim import weighted_dssim
-from nexwarp.train.config import Config
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.initial import starting_points
+from nexwarp.train.recipe import Config
 from nexwarp.train.step_losses import SATURATION
 from nexwarp.train.views import TrainingViews, mean_color
 

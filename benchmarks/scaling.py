@@ -27,14 +27,13 @@ from torch import nn
 from benchmarks.timing import git_commit, synchronize
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.config import Config
 from nexwarp.train.densify import split_surfels
 from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.presets import DEMO_SETTINGS, preset
 from nexwarp.train.ranks.launch import launch
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.ranks.shared import shared_scene
+from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
 from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
 

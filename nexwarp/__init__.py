@@ -25,8 +25,7 @@ from nexwarp.model.render import Rendering, render
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.api import train
-from nexwarp.train.config import Config
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import Config, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer

@@ -18,7 +18,7 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene, write_demo
 from nexwarp.kernels import launch
-from nexwarp.train import presets
+from nexwarp.train import recipe
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
 
@@ -79,7 +79,7 @@ def one_torch_thread() -> Iterator[None]:
 def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iterator[None]:
     """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets.PRESETS, "default", request.module.SMALL)
+        patch.setitem(recipe.PRESETS, "default", request.module.SMALL)
         yield
 
 

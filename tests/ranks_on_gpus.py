@@ -14,10 +14,9 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.data import Scene
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.ranks_support import digest
 
 

@@ -19,10 +19,10 @@ from torch import nn
 from nexwarp.data import Scene
 from nexwarp.kernels.launch import set_num_threads
 from nexwarp.model.model import Model
-from nexwarp.train.config import Config
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
+from nexwarp.train.recipe import Config
 from nexwarp.train.trainer import Trainer
 from tests.trainer_support import state_of
 

@@ -8,8 +8,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.data import Scene, View
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)

@@ -8,8 +8,7 @@ from typing import Any
 
 from nexwarp.data import Scene, load_scene
 from nexwarp.data.scene import TEST_EVERY
-from nexwarp.train.config import Config
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import Config, preset
 from nexwarp.train.settings import with_settings
 
 SCENES = ("train", "fox", "saharov", "kitchen25")

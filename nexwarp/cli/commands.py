@@ -25,7 +25,7 @@ from nexwarp.run.folder import read_metrics
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.run.optics import Kind, Optics
 from nexwarp.run.render_job import RenderOrder
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import preset
 
 
 @dataclass

@@ -22,8 +22,8 @@ from nexwarp.run.fit_poses import fit_poses
 from nexwarp.run.folder import SceneSource, read_metrics
 from nexwarp.run.lock import locked_run
 from nexwarp.run.opened import OpenedModel, open_model
-from nexwarp.train.config import MASK_MODES
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import MASK_MODES
 
 
 @dataclass

@@ -8,7 +8,7 @@ import tyro
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.settings import with_settings
 
 

@@ -15,10 +15,10 @@ from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.run.contents import teacher_folder
 from nexwarp.run.folder import SceneSource, create_run, is_run, read_metrics, read_run, rewrite_config
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
-from nexwarp.train.config import Config
 from nexwarp.train.exposure import CalibrateOnce
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import Config
 from nexwarp.train.stages import OwnTeachers, divide, training_teacher
 from nexwarp.train.trainer import Trainer
 

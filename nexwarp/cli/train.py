@@ -36,13 +36,12 @@ from nexwarp.run.folder import (
     record_places,
 )
 from nexwarp.run.log_sinks import PACKAGES, check_package
-from nexwarp.train.config import Config
-from nexwarp.train.presets import DEMO_SETTINGS, config_from_dict, preset
 from nexwarp.train.ranks.join import is_rank
 from nexwarp.train.ranks.launch import check_count
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.shared import shared_scene
-from nexwarp.train.settings import parse_settings, setting, with_settings
+from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
+from nexwarp.train.settings import config_from_dict, parse_settings, setting, with_settings
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers, plan_teachers
 
 if TYPE_CHECKING:

@@ -34,8 +34,8 @@ from nexwarp.run.folder import check_room
 from nexwarp.run.log import TrainingLog
 from nexwarp.run.log_sinks import PACKAGES
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
-from nexwarp.train.config import Config
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 

@@ -11,7 +11,7 @@ from nexwarp.io.files import is_abandoned, is_temporary, remove_empty
 from nexwarp.io.json_files import READ_ERRORS, read_json
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
-from nexwarp.train.config import MOST_TEACHERS
+from nexwarp.train.recipe import MOST_TEACHERS
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"

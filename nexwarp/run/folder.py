@@ -27,8 +27,8 @@ from nexwarp.run.contents import (
     teacher_folders,
 )
 from nexwarp.run.lock import locked_run
-from nexwarp.train.config import MIN_SURFELS, MOST_TEACHERS, Config
-from nexwarp.train.presets import config_from_dict
+from nexwarp.train.recipe import MIN_SURFELS, MOST_TEACHERS, Config
+from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 
 RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1

@@ -12,7 +12,7 @@ import torch
 from nexwarp.io.files import written_aside
 from nexwarp.run.contents import LOG_FILE
 from nexwarp.run.log_sinks import Sink, TensorboardSink, WandbSink
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -20,7 +20,7 @@ from nexwarp.train.trainer import Trainer
 EVERY = 100
 MIN_LINES = 100
 
-# Names in `nexwarp.train.config.LearningRates` of the optimizer's parameters.
+# Names in `nexwarp.train.recipe.LearningRates` of the optimizer's parameters.
 RATES = {
     "corrections": "poses",
     "means": "means",
@@ -163,7 +163,7 @@ class TrainingLog:
 
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Return the learning rates of the trainer's last step by the names of `nexwarp.train.config.LearningRates`."""
+    """Return the learning rates of the trainer's last step by the names of `nexwarp.train.recipe.LearningRates`."""
     poses = () if trainer.poses is None else (trainer.poses,)
     modules = (trainer.surfels, trainer.texture, *poses)
     names = {id(parameter): name for module in modules for name, parameter in module.named_parameters()}

@@ -15,8 +15,8 @@ from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.contents import CONFIG_FILE
 from nexwarp.run.folder import SceneSource, read_run
-from nexwarp.train.config import Config
 from nexwarp.train.finish.order import ordered
+from nexwarp.train.recipe import Config
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.ops.startup import start_warp
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.config import REFERENCE_ITERATIONS, Config
+from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 

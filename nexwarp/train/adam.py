@@ -8,7 +8,7 @@ import torch
 
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.adam import Moments, adam_step
-from nexwarp.train.losses import LossWeights
+from nexwarp.train.recipe import LossWeights
 
 
 class FusedAdam(torch.optim.Adam):

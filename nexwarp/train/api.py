@@ -7,7 +7,7 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.model.model import Model
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.stages import InMemory, stage_runner

@@ -1,43 +1,15 @@
 """Adaptive density control (paper Sec. 4.3): splits surfels of large blended error, prunes transparent ones."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import nn
 
 from nexwarp.errors import check_range
 from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.train.recipe import DensifyConfig
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations
 FULL = 0.98  # share of the budget from which it counts as used up: a round that splits few leaves some of it
-
-
-@dataclass(frozen=True)
-class DensifyConfig:
-    """When and how surfels are split and pruned; iterations are those of a run of 30,000."""
-
-    start: int = 500
-    """Iteration of the first round (exclusive)."""
-    stop: int = 25_000
-    """Iteration of the last round (exclusive)."""
-    every: int = 100
-    """Iterations between rounds."""
-    fraction: float = 0.05
-    """Fraction of the surfels that a round splits, within the budget."""
-    prune_opacity: float = 0.005
-    """Surfels with less opacity than this are removed."""
-    prune_at_cap: bool = True
-    """Prune also once the budget is used up, and split others in their place (the authors' code does neither)."""
-    relocate: float = 0.1
-    """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
-    that contribute least to the training views. Others are split in their place. 0 removes none."""
-
-    def __post_init__(self) -> None:
-        check_range("every", self.every, 1)
-        check_range("fraction", self.fraction, 0.0, 1.0)
-        check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
-        check_range("relocate", self.relocate, 0.0, 0.5)
 
 
 class Densifier:

@@ -17,7 +17,7 @@ import torch
 from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.data import Scene, View
 from nexwarp.model.exposures import DECIMALS, Exposures
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 
 CLIPPED = (8, 247)  # 8-bit values beyond these are clipped, or too dark to tell a ratio
 ROUNDS = 6  # rounds of reweighted least squares

@@ -9,7 +9,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import DivergedError
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.state import Snapshot
 

@@ -12,7 +12,7 @@ from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import TextureShape
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 
 INITIAL_OPACITY = 0.1
 INITIAL_RAW_GAMMA = -5.0

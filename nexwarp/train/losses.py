@@ -5,44 +5,15 @@ weights W of the K textured hits of each pixel, empty slots 0, and `textured` (H
 Terms of images are differentiable once; a `target` gets no gradient, and one that requires it is refused.
 """
 
-from dataclasses import dataclass
-
 import torch
 
 from nexwarp.errors import check_range, check_tensors
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
+from nexwarp.train.recipe import LossWeights
 
 ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Factors of the terms of the training loss; a term with factor 0 is not computed."""
-
-    dssim: float = 0.2
-    """Share of D-SSIM in the image loss; L1 has the rest."""
-    alpha: float = 0.005
-    """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
-    texture: float = 0.5
-    """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
-    opacity: float = 0.01
-    """Factor of the surfels' mean opacity; makes them sparse."""
-    grid: float = 0.01
-    """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
-    empty: float = 0.1
-    """Factor of the opacity in pixels that a mask declares as background."""
-    depth: float = 0.3
-    """Factor of the relative depth error at the points that were triangulated from the photo."""
-    normals: float = 0.0
-    """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
-    Counts from 7/30 of the run on; smoother meshes."""
-
-    def __post_init__(self) -> None:
-        check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals"):
-            check_range(name, getattr(self, name), 0.0)
 
 
 def training_losses(

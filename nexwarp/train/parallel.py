@@ -21,11 +21,11 @@ from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
-from nexwarp.train.config import Config
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
+from nexwarp.train.recipe import Config
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
 from nexwarp.train.step_losses import OwnLoss

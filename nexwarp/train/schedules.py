@@ -13,8 +13,7 @@ from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.tiles import Order
 from nexwarp.train.adam import FusedAdam, grid_factors
-from nexwarp.train.config import REFERENCE_ITERATIONS, Config
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, DensifyConfig
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are

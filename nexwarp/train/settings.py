@@ -1,15 +1,37 @@
-"""Settings by name, as a person types them."""
+"""Settings by name: as a person types them, and as a run's config.json holds them."""
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from typing import get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
-from nexwarp.train.config import LARGEST_NUMBER, Config
-from nexwarp.train.presets import REMOVED
+from nexwarp.train.recipe import PRESETS, Config
+
+LARGEST_NUMBER = 2**53  # all integers up to there are floats too
+# What runs did before a setting existed, where the default does something else.
+BEFORE: dict[str, object] = {"skybox": 0, "teachers": 0, "densify.relocate": 0.0}
+# Settings that no version has any more, and the value with which they did nothing.
+REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "low_pass": False, "losses.distortion": 0.0}
+
+
+def setting_names(config: Config) -> Iterator[str]:
+    """Yield the names of all settings; a dot leads into a part, as in "texture.residual"."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from (f"{field.name}.{inner.name}" for inner in dataclasses.fields(value))
+        else:
+            yield field.name
+
+
+def setting(config: Config, name: str) -> object:
+    """Return the value of a setting; ValueError when there is none of that name."""
+    _check_name(config, name)
+    part, _, key = name.rpartition(".")
+    return getattr(getattr(config, part) if part else config, key)
 
 
 def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
@@ -17,14 +39,15 @@ def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
 
     Args:
         config: what to start from.
-        settings: name -> value; a dot leads into a part, as in "texture.residual". Lists stand for tuples.
+        settings: name -> value. Lists stand for tuples.
 
     Raises:
         ValueError: there is no setting of that name, or its value is of another type or out of range.
     """
     changes: dict[str, dict[str, object]] = {}
     for name, value in settings.items():
-        part, key = _find_setting(config, name)
+        _check_name(config, name)
+        part, _, key = name.rpartition(".")
         hints = get_type_hints(type(getattr(config, part) if part else config))
         changes.setdefault(part, {})[key] = _typed(name, value, hints[key])
     whole = changes.pop("", {})
@@ -34,12 +57,6 @@ def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
         except ValueError as error:  # which names the setting without the part
             raise ValueError(f"{part}.{error}") from None
     return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # _typed has checked them
-
-
-def setting(config: Config, name: str) -> object:
-    """Return the value of a setting, named as `with_settings` names it; ValueError when there is none."""
-    part, key = _find_setting(config, name)
-    return getattr(getattr(config, part) if part else config, key)
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
@@ -68,19 +85,52 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
     return settings
 
 
-def _find_setting(config: Config, name: str) -> tuple[str, str]:
-    """Part, or "", and key of a setting."""
-    part, _, key = name.rpartition(".")
-    parts = {f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))}
-    known = [f.name for f in dataclasses.fields(config) if f.name not in parts]
-    known += [f"{p}.{f.name}" for p in sorted(parts) for f in dataclasses.fields(getattr(config, p))]
+def config_from_dict(data: Mapping[str, Any]) -> Config:
+    """Rebuild a config from `Config.as_dict`; ValueError names a value of another type or out of range.
+
+    Settings that an older version did not write are those of the preset that the run started from, but for those of
+    `BEFORE`. Those that this version does not know are passed over; see `refuse_removed`.
+    """
+    try:
+        name = data.get("preset")
+        base = PRESETS.get(name, Config()) if isinstance(name, str) else Config()
+        stored = _flat(data)
+        before = BEFORE if "densify" in data else {}  # the record of a run has it, a few settings do not
+        known = {name: stored.get(name, before.get(name)) for name in setting_names(base) if name in stored | before}
+        return with_settings(base, known)
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
+
+
+def refuse_removed(data: Mapping[str, Any]) -> None:
+    """Raise ValueError where settings, as an older version wrote them, ask for something that was removed since."""
+    stored = _flat(data)
+    for name, neutral in REMOVED.items():
+        if stored.get(name, neutral) != neutral:
+            raise ValueError(f"{name}: {stored[name]} was removed; versions up to 0.2 have it")
+
+
+def _flat(data: Mapping[str, Any]) -> dict[str, object]:
+    """Return the settings of `Config.as_dict`, or of another version, by name."""
+    flat: dict[str, object] = {}
+    for name, value in data.items():
+        flat |= {f"{name}.{key}": x for key, x in value.items()} if isinstance(value, Mapping) else {name: value}
+    for part in (field.name for field in dataclasses.fields(Config) if field.name in flat):
+        if dataclasses.is_dataclass(getattr(Config(), part)):
+            raise ValueError(f"{part}: expected an object, got {flat[part]!r:.60}")
+    return flat
+
+
+def _check_name(config: Config, name: str) -> None:
+    known = list(setting_names(config))
     if name in known:
-        return part, key
+        return
     if name in REMOVED:
         raise ValueError(f"{name}: expected a setting, got one that was removed; versions up to 0.2 have it")
-    close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part or name}.")]
-    # Not the first one of all, the preset, which has a flag of its own.
-    raise ValueError(f"{one_line(name, 60)}: expected a setting, such as {', '.join(close or known[1:5])}")
+    part = name.rpartition(".")[0] or name
+    close = get_close_matches(name, known, n=4, cutoff=0.5) or [n for n in known if n.startswith(f"{part}.")]
+    close = close or [n for n in known if "." not in n and n != "preset"][:4]  # the preset has a flag of its own
+    raise ValueError(f"{one_line(name, 60)}: expected a setting, such as {', '.join(close)}")
 
 
 def _typed(name: str, value: object, annotation: object) -> object:

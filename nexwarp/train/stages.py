@@ -16,10 +16,10 @@ from nexwarp.data import Scene
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
-from nexwarp.train.config import REFERENCE_ITERATIONS, Config
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.step_losses import OwnLoss

@@ -19,8 +19,8 @@ from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
-from nexwarp.train.config import Config
-from nexwarp.train.presets import config_from_dict, refuse_removed
+from nexwarp.train.recipe import Config
+from nexwarp.train.settings import config_from_dict, refuse_removed
 
 MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too

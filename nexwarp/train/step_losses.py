@@ -10,8 +10,8 @@ from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import expose
-from nexwarp.train.config import Config
 from nexwarp.train.losses import depth_loss, training_losses
+from nexwarp.train.recipe import Config
 from nexwarp.train.surface_losses import normal_loss
 from nexwarp.train.target import Target
 

@@ -4,7 +4,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.model.render import Rendering
-from nexwarp.train.config import REFERENCE_ITERATIONS, Config
+from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 
 # Iteration, of a run of 30,000, from which the loss counts: that of 2DGS.
 NORMALS_FROM = 7_000

@@ -12,7 +12,7 @@ from nexwarp.data import Scene
 from nexwarp.model.background import Color
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import jitter_factors
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.surface_losses import normals_factor
 from nexwarp.train.views import TrainingViews
 

@@ -18,7 +18,7 @@ from nexwarp.data import Scene
 from nexwarp.machine import derived_seed
 from nexwarp.model.frames import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.target import Target
 
 EVERY = 2  # the second of so many steps learns from a teacher: the log's lines are of odd steps, which have photos

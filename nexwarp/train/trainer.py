@@ -22,7 +22,6 @@ from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, FinishSettings, finish_model
@@ -30,6 +29,7 @@ from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, be
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import Config
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer, options_at, set_rates

@@ -8,7 +8,7 @@ import pytest
 
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.train import presets
+from nexwarp.train import recipe
 from tests.cli.support import FLAGS, SMALL
 
 
@@ -16,7 +16,7 @@ from tests.cli.support import FLAGS, SMALL
 def small_preset(one_torch_thread: None) -> Iterator[None]:
     """A small default preset: the command line has no flags for the texture's shape."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets.PRESETS, "default", SMALL)
+        patch.setitem(recipe.PRESETS, "default", SMALL)
         yield
 
 

@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 
 from nexwarp.cli import main as cli
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 
 SMALL = Config(
     texture=TextureConfig(levels=4, table_size=2**10, width=16),

@@ -15,7 +15,7 @@ from nexwarp.cli import main as cli
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
 from nexwarp.run.contents import list_files
 from nexwarp.run.metrics import CONVENTION, psnr
-from nexwarp.train.presets import config_from_dict
+from nexwarp.train.settings import config_from_dict
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
 from tests.data.test_scene import make_scene

@@ -25,8 +25,8 @@ from nexwarp.data.lens import pycolmap_module
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
 from nexwarp.model.model_file import load, save_model
-from nexwarp.train.config import Config
-from nexwarp.train.presets import config_from_dict
+from nexwarp.train.recipe import Config
+from nexwarp.train.settings import config_from_dict
 from tests.data.test_scene import HEIGHT, WIDTH, make_scene, pose
 from tests.model_file_support import make_model, rewrite
 
@@ -333,13 +333,13 @@ def test_paths_and_cameras_with_absurd_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"seed": "0"}, "config: seed: expected int, got '0'"),
-        ({"footprints": 1}, "config: footprints: expected bool, got 1"),
-        ({"rates": {"quats": float("inf")}}, "rates: quats: expected float, got inf"),
-        ({"rates": {"means": [1e-4]}}, "rates: means: expected .*, got "),
-        ({"texture": {"levels": 2.5}}, "texture: levels: expected int, got 2.5"),
-        ({"losses": {"alpha": float("nan")}}, "losses: alpha: expected float, got nan"),
-        ({"background": [0, 0]}, "config: background: expected .*, got "),
+        ({"seed": "0"}, "seed: expected an integer, got .0."),
+        ({"footprints": 1}, "footprints: expected true or false, got 1"),
+        ({"rates": {"quats": float("inf")}}, "rates.quats: expected a number, got Infinity"),
+        ({"rates": {"means": [1e-4]}}, "rates.means: expected .*, got "),
+        ({"texture": {"levels": 2.5}}, "texture.levels: expected an integer, got 2.5"),
+        ({"losses": {"alpha": float("nan")}}, "losses.alpha: expected a number, got NaN"),
+        ({"background": [0, 0]}, "background: expected .*, got "),
     ],
 )
 def test_settings_have_types(changes, match):

@@ -26,9 +26,8 @@ import pytest
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
-from nexwarp.train.config import Config
-from nexwarp.train.presets import DEMO_SETTINGS, PRESETS, preset
-from nexwarp.train.settings import setting, with_settings
+from nexwarp.train.recipe import PRESETS, USER_SETTINGS, Config, preset
+from nexwarp.train.settings import setting, setting_names, with_settings
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROOT = DOCS.parent
@@ -36,62 +35,13 @@ ROOT = DOCS.parent
 # The publication's symbol of a setting, and the section that gives its value (docs/paper.md has their titles);
 # "code": only the authors' code gives it.
 SYMBOLS: dict[str, tuple[str, str]] = {
-    "preset": ("", ""),
     "iterations": ("", "4.3"),
     "max_surfels": ("P", "4.3"),
     "max_hits": ("K", "5"),
-    "more_hits_from": ("", ""),
     "sh_degree": ("S = (d + 1)^2", "5"),
-    "sh_every": ("", "code"),
     "background": ("", "code"),
-    "footprints": ("", ""),
-    "smooth_sh": ("", ""),
-    "exposures": ("", ""),
-    "mask_mode": ("", ""),
-    "refine_poses": ("", ""),
-    "depth_jitter": ("", ""),
-    "order": ("", ""),
-    "filter_points": ("", ""),
-    "orient_points": ("", ""),
-    "skybox": ("", ""),
-    "teachers": ("", ""),
     "seed": ("", "code"),
-    "deterministic": ("", ""),
-    "cuda_graphs": ("", ""),
-    "losses.dssim": ("λ_D-SSIM", "4.3"),
-    "losses.alpha": ("λ_alpha", "4.3"),
-    "losses.texture": ("λ_texture", "4.3"),
-    "losses.opacity": ("λ_opacity", "4.3"),
-    "losses.grid": ("λ_grid", "4.3"),
-    "losses.empty": ("", ""),
-    "losses.depth": ("", ""),
-    "losses.normals": ("", ""),
-    "rates.means": ("", "code"),
-    "rates.quats": ("", "code"),
-    "rates.scales": ("", "code"),
-    "rates.opacities": ("", "code"),
-    "rates.gammas": ("", "code"),
-    "rates.sh0": ("", "code"),
-    "rates.shN": ("", "code"),
-    "rates.grid": ("", "code"),
-    "rates.mlp": ("", "code"),
-    "texture.levels": ("L", "5"),
     "texture.table_size": ("T", "5"),
-    "texture.features": ("F", "5"),
-    "texture.min_resolution": ("s_0", "code"),
-    "texture.max_resolution": ("s_(L-1)", "code"),
-    "texture.width": ("", "5"),
-    "texture.hidden_layers": ("", "5"),
-    "texture.sh_degree": ("S = (d + 1)^2", "5"),
-    "texture.residual": ("", ""),
-    "texture.down_weighting": ("Δ", "4.1"),
-    "densify.start": ("", "4.3"),
-    "densify.stop": ("", "4.3"),
-    "densify.every": ("", "4.3"),
-    "densify.fraction": ("", "4.3"),
-    "densify.prune_opacity": ("", "4.3"),
-    "densify.prune_at_cap": ("", "code"),
-    "densify.relocate": ("", ""),
 }
 
 INTRODUCTION = """\
@@ -105,23 +55,24 @@ with 130.
 """
 
 SETTINGS = """\
-## All settings
+## Settings of a training
 
-What a training depends on beside its scene: `nexwarp.Config`. `--preset` picks the values to start from, the
-flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
+What a person chooses of `nexwarp.Config`. `--preset` picks the values to start from, the flags of `nexwarp train`
+change some, and `--set KEY=VALUE`, repeated, any:
 
-    nexwarp train SCENE --preset paper --set texture.max_resolution=1024
-    nexwarp train SCENE --set mask_mode=background --set losses.empty=0.2 --set 'rates.means=[1e-4, 1e-6]'
+    nexwarp train SCENE --preset paper --set texture.table_size=65536
+    nexwarp train SCENE --set mask_mode=background --set losses.depth=0.1 --set 'background=[0, 0, 0]'
 
 VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY and a value of another type or
 out of range are refused before anything is written. The settings of a run are in its `config.json`. With `--resume`
 they come from there, and options that are given must agree with them.
 
-`demo` has settings of its own, for a short training on a CPU, with either preset: DEMO.
+All others, such as learning rates and the texture's shape, are documented in
+[recipe.py](https://github.com/nexwarp/nexwarp/blob/main/nexwarp/train/recipe.py), with the values of the presets and
+of `demo`; `--set` reaches them, too.
 
-Symbol and section are the publication's; "code" means that only the authors' code has the setting. A setting without
-either is not in the publication; `paper` turns it off, or it has no effect there. Values that differ are bold.
-[Presets and paper](paper.md) says why they differ.
+Symbol and section are the publication's; "code" means that only the authors' code has the setting. Values that differ
+are bold. [Presets and paper](paper.md) says why.
 """
 
 
@@ -162,17 +113,11 @@ def options(command: Any) -> Iterator[tuple[str, str, str]]:
         yield f"{name} {metavar}".strip(), str(default), docs[f.name]
 
 
-def setting_names(config: Config) -> Iterator[tuple[str, str]]:
-    """Names of all settings, and what they mean."""
-    parts = []
-    for name, text in field_docs(type(config)).items():
-        if dataclasses.is_dataclass(getattr(config, name)):
-            parts.append(name)
-        else:
-            yield name, text
-    for part in parts:
-        for name, text in field_docs(type(getattr(config, part))).items():
-            yield f"{part}.{name}", text
+def described_settings() -> Iterator[tuple[str, str]]:
+    """Names of the settings that a person chooses, and what they mean."""
+    for name in USER_SETTINGS:
+        part, _, key = name.rpartition(".")
+        yield name, field_docs(type(getattr(Config(), part)) if part else Config)[key]
 
 
 def cell(text: Any) -> str:
@@ -189,13 +134,12 @@ def options_page() -> str:
         page.append("| option | default | what |\n|---|---|---|")
         page += [f"| `{cell(option)}` | {cell(default)} | {cell(text)} |" for option, default, text in rows]
         page.append("")
-    demo = ", ".join(f"`{name}` {json.dumps(value)}" for name, value in DEMO_SETTINGS.items())
-    page.append(SETTINGS.replace("DEMO", demo))
+    page.append(SETTINGS)
     page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
     ours, paper = preset("default"), preset("paper")
-    for name, text in setting_names(ours):
+    for name, text in described_settings():
         default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
-        symbol, section = SYMBOLS[name]
+        symbol, section = SYMBOLS.get(name, ("", ""))
         theirs = theirs if theirs == default else f"**{theirs}**"
         section = f"paper Sec. {section}" if section[:1].isdigit() else section
         page.append(f"| `{name}` | {default} | {theirs} | {cell(text)} | {symbol} | {section} |")
@@ -247,8 +191,8 @@ def test_the_options_page_is_that_of_the_code():
     assert page == options_page(), "docs/options.md is out of date: python -m tests.docs.test_docs --write"
 
 
-def test_every_setting_has_its_symbol():
-    assert [name for name, _ in setting_names(Config())] == list(SYMBOLS)
+def test_few_settings_are_for_users():
+    assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names(Config())) and len(USER_SETTINGS) <= 20
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
@@ -271,7 +215,7 @@ def test_the_options_page_says_what_help_says(name, capsys, monkeypatch):
 def test_settings_on_the_page_can_be_set():
     """What the tables print is what --set takes: each preset is the other one with the page's values."""
     ours, paper = PRESETS["default"], PRESETS["paper"]
-    values = {name: json.loads(json.dumps(setting(paper, name))) for name in SYMBOLS}
+    values = {name: json.loads(json.dumps(setting(paper, name))) for name in setting_names(paper)}
     assert with_settings(ours, values) == paper
 
 
@@ -314,7 +258,7 @@ def test_the_paper_page_lists_all_that_differs():
     page = (DOCS / "paper.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `([a-z_.]+)` \|", page, re.M)
     ours, paper = preset("default"), preset("paper")
-    differ = {name for name in SYMBOLS if setting(ours, name) != setting(paper, name)} - {"preset"}
+    differ = {name for name in setting_names(ours) if setting(ours, name) != setting(paper, name)} - {"preset"}
     assert set(listed) == differ and len(listed) == len(differ)
 
 
@@ -339,7 +283,7 @@ def test_the_api_page_has_every_public_name():
 def test_every_setting_has_a_row_of_evidence() -> None:
     rows = re.findall(r"^\| (`.+?`) \|", (DOCS / "evidence.md").read_text(encoding="utf-8"), re.M)
     named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
-    assert sorted(named) == sorted(SYMBOLS)
+    assert sorted(named) == sorted(setting_names(Config()))
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")

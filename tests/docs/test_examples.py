@@ -14,7 +14,7 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.data import Scene
 from nexwarp.io.pictures import load_exr
-from nexwarp.train.config import LearningRates, TextureConfig
+from nexwarp.train.recipe import LearningRates, TextureConfig
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]

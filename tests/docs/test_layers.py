@@ -128,7 +128,7 @@ USES = """
 import sys
 import nexwarp as nw
 
-from nexwarp.train.config import TextureConfig
+from nexwarp.train.recipe import TextureConfig
 
 scene, shape = nw.load_scene(sys.argv[1]), TextureConfig(table_size=2**10)
 trainer = nw.Trainer(scene, nw.Config(iterations=2, max_surfels=50, texture=shape), "cpu")

@@ -14,7 +14,7 @@ from nexwarp.export.splats import Pieces, split_large
 from nexwarp.export.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.metrics import psnr
-from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.recipe import DEMO_SETTINGS, preset
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
 from tests.gsplat_support import draw, untextured

@@ -5,7 +5,8 @@ import torch
 from torch.autograd import gradcheck
 
 from nexwarp.ops.ssim import weighted_dssim
-from nexwarp.train.losses import LossWeights, training_losses
+from nexwarp.train.losses import training_losses
+from nexwarp.train.recipe import LossWeights
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 

@@ -19,7 +19,6 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
-from nexwarp.train.config import Config, TextureConfig
 from nexwarp.train.exposure import (
     PRIOR,
     CalibrateOnce,
@@ -31,7 +30,7 @@ from nexwarp.train.exposure import (
     observations,
     solve_gains,
 )
-from nexwarp.train.losses import LossWeights
+from nexwarp.train.recipe import Config, LossWeights, TextureConfig
 from nexwarp.train.step_losses import as_taken, step_losses
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer

@@ -20,7 +20,7 @@ from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.run.folder import SceneSource, create_run
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_finite
 

@@ -20,7 +20,7 @@ from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.trainer import Trainer
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite

@@ -11,9 +11,8 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
 from nexwarp.data import Scene, View, write_demo
 from nexwarp.model.surfels import Surfels
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.finish.sh_smoothing import MAX_STRENGTH, MIN_STRENGTH, seen_directions, smooth_sh
-from nexwarp.train.presets import preset
+from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
+from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig, preset
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
 from tests.scenes import make_surfels, random_scene

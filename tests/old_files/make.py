@@ -23,9 +23,9 @@ def first_of(tree: str, *names: str) -> Any:
 def main(tree: str, scene: str, run: str) -> None:
     sys.path.insert(0, tree)
     torch.set_num_threads(1)
-    config = first_of(tree, "nexwarp.train.config", "nexwarp.config", "nexwarp.trainer")
-    presets = first_of(tree, "nexwarp.train.presets", "nexwarp.config", "nexwarp.trainer")
-    densify = first_of(tree, "nexwarp.train.densify", "nexwarp.densify")
+    config = first_of(tree, "nexwarp.train.recipe", "nexwarp.train.config", "nexwarp.config", "nexwarp.trainer")
+    presets = first_of(tree, "nexwarp.train.recipe", "nexwarp.train.presets", "nexwarp.config", "nexwarp.trainer")
+    densify = first_of(tree, "nexwarp.train.recipe", "nexwarp.train.densify", "nexwarp.densify")
     evaluate = first_of(tree, "nexwarp.run.evaluate", "nexwarp.evaluate")
     cli = first_of(tree, "nexwarp.cli.main", "nexwarp.cli")
     texture = config.TextureConfig(levels=2, table_size=2**6, width=8)

@@ -9,8 +9,8 @@ import torch
 import nexwarp as nw
 from nexwarp.ops.adam import Moments, adam_step
 from nexwarp.train.adam import FusedAdam, grid_factors
-from nexwarp.train.config import TextureConfig
-from nexwarp.train.losses import LossWeights, grid_loss
+from nexwarp.train.losses import grid_loss
+from nexwarp.train.recipe import LossWeights, TextureConfig
 from nexwarp.train.schedules import EPSILON
 from nexwarp.train.state import gather_optimizer, restore_optimizer
 from nexwarp.train.trainer import Trainer

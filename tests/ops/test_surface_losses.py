@@ -10,8 +10,7 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.data import Scene as Capture
 from nexwarp.model.render import Rendering
-from nexwarp.train.config import Config
-from nexwarp.train.losses import LossWeights
+from nexwarp.train.recipe import Config, LossWeights
 from nexwarp.train.surface_losses import depth_normals, normal_loss, normals_factor
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import present

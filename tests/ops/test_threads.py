@@ -9,9 +9,8 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.data import write_demo
 from nexwarp.kernels import launch
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.losses import depth_loss
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import present, total
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene

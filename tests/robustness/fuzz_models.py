@@ -13,7 +13,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.train.config import Config, TextureConfig
+from nexwarp.train.recipe import Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 
 WIDTH, HEIGHT, VIEWS = 12, 9, 3

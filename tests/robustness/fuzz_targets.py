@@ -30,7 +30,7 @@ from nexwarp.model.model_file import load, save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
 from nexwarp.run.log import keep_lines
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
 from tests.robustness.fuzz_inputs import Files

@@ -28,7 +28,7 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.run import warmup
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import preset
 from nexwarp.train.trainer import Trainer
 from tests.render_support import loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene

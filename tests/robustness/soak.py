@@ -21,8 +21,7 @@ from nexwarp.data import Scene
 from nexwarp.machine import keep_freed_memory
 from nexwarp.model.buffers import render_buffers
 from nexwarp.run.warmup import tiny_scene
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 
 MIB = 2**20

@@ -19,8 +19,7 @@ from nexwarp.errors import NexwarpError, StorageError
 from nexwarp.io.pictures import load_exr
 from nexwarp.run.folder import check_room, read_metrics, read_run
 from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.faults import Disk, failing
 
 pytestmark = pytest.mark.usefixtures("small_preset")

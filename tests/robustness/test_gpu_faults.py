@@ -16,8 +16,7 @@ from nexwarp.errors import DivergedError, OutOfMemoryError
 from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train import graphs as step_graphs
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Allocator, allocating, failing_gpu
 from tests.narrowing import present

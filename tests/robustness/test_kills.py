@@ -16,11 +16,10 @@ from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.train import presets
+from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.finish.finish import FinishObserver
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
 from tests.robustness.kills import kill_and_resume
@@ -40,7 +39,7 @@ Moment = float | tuple[str, int]  # a share of the training's time, or a stage a
 
 def main() -> None:
     """The command line, whose default preset is a small one; it may kill itself in a stage of the finishing."""
-    presets.PRESETS["default"] = SMALL
+    recipe.PRESETS["default"] = SMALL
     if KILL_AT in os.environ:
         count, stage = os.environ[KILL_AT].split(" ", 1)
         finish = Trainer.finish
@@ -59,7 +58,7 @@ def main() -> None:
 
 @pytest.fixture(autouse=True)
 def small_preset(monkeypatch):
-    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
 
 
 def moments(count: int) -> list[Moment]:

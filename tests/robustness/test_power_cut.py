@@ -27,7 +27,7 @@ from nexwarp.run.folder import SceneSource, claimed_run, create_run, read_metric
 from nexwarp.run.log import _open_log, keep_lines
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from tests.model_file_support import make_model
 from tests.power_cut import Mark, Recorder, after_power_cut, recorded
 from tests.scenes import make_camera, random_scene

@@ -17,8 +17,7 @@ from nexwarp.cli import main as cli
 from nexwarp.data import Scene, load_scene, write_demo
 from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines, peak_memory
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 

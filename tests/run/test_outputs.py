@@ -26,7 +26,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import SceneSource, create_run
 from nexwarp.run.opened import open_model
 from nexwarp.run.render_job import RenderOrder
-from nexwarp.train.config import Config
+from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring, row
 from tests.scenes import make_surfels, make_texture, random_scene
 

@@ -15,11 +15,9 @@ from nexwarp.io.pictures import to_uint8
 from nexwarp.model.poses import PoseCorrections, pose_differences, rigid_motion
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.train import presets
-from nexwarp.train.config import LearningRates
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train import recipe
 from nexwarp.train.initial import initial_poses
-from nexwarp.train.presets import DEMO_SETTINGS, preset
+from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset
 from nexwarp.train.schedules import make_optimizer, rate_ends
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
@@ -173,7 +171,7 @@ def test_fitted_test_poses_come_back_and_the_model_stays(shown, model):
 
 
 def test_the_command_line_refines_and_says_so(tiny_folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
     run = tmp_path / "run"
     assert cli.main(["train", str(tiny_folder), "--run", str(run), *FLAGS, "--refine-poses"]) == 0
     cameras = json.loads((run / "cameras.json").read_text())

@@ -41,9 +41,8 @@ from nexwarp.run.contents import LOCK_FILE
 from nexwarp.run.export import export_run
 from nexwarp.run.folder import read_run
 from nexwarp.run.opened import open_model
-from nexwarp.train import presets
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train import recipe
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Killed, kill_at
 from tests.subprocesses import python_path
@@ -80,7 +79,7 @@ def train(scene: Path, run: Path, seed: int | None, flag: str) -> None:
 
 def main() -> None:
     """Train with the small preset, in a process of its own that is to be killed."""
-    presets.PRESETS["default"] = SMALL
+    recipe.PRESETS["default"] = SMALL
     scene, run, seed, flag = sys.argv[1:]
     train(Path(scene), Path(run), int(seed), flag)
 

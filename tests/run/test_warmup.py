@@ -15,9 +15,8 @@ import warp as wp
 from nexwarp.cli import main as cli
 from nexwarp.kernels import launch as launching
 from nexwarp.run import warmup
-from nexwarp.train.config import Config
 from nexwarp.train.densify import Densifier
-from nexwarp.train.presets import PRESETS
+from nexwarp.train.recipe import PRESETS, Config
 from nexwarp.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -32,12 +31,12 @@ print(len(warmup.cached_binaries()))
 USE = """
 import json, sys, torch
 from dataclasses import replace
-from nexwarp.cli import main as cli; from nexwarp.train import presets; from nexwarp.run import warmup
+from nexwarp.cli import main as cli; from nexwarp.train import recipe; from nexwarp.run import warmup
 from nexwarp.data import write_demo
 scene, run, device = sys.argv[1:]
 write_demo(scene, width=48, height=36, views=10, points=200)
-base = presets.PRESETS["default"]
-presets.PRESETS["default"] = replace(base, texture=replace(base.texture, table_size=2**10))
+base = recipe.PRESETS["default"]
+recipe.PRESETS["default"] = replace(base, texture=replace(base.texture, table_size=2**10))
 before = warmup.cached_binaries()
 short = ["--iterations", "60", "--max-surfels", "100"]
 commands = {

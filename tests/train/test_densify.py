@@ -9,7 +9,8 @@ import torch
 
 import nexwarp as nw
 from nexwarp.model.surfels import PARAMETERS
-from nexwarp.train.densify import Densifier, DensifyConfig, split_surfels
+from nexwarp.train.densify import Densifier, split_surfels
+from nexwarp.train.recipe import DensifyConfig
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 

@@ -17,8 +17,8 @@ from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
 from nexwarp.train import graphs as step_graphs
 from nexwarp.train import views as training_views
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.densify import Densifier
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.settings import with_settings
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
@@ -165,7 +165,7 @@ def test_sizes_beyond_the_first_few(tiny_scene: Scene, monkeypatch: pytest.Monke
 def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
     """Nothing else has started Warp."""
     code = (
-        "import nexwarp as nw; from nexwarp.train.config import Config; from nexwarp.train.trainer import Trainer\n"
+        "import nexwarp as nw; from nexwarp.train.recipe import Config; from nexwarp.train.trainer import Trainer\n"
         f"trainer = Trainer(nw.load_scene({str(tiny_folder)!r}), Config(max_surfels=100), 'cuda')\n"
         "captured = 0\n"
         "for _ in range(12):\n"

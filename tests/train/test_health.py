@@ -17,9 +17,8 @@ from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMe
 from nexwarp.machine import needed_memory
 from nexwarp.train import trainer
 from nexwarp.train.checkpoint import save_checkpoint
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.health import LossLog, describe, not_finite
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.schedules import make_optimizer
 from nexwarp.train.step_losses import step_losses
 from nexwarp.train.trainer import Trainer

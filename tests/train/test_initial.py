@@ -8,9 +8,8 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, initial_points
-from nexwarp.train.config import TextureConfig
 from nexwarp.train.initial import initial_surfels, quats_towards, texture_shape
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import TextureConfig, preset
 from tests.reference.collect import rotations
 from tests.trainer_support import TEXTURE, rescaled, small
 

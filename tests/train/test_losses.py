@@ -9,7 +9,7 @@ from torch.autograd import gradcheck
 
 from nexwarp.cameras.camera import visible_points
 from nexwarp.train import losses
-from nexwarp.train.losses import LossWeights
+from nexwarp.train.recipe import LossWeights
 from tests.narrowing import present, total
 from tests.tolerances import assert_close
 

@@ -19,15 +19,14 @@ from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.train import presets
+from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
 from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
 from nexwarp.train.ranks import join, liveness
 from nexwarp.train.ranks.join import Place, first_difference, join_store
 from nexwarp.train.ranks.launch import check_count
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import (
     CPU,
@@ -234,7 +233,7 @@ def test_gpus_that_are_not_there_are_refused(capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def small_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(presets.PRESETS, "default", SMALL)
+    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
 
 
 def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:

@@ -5,10 +5,8 @@ import json
 
 import pytest
 
-from nexwarp.train.config import MIN_SURFELS, Config, LearningRates, TextureConfig
-from nexwarp.train.densify import DensifyConfig
-from nexwarp.train.losses import LossWeights
-from nexwarp.train.presets import config_from_dict, preset
+from nexwarp.train.recipe import MIN_SURFELS, Config, DensifyConfig, LearningRates, LossWeights, TextureConfig, preset
+from nexwarp.train.settings import config_from_dict
 from tests.trainer_support import small
 
 

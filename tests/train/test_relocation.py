@@ -11,8 +11,9 @@ from nexwarp.data import Scene
 from nexwarp.model.render import render
 from nexwarp.train import relocation
 from nexwarp.train import trainer as trainer_module
-from nexwarp.train.densify import Densifier, DensifyConfig
+from nexwarp.train.densify import Densifier
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import DensifyConfig
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import run_ranks

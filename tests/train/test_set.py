@@ -12,9 +12,8 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
-from nexwarp.train.config import Config, LearningRates
-from nexwarp.train.presets import PRESETS, config_from_dict, preset
-from nexwarp.train.settings import parse_settings, setting, with_settings
+from nexwarp.train.recipe import PRESETS, Config, LearningRates, preset
+from nexwarp.train.settings import config_from_dict, parse_settings, setting, with_settings
 from tests.scene_writers import write_blender
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]

@@ -10,9 +10,8 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import Evaluation, evaluate
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.presets import PRESETS, config_from_dict, preset
-from nexwarp.train.settings import with_settings
+from nexwarp.train.recipe import PRESETS, Config, TextureConfig, preset
+from nexwarp.train.settings import config_from_dict, with_settings
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import mean_color
 from tests.tolerances import assert_close

@@ -22,11 +22,11 @@ from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_
 from nexwarp.train import exposure
 from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
-from nexwarp.train.config import TextureConfig
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
-from nexwarp.train.presets import PRESETS, config_from_dict, preset
 from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import PRESETS, TextureConfig, preset
 from nexwarp.train.report import StepReport
+from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, teacher_count
 from tests.exposed import expose_photos
 

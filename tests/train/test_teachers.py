@@ -15,7 +15,7 @@ from nexwarp.cli import main as cli
 from nexwarp.errors import CheckpointError
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.checkpoint import CHECKPOINTS
-from nexwarp.train.config import TextureConfig
+from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.teachers import Teachers
 from tests.ranks_support import alone_as
 

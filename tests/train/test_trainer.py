@@ -13,8 +13,7 @@ import nexwarp as nw
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.train.config import Config, LearningRates, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, LearningRates, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.exposed import with_exposures
 from tests.tolerances import assert_close

@@ -14,8 +14,7 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
-from nexwarp.train.config import TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import DensifyConfig, TextureConfig
 from nexwarp.train.schedules import OptimizerMaker, ParameterGroup
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_same_state

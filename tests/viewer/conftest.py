@@ -7,9 +7,8 @@ import pytest
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.train import presets
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train import recipe
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 
@@ -32,7 +31,7 @@ def run(tmp_path_factory) -> Path:
     scene = write_demo(folder / "tiny", width=48, height=36, views=10, points=200)
     small = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets.PRESETS, "default", small)
+        patch.setitem(recipe.PRESETS, "default", small)
         flags = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
         assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
     return folder / "run"

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.train.config import Config, TextureConfig
-from nexwarp.train.densify import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from nexwarp.viewer import Viewer
 from tests.scenes import make_surfels, make_texture, random_scene

@@ -22,7 +22,6 @@ from nexwarp.model.model import Model
 PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 GiB
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
-MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # 0 is allowed too; less is lost in the harmonics' rounding
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from PIL import Image
 
 from nexwarp.data import initial_points, load_scene
 from nexwarp.data.scene import find_format
-from nexwarp.train.presets import preset
+from nexwarp.train.recipe import preset
 from nexwarp.train.trainer import Trainer
 from tests.data.inputs.support import assert_same_cameras, edit
 from tests.data.test_scene import make_scene, project, views_of

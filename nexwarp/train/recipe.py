@@ -1,0 +1,327 @@
+"""The recipe: every setting of a training and its default, and the presets.
+
+What a person chooses, `USER_SETTINGS`, is shown by `nexwarp train --help` and docs/options.md. All other settings are
+documented here alone; `--set KEY=VALUE` and `nexwarp.Config` reach them, too. Iterations are those of a run of 30,000;
+schedules stretch with `Config.iterations`.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from nexwarp.errors import check_range
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE
+from nexwarp.model.render import MAX_JITTER
+from nexwarp.model.texture import check_sizes
+from nexwarp.ops.tiles import check_order
+
+REFERENCE_ITERATIONS = 30_000
+MIN_SURFELS = 16
+MASK_MODES = ("ignore", "background")
+MOST_TEACHERS = 8
+MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # of SH smoothing; 0 is allowed too, less is lost in the harmonics' rounding
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Factors of the terms of the training loss; a term with factor 0 is not computed."""
+
+    dssim: float = 0.2
+    """Share of D-SSIM in the image loss; L1 has the rest."""
+    alpha: float = 0.005
+    """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
+    texture: float = 0.5
+    """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
+    opacity: float = 0.01
+    """Factor of the surfels' mean opacity; makes them sparse."""
+    grid: float = 0.01
+    """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
+    empty: float = 0.1
+    """Factor of the opacity in pixels that a mask declares as background."""
+    depth: float = 0.3
+    """Factor of the relative depth error at the points that were triangulated from the photo."""
+    normals: float = 0.0
+    """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
+    Counts from 7/30 of the run on; smoother meshes."""
+
+    def __post_init__(self) -> None:
+        check_range("dssim", self.dssim, 0.0, 1.0)
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals"):
+            check_range(name, getattr(self, name), 0.0)
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates; pairs decay log-linearly over the run."""
+
+    means: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """First and last learning rate of the centres, times the scene scale."""
+    quats: float = 1e-3
+    """Learning rate of the raw quaternions."""
+    scales: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
+    opacities: float = 0.025
+    """Learning rate of the logits of the opacities."""
+    gammas: float = 1e-3
+    """Learning rate of the logarithms of gamma - 1."""
+    sh0: float = 2.5e-3
+    """Learning rate of the plain colours' constant SH coefficients."""
+    shN: float = 1.25e-4
+    """Learning rate of the plain colours' other SH coefficients."""
+    grid: tuple[float, float] = (1e-3, 1e-5)
+    """First and last learning rate of the hash grid."""
+    mlp: tuple[float, float] = (1e-3, 1e-3)
+    """First and last learning rate of the MLP."""
+
+    def __post_init__(self) -> None:
+        for rate in dataclasses.fields(self):
+            value = getattr(self, rate.name)
+            ends = value if isinstance(value, tuple) else (value, value)
+            if not (min(ends) > 0 or ends == (0.0, 0.0)):
+                raise ValueError(f"{rate.name}: expected rates > 0, or 0 throughout, got {value}")
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Shape of the neural texture (paper Sec. 5)."""
+
+    levels: int = 8
+    """L, number of resolution levels."""
+    table_size: int | None = None
+    """T, entries per level, a power of two; None derives it from the number of pixels of the training photos."""
+    features: int = 4
+    """F, features per entry."""
+    min_resolution: float | None = None
+    """Resolution of the coarsest level, cells per world unit; None derives it from the scene scale."""
+    max_resolution: float | None = None
+    """Resolution of the finest level, cells per world unit; None makes its cells as large as the training pixels are at
+    the points that they see."""
+    width: int = 64
+    """Width of the hidden layers of the MLP."""
+    hidden_layers: int = 2
+    """Number of hidden layers of the MLP."""
+    sh_degree: int | None = None
+    """SH degree of the texture's colours, 0 to 3; None takes that of the run."""
+    residual: bool = True
+    """Add the texture's colours to the plain ones instead of replacing them."""
+    down_weighting: bool = True
+    """Fade levels whose cells are smaller than a pixel (paper Eq. 4)."""
+
+    def __post_init__(self) -> None:
+        entries = 1 if self.table_size is None else self.table_size
+        degree = 0 if self.sh_degree is None else self.sh_degree
+        check_sizes(self.levels, entries, self.features, self.width, self.hidden_layers, degree)
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When and how surfels are split and pruned; iterations are those of a run of 30,000."""
+
+    start: int = 500
+    """Iteration of the first round (exclusive)."""
+    stop: int = 25_000
+    """Iteration of the last round (exclusive)."""
+    every: int = 100
+    """Iterations between rounds."""
+    fraction: float = 0.05
+    """Fraction of the surfels that a round splits, within the budget."""
+    prune_opacity: float = 0.005
+    """Surfels with less opacity than this are removed."""
+    prune_at_cap: bool = True
+    """Prune also once the budget is used up, and split others in their place (the authors' code does neither)."""
+    relocate: float = 0.1
+    """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
+    that contribute least to the training views. Others are split in their place. 0 removes none."""
+
+    def __post_init__(self) -> None:
+        check_range("every", self.every, 1)
+        check_range("fraction", self.fraction, 0.0, 1.0)
+        check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
+        check_range("relocate", self.relocate, 0.0, 0.5)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a training goes about it: what few people change."""
+
+    more_hits_from: int = 25_000
+    """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
+    with K = 2 has fewer floaters."""
+    sh_every: int = 1000
+    """Iterations, of a run of 30,000, after which the SH degree rises by one."""
+    depth_jitter: float = 1.0
+    """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
+    evaluates the texture."""
+    filter_points: bool = True
+    """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
+    orient_points: bool = True
+    """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
+    skybox: int = 100
+    """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
+    behind a table. Initial surfels start on those around which photos show no point of the cloud. They are at most a
+    sixth of the initial surfels. Where photos are transparent there are none."""
+    losses: LossWeights = field(default_factory=LossWeights)
+    """Factors of the loss terms."""
+    rates: LearningRates = field(default_factory=LearningRates)
+    """Learning rates."""
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    """Shape of the texture."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    """Density control."""
+
+    def __post_init__(self) -> None:
+        check_range("more_hits_from", self.more_hits_from, 0)
+        check_range("sh_every", self.sh_every, 1)
+        check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
+        check_range("skybox", self.skybox, 0)
+
+
+@dataclass(frozen=True)
+class Config(Recipe):
+    """All settings of a training run; run and scene together determine the result."""
+
+    preset: str = "default"
+    """Name of the preset from which the settings started."""
+    iterations: int = REFERENCE_ITERATIONS
+    """Number of training steps; each renders one view. All schedules stretch with this number."""
+    max_surfels: int = 400_000
+    """P, the largest number of surfels. At most half as many start from the point cloud."""
+    max_hits: int = 2
+    """K, the number of ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
+    sh_degree: int = 3
+    """SH degree of the surfels' colours, 0 to 3, and of the texture's. Training starts at degree 0."""
+    background: tuple[float, float, float] | None = None
+    """Background colour; None takes that of the scene, or the mean colour of the training photos."""
+    mask_mode: str = "ignore"
+    """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
+    background."""
+    exposures: bool = True
+    """Estimate each photo's exposure and white balance, as gains of red, green and blue, and the vignetting of the lens
+    before training, and train at the mean exposure. Rendered views get gains that are predicted from nearby photos.
+    Each is left out where the photos do not show it."""
+    footprints: bool = True
+    """Detail limits: in views from closer or farther away than the training views, limit the texture's detail to what
+    the training views resolved; in views from farther away, also anti-alias the surfels."""
+    smooth_sh: float = 0.01
+    """Strength of SH smoothing, a ridge regression after training that makes a surfel's colour smooth in directions
+    that no training view has. A larger strength changes the colours in the training views more; 0 keeps the SH as
+    trained."""
+    refine_poses: bool = False
+    """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
+    `nexwarp eval --refine-poses` fits them, too."""
+    teachers: int | None = None
+    """Number of teachers: models of other seeds that are trained first, in two fifths of the iterations, and from whose
+    renderings the run then learns, too, for captures of few photos (docs/sparse.md). Each has four times `max_surfels`
+    but at most 40,000, and never fewer than `max_surfels`. None is 2 where there are at most 44 training photos, at
+    least 300 surfels of `max_surfels` for each of them and at least 30,000 iterations, and where poses stay as given;
+    otherwise 0."""
+    order: str = "depth"
+    """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
+    `distance` by their distance from the camera, for scenes that are shown as panoramas."""
+    seed: int = 0
+    """Random seed."""
+    deterministic: bool = False
+    """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
+    cuda_graphs: bool = True
+    """On CUDA, repeat steps as CUDA graphs instead of launching each kernel: the same arithmetic, more memory."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range("iterations", self.iterations, 1)
+        check_range("max_surfels", self.max_surfels, MIN_SURFELS)
+        check_range("max_hits", self.max_hits, 0, MAX_HITS)
+        check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
+        check_range("seed", self.seed, 0, 2**32 - 1)
+        if self.smooth_sh != 0.0:
+            check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
+        for value in self.background or ():
+            check_range("background", value, 0.0, 1.0)
+        check_order(self.order)
+        if self.teachers is not None:
+            check_range("teachers", self.teachers, 0, MOST_TEACHERS)
+        if self.teachers and self.refine_poses:
+            raise ValueError(f"teachers: expected 0 or null where poses are learned, got {self.teachers}")
+        if self.mask_mode not in MASK_MODES:
+            raise ValueError(f"mask_mode: expected one of {', '.join(MASK_MODES)}, got {self.mask_mode!r}")
+
+    def scaled(self, iteration: float) -> int:
+        """Iteration of this run that stands for one of a run of 30,000."""
+        return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
+
+    @property
+    def texture_sh_degree(self) -> int:
+        """SH degree of the texture's colours."""
+        own = self.texture.sh_degree
+        return min(self.sh_degree, MAX_TEXTURE_SH_DEGREE) if own is None else own
+
+    @property
+    def settled(self) -> int:
+        """First iteration of this run in which a pixel textures more than 2 hits, where K is more."""
+        return math.ceil(self.more_hits_from * self.iterations / REFERENCE_ITERATIONS)
+
+    def hits_at(self, iteration: int) -> int:
+        """K at an iteration of this run: `max_hits`, but at most 2 while surfels settle."""
+        return self.max_hits if iteration >= self.settled else min(self.max_hits, 2)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+# What a person chooses; `Recipe` has the rest.
+USER_SETTINGS = (*Config.__annotations__, "losses.depth", "losses.normals", "texture.table_size")
+
+DEFAULT = Config()
+
+# A texture that weak GPUs evaluate in real time: a third of the arithmetic.
+WEB = Config(preset="web", texture=TextureConfig(width=32, hidden_layers=1, sh_degree=1))
+
+# The publication's; what it does not have is off.
+PAPER = Config(
+    preset="paper",
+    more_hits_from=0,
+    background=(0.0, 0.0, 0.0),
+    depth_jitter=0.0,
+    footprints=False,
+    smooth_sh=0.0,
+    exposures=False,
+    filter_points=False,
+    orient_points=False,
+    skybox=0,
+    teachers=0,
+    texture=TextureConfig(
+        levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
+    ),
+    losses=LossWeights(depth=0.0),
+    densify=DensifyConfig(prune_at_cap=False, relocate=0.0),
+)
+
+# What the demo changes in any preset: it is small enough for two CPU cores, a short run, so its steps are larger.
+DEMO_SETTINGS: dict[str, object] = {
+    "iterations": 1200,
+    "max_surfels": 3000,
+    "depth_jitter": 0.5,
+    "texture.levels": 12,
+    "texture.table_size": 2**15,
+    "texture.features": 2,
+    "texture.width": 32,
+    "rates.means": (5e-4, 5e-6),
+    "rates.quats": 5e-3,
+    "rates.scales": 2.5e-2,
+    "rates.opacities": 0.05,
+    "rates.gammas": 5e-3,
+    "rates.sh0": 1.25e-2,
+    "rates.shN": 6e-4,
+    "rates.grid": (2e-2, 2e-4),
+    "rates.mlp": (3e-3, 3e-4),
+}
+
+PRESETS = {config.preset: config for config in (DEFAULT, WEB, PAPER)}
+
+
+def preset(name: str) -> Config:
+    """Return a preset; ValueError lists the known ones."""
+    if name not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(sorted(PRESETS))}, got {name!r}")
+    return PRESETS[name]
