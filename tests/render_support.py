@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 import nexwarp as nw
+from nexwarp.model.render import draw as draw_parts
 from tests.narrowing import present
 from tests.reference import render as reference
 from tests.scenes import Scene, make_camera, make_surfels
@@ -16,9 +17,14 @@ BACKGROUND = (0.1, 0.4, 0.7)
 MAX_HITS = 8
 
 
-def draw(scene: Scene, texture: nw.NeuralTexture | None = None, **options: Any) -> Any:
+def draw(
+    scene: Scene, texture: nw.NeuralTexture | None = None, *, jitter: torch.Tensor | None = None, **options: Any
+) -> Any:
     """Render `scene` over the test background."""
-    return nw.render(make_surfels(scene), texture, make_camera(scene), **({"background": BACKGROUND} | options))
+    surfels, camera, options = make_surfels(scene), make_camera(scene), {"background": BACKGROUND} | options
+    if jitter is None:
+        return nw.render(surfels, texture, camera, **options)
+    return draw_parts(surfels, texture, camera, nw.RenderOptions(**options), jitter=jitter)
 
 
 def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:

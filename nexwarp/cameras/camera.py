@@ -1,5 +1,6 @@
 """Pinhole cameras, with OpenCV axes as in COLMAP: x right, y down, z forward."""
 
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Any
 
@@ -126,44 +127,49 @@ class StagedCamera(Camera):
     """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
 
     Attributes:
-        focals: (2,) `Camera.focal` and `Camera.pixel_focal` of the camera that was copied last, on the device of
-            `viewmat`; `fx` to `cy` are those of the first one.
+        numbers: (30,) viewmat, K, `Camera.focal`, `Camera.pixel_focal` and a background colour of what was copied last:
+            one tensor, so that one copy brings them all. `fx` to `cy` are those of the first camera.
         falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
     """
 
-    focals: torch.Tensor = field(kw_only=True)
+    numbers: torch.Tensor = field(kw_only=True)
     falloff: torch.Tensor | None = field(default=None, kw_only=True)
 
     @classmethod
-    def of(cls, camera: Camera) -> "StagedCamera":
-        """Copy a camera into tensors of its own."""
-        return cls(
-            camera.viewmat.clone(),
-            camera.K.clone(),
-            camera.width,
-            camera.height,
-            camera.near,
-            checked=(camera.fx, camera.fy, camera.cx, camera.cy),
-            focals=camera.viewmat.new_tensor([camera.focal, camera.pixel_focal]),
-        )
+    def like(cls, camera: Camera, device: torch.device, falloff: torch.Tensor | None = None) -> "StagedCamera":
+        """Return a camera of the same size, near depth and dtype, with zeros for numbers until `copy_`."""
+        numbers = torch.zeros(30, dtype=camera.viewmat.dtype, device=device)
+        matrices = (numbers[:16].view(4, 4), numbers[16:25].view(3, 3))
+        checked = (camera.fx, camera.fy, camera.cx, camera.cy)
+        width, height, near = camera.width, camera.height, camera.near
+        return cls(*matrices, width, height, near, checked=checked, numbers=numbers, falloff=falloff)
 
     @property
     def focal(self) -> torch.Tensor:  # type: ignore[override]  # a graph reads the number from the device
         """(1,) focal length in pixels, on the device."""
-        return self.focals[:1]
+        return self.numbers[25:26]
 
     @property
     def pixel_focal(self) -> torch.Tensor:  # type: ignore[override]
         """(1,) focal length of the image's pixels, on the device."""
-        return self.focals[1:]
+        return self.numbers[26:27]
 
-    def copy_(self, camera: Camera) -> None:
-        """Overwrite the tensors but the falloff with those of another camera of the same size and near depth."""
-        self.viewmat.copy_(camera.viewmat)
-        self.K.copy_(camera.K)
-        # From pageable memory, which is read before the call returns.
-        focals = torch.tensor([camera.focal, camera.pixel_focal], dtype=torch.float64)
-        self.focals.copy_(focals.to(self.focals.dtype), non_blocking=True)
+    @property
+    def color(self) -> torch.Tensor:
+        """(3,) background colour, on the device."""
+        return self.numbers[27:]
+
+    def copy_(self, camera: Camera, color: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Overwrite all but the falloff with another camera of the same size and near depth, and a background."""
+        dtype = self.numbers.dtype
+        # From pageable memory, which is read before the copy returns.
+        scalars = torch.tensor([camera.focal, camera.pixel_focal, *color], dtype=dtype)
+        matrices = [camera.viewmat.detach().reshape(-1), camera.K.detach().to(dtype).reshape(-1)]
+        if camera.device.type == "cpu":
+            self.numbers.copy_(torch.cat([*matrices, scalars]), non_blocking=True)
+        else:
+            torch.cat(matrices, out=self.numbers[:25])
+            self.numbers[25:].copy_(scalars, non_blocking=True)
 
 
 def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.Tensor:

@@ -67,6 +67,11 @@ class RayCamera:
         return self.rays.shape[0]
 
     @property
+    def pixel_focal(self) -> float:
+        """`focal`: what `Camera.pixel_focal` is for rays."""
+        return self.focal
+
+    @property
     def device(self) -> torch.device:
         """Device of `viewmat`."""
         return self.viewmat.device

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from nexwarp.cameras.camera import Camera, StagedCamera
+from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import check_tensors
 from nexwarp.machine import one_thread
 
@@ -138,7 +139,7 @@ class Exposures(nn.Module):
         return dict(self.named_buffers())
 
     @torch.no_grad()
-    def gains(self, camera: Camera) -> torch.Tensor:
+    def gains(self, camera: Camera | RayCamera) -> torch.Tensor:
         """Return a camera's gains (3,), within the range of the photos' gains; far from all photos, their mean."""
         position, direction = poses_of(camera.viewmat.to(self.positions))
         turned = self.lengths[0] * (self.directions - direction)
@@ -147,23 +148,24 @@ class Exposures(nn.Module):
         return log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()
 
     @torch.no_grad()
-    def factors(self, camera: Camera) -> torch.Tensor:
+    def factors(self, camera: Camera | RayCamera) -> torch.Tensor:
         """Return gains times falloff of a camera, (H, W, 3), or (3,) for a lens without vignetting."""
         gains, light = self.gains(camera), self.falloff_of(camera)
         return gains if light is None else light * gains
 
     @torch.inference_mode(False)  # a later training may use what is cached
     @torch.no_grad()
-    def falloff_of(self, camera: Camera) -> torch.Tensor | None:
-        """Return the fraction of light that the lens transmits to each pixel; None for a lens without vignetting.
+    def falloff_of(self, camera: Camera | RayCamera) -> torch.Tensor | None:
+        """Return the fraction of light that the lens transmits to each pixel.
 
         Returns:
-            (H, W, 1), cached: callers must not write to it.
+            (H, W, 1), cached: callers must not write to it. None for a lens without vignetting, and for a `RayCamera`,
+            whose lens is not that of the photos.
         """
         if isinstance(camera, StagedCamera):
             return camera.falloff
         a, b, largest = self._lens
-        if a == b == 0:
+        if a == b == 0 or isinstance(camera, RayCamera):
             return None
         device = self.falloff.device
         key = (device, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)

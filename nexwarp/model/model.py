@@ -11,16 +11,12 @@ from typing_extensions import Unpack
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
-from nexwarp.errors import OutOfMemoryError
 from nexwarp.io.json_files import Json
-from nexwarp.model import frames
-from nexwarp.model.background import Color, color_tensor
+from nexwarp.model import graphs
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
-from nexwarp.model.frame_request import FrameRequest, Parts
-from nexwarp.model.options import RenderChanges, RenderOptions
-from nexwarp.model.render import Rendering, render
-from nexwarp.model.render_rays import RayRendering, render_rays
+from nexwarp.model.options import Color, RenderChanges, RenderOptions
+from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 
@@ -105,29 +101,12 @@ class Model(nn.Module):
 
     @overload
     def render(
-        self,
-        camera: Camera,
-        *,
-        background: Color | None = ...,
-        depth_jitter: float | torch.Tensor = ...,
-        generator: torch.Generator | None = ...,
-        **changes: Unpack[RenderChanges],
+        self, camera: Camera | RayCamera, *, background: Color | None = ..., **changes: Unpack[RenderChanges]
     ) -> Rendering: ...
 
     @overload
     def render(
-        self, camera: RayCamera, *, background: Color | None = ..., **changes: Unpack[RenderChanges]
-    ) -> RayRendering: ...
-
-    @overload
-    def render(
-        self,
-        camera: Sequence[Camera],
-        *,
-        background: Color | None = ...,
-        depth_jitter: float | torch.Tensor = ...,
-        generator: torch.Generator | None = ...,
-        **changes: Unpack[RenderChanges],
+        self, camera: Sequence[Camera], *, background: Color | None = ..., **changes: Unpack[RenderChanges]
     ) -> list[Rendering]: ...
 
     def render(
@@ -135,18 +114,14 @@ class Model(nn.Module):
         camera: Camera | RayCamera | Sequence[Camera],
         *,
         background: Color | None = None,
-        depth_jitter: float | torch.Tensor = 0.0,
-        generator: torch.Generator | None = None,
         **changes: Unpack[RenderChanges],
-    ) -> Rendering | RayRendering | list[Rendering]:
+    ) -> Rendering | list[Rendering]:
         """Render the scene as `nexwarp render` does, with exposures and detail limits. Differentiable.
 
         Args:
             camera: one camera, or several, which may differ in size. Cameras are moved to the model's device. What a
                 `RayCamera` renders is not differentiable.
-            background: see `nexwarp.model.render`; None takes that of the options.
-            depth_jitter: see `nexwarp.model.render`; for training.
-            generator: random generator of the jitter.
+            background: see `nexwarp.render`; None takes that of the options.
             changes: fields of `RenderOptions` to change for this rendering, such as `exposure="mean"`.
 
         Returns:
@@ -155,18 +130,13 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
-        jitter = (depth_jitter, generator)
         if isinstance(camera, Sequence) and not isinstance(camera, str):
-            return [
-                self.render(item, background=background, depth_jitter=depth_jitter, generator=generator, **changes)
-                for item in camera
-            ]
-        options = self.options.changed(**changes) if changes else self.options
-        if isinstance(camera, RayCamera):
-            return self._render_rays(camera, options, background)
-        if not isinstance(camera, Camera):
+            return [self.render(item, background=background, **changes) for item in camera]
+        if not isinstance(camera, (Camera, RayCamera)):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
-        return self._render(camera, options.background if background is None else background, options, jitter)
+        frame = self._frame(camera, background, changes)
+        rendering = graphs.replayed(frame)
+        return graphs.launched(frame) if rendering is None else rendering
 
     def render_image(
         self, camera: Camera, *, background: Color | None = None, **changes: Unpack[RenderChanges]
@@ -186,84 +156,15 @@ class Model(nn.Module):
         """
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
-        options = self.options.changed(**changes) if changes else self.options
         with torch.no_grad():
-            request = self._request(
-                camera, options.background if background is None else background, options, (0.0, None)
-            )
-            image = frames.render_image_by_graph(request)
-            return self._launch(request).image if image is None else image
+            frame = self._frame(camera, background, changes)
+            image = graphs.replayed_image(frame)
+            return graphs.launched(frame).image if image is None else image
 
-    def _render(
-        self,
-        camera: Camera,
-        background: Color,
-        options: RenderOptions,
-        jitter: tuple[float | torch.Tensor, torch.Generator | None],
-    ) -> Rendering:
-        """Render one camera, by a CUDA graph where that is possible."""
-        request = self._request(camera, background, options, jitter)
-        if not isinstance(jitter[0], torch.Tensor) and jitter[0] == 0:
-            rendering = frames.render_by_graph(request)
-            if rendering is not None:
-                return rendering
-        return self._launch(request)
-
-    def _request(
-        self,
-        camera: Camera,
-        background: Color,
-        options: RenderOptions,
-        jitter: tuple[float | torch.Tensor, torch.Generator | None],
-    ) -> FrameRequest:
-        parts = Parts(
-            self.surfels,
-            self.texture if options.max_hits else None,
-            self.exposures if options.exposure == "photos" else None,
-            self.detail_limits if options.detail_limits else None,
-        )
-
-        def work(camera: Camera, background: Color) -> Rendering:
-            return render(
-                parts.surfels,
-                parts.texture,
-                camera,
-                options.max_hits,
-                background,
-                options.sh_degree,
-                options.low_pass,
-                options.clamp_texture,
-                *jitter,
-                exposures=parts.exposures,
-                detail_limits=parts.detail_limits,
-                order=options.order,
-            )
-
-        return FrameRequest(work, parts, options, camera, background)
-
-    def _launch(self, request: FrameRequest) -> Rendering:
-        """Render kernel by kernel; where memory does not suffice, again without any graphs."""
-        camera = request.camera
-        camera = camera if camera.device == self.device else camera.to(self.device)
-        try:
-            return request.work(camera, request.background)
-        except OutOfMemoryError:
-            # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
-            if frames.capturing(self.device) or not frames.release_graphs():
-                raise
-        # Outside of the handler: the error's traceback would keep alive what has been allocated.
-        return request.work(camera, request.background)
-
-    def _render_rays(self, camera: RayCamera, options: RenderOptions, background: Color | None) -> RayRendering:
-        return render_rays(
-            self.surfels,
-            self.texture if options.max_hits else None,
-            camera.to(self.device),
-            options,
-            color_tensor(options.background if background is None else background, self.surfels.means),
-            self.exposures if options.exposure == "photos" else None,
-            self.detail_limits if options.detail_limits else None,
-        )
+    def _frame(self, camera: Camera | RayCamera, background: Color | None, changes: RenderChanges) -> graphs.Frame:
+        options = self.options.changed(**changes)
+        texture = self.texture if options.max_hits else None
+        return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, background)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.

@@ -22,7 +22,7 @@ from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.exposures import BUFFERS, Exposures
 from nexwarp.model.merged_texture import MergedTexture, make_texture
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
+from nexwarp.model.options import RenderOptions, check_removed
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, TextureShape
 
@@ -75,6 +75,7 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     meta = {
         **model.meta,
         **dataclasses.asdict(model.options),
+        "low_pass": False,  # which older versions expect
         "format_version": COMPACT_VERSION if compact else FORMAT_VERSION,
         "frame": FRAME,
         "texture": None if model.texture is None else model.texture.config,
@@ -273,6 +274,7 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
     missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
     if missing:
         raise ValueError(f"metadata: expected {missing[0]}, found none")
+    check_removed(meta)
     values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
     if isinstance(color := values["background"], list):
         values["background"] = tuple(color)

@@ -1,18 +1,21 @@
-"""Options of a model's rendering."""
+"""Options of a model's rendering, and the colour behind everything."""
 
 import dataclasses
 import numbers
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypedDict, get_args
+from typing import Any, Literal, TypedDict, cast, get_args
 
+import torch
 from typing_extensions import Unpack
 
-from nexwarp.errors import check_range
+from nexwarp.errors import check_finite, check_range
 from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.ops.tiles import Order, check_order
 
 Exposure = Literal["photos", "mean"]
+Color = float | Sequence[float] | torch.Tensor
 LARGEST_COLOR = 1e6
 
 
@@ -21,7 +24,6 @@ class RenderChanges(TypedDict, total=False):
 
     max_hits: int
     sh_degree: int
-    low_pass: bool
     clamp_texture: bool
     exposure: Exposure
     detail_limits: bool
@@ -35,8 +37,7 @@ class RenderOptions:
     Attributes:
         max_hits: K, number of hits textured in each pixel, 0 to 8.
         background: sRGB colour behind the surfels, weighted by the final transmittance.
-        sh_degree: largest SH degree of the plain colours, 0 to 6, and of the textured ones, which have 3 at most.
-        low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
+        sh_degree: largest SH degree of the colours, 0 to 3.
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
         exposure: "photos" predicts the gains from the training photos near the camera, and applies the falloff of their
             lens; "mean" renders every camera at the photos' mean exposure.
@@ -52,7 +53,6 @@ class RenderOptions:
     max_hits: int = 2
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
-    low_pass: bool = False
     clamp_texture: bool = False
     exposure: Exposure = "photos"
     detail_limits: bool = True
@@ -64,17 +64,15 @@ class RenderOptions:
             if isinstance(value, bool) or not isinstance(value, int):
                 raise TypeError(f"{name}: expected an int, got {value!r:.60}")
             check_range(name, value, 0, high)
-        for name in ("low_pass", "clamp_texture", "detail_limits"):
+        for name in ("clamp_texture", "detail_limits"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name}: expected True or False, got {getattr(self, name)!r:.60}")
         if self.exposure not in get_args(Exposure):
             raise ValueError(f"exposure: expected {' or '.join(get_args(Exposure))}, got {self.exposure!r:.60}")
         check_order(self.order)
-        if not isinstance(self.background, tuple) or len(self.background) != 3:
+        if not isinstance(self.background, tuple):
             raise ValueError(f"background: expected three numbers, got {self.background!r:.60}")
-        for value in self.background:
-            if isinstance(value, bool) or not isinstance(value, numbers.Real):
-                raise TypeError(f"background: expected three numbers, got {self.background!r:.60}")
+        for value in color_numbers(self.background):
             check_range("background", value, -LARGEST_COLOR, LARGEST_COLOR)
 
     def changed(self, **changes: Unpack["RenderChanges"]) -> "RenderOptions":
@@ -83,4 +81,42 @@ class RenderOptions:
         for name in changes:
             if name not in known:
                 raise TypeError(f"{one_line(name, 60)}: expected one of the options {', '.join(known)}")
-        return dataclasses.replace(self, **changes)
+        return dataclasses.replace(self, **changes) if changes else self
+
+
+def check_removed(values: dict[str, Any]) -> None:
+    """Take options that went after 7f7bd6c out of a file's values; raise ValueError where one was used."""
+    if values.pop("low_pass", False) is not False:
+        raise ValueError("low_pass: expected false: the screen-space low-pass was removed after 7f7bd6c")
+    degree = values.get("sh_degree")
+    if isinstance(degree, int) and MAX_SH_DEGREE < degree <= 6:
+        raise ValueError(f"sh_degree: expected at most 3, got {degree}: higher degrees were removed after 7f7bd6c")
+
+
+def color_tensor(background: Color, like: torch.Tensor) -> torch.Tensor:
+    """Return the background as a (3,) tensor; a tensor keeps its graph."""
+    if isinstance(background, torch.Tensor):
+        if background.device.type == "cpu":
+            check_finite("background", background.detach())
+        return background.expand(3) if background.ndim == 0 else background
+    values = color_numbers(background)
+    for value in values:
+        if not abs(value) <= torch.finfo(like.dtype).max:
+            raise ValueError(f"background: expected finite values, got {value}")
+    return torch.stack([like.new_full((), value) for value in values])
+
+
+def color_numbers(background: float | Sequence[float]) -> list[float]:
+    """Return a background that is no tensor as three numbers; raise TypeError or ValueError where it is none."""
+    values: Sequence[object]
+    if isinstance(background, numbers.Real):
+        values = [background] * 3
+    elif isinstance(background, Iterable) and not isinstance(background, str):
+        values = list(background)
+    else:
+        raise TypeError(f"background: expected numbers or a tensor, got {type(background).__name__}")
+    if len(values) != 3:
+        raise ValueError(f"background: expected 3 values, got {len(values)}")
+    if not all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in values):
+        raise TypeError(f"background: expected three numbers or a tensor, got {values}")
+    return cast(list[float], values)

@@ -1,6 +1,5 @@
-"""Rendering: (antialias ->) project -> tiles -> collect -> texture -> compose (paper Sec. 4.2)."""
+"""From model parts to pixels: antialias, project, tiles, collect, texture, compose (paper Sec. 4.2)."""
 
-import numbers
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -8,44 +7,54 @@ import torch
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.errors import OutOfMemoryError, check_range, check_tensors
-from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
+from nexwarp.cameras.ray_camera import RayCamera
+from nexwarp.errors import OutOfMemoryError, check_tensors
 from nexwarp.machine import keep_freed_memory, needed_memory
-from nexwarp.model.background import Color, color_tensor
 from nexwarp.model.detail_limits import DetailLimits, limited_depths
 from nexwarp.model.exposures import Exposures
+from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.ops.tiles import Order, check_order
+from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records, reaches_of
+from nexwarp.ops.tiles import Order
 
 MAX_JITTER = 1000.0  # pixels
+FAR_AWAY = 1e4  # parallel rays see plain colours from this many times the scene's extent
 
 
 @dataclass(frozen=True)
-class Intermediates:
-    """Results of the stages of a rendering, from which `Rendering` computes further buffers on request.
+class RayIntermediates:
+    """Results of the stages for any camera, from which `Rendering` computes further buffers on request.
 
     Attributes:
         projection: projected surfels.
-        tiles: depth-sorted lists of the surfels in each tile.
         hits: result of the collection pass.
-        pinhole: intrinsics of the image.
-        viewmat: (4, 4) world to camera.
-        low_pass: argument of `render`.
         texels: (H, W, K, 3) textured colours of the hits; None without a texture.
         residual: whether the texture's colours are added to the plain colours.
         factors: (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure.
     """
 
     projection: ops.Projection
-    tiles: ops.Tiles
-    hits: ops.Hits
-    pinhole: ops.Pinhole
-    viewmat: torch.Tensor
-    low_pass: bool
+    hits: ops.Hits | RayHits
     texels: torch.Tensor | None
     residual: bool
     factors: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class Intermediates(RayIntermediates):
+    """Results of the stages for a pinhole camera.
+
+    Attributes:
+        tiles: depth-sorted lists of the surfels in each tile.
+        pinhole: intrinsics of the image.
+        viewmat: (4, 4) world to camera.
+    """
+
+    hits: ops.Hits
+    tiles: ops.Tiles
+    pinhole: ops.Pinhole
+    viewmat: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -53,9 +62,8 @@ class Rendering:
     """The buffers of one rendering.
 
     All fields but `ids` are differentiable. `expected_depth`, `median_depth`, `top_depth`, `normals`,
-    `blended_normals`, `distortion` and `colors` are computed on first access, without a second rendering, and are
-    differentiable, too. The gradient of `median_depth` and `top_depth` is that of the depth of the hit that they are
-    taken from.
+    `blended_normals` and `colors` are computed on first access, without a second rendering, and are differentiable,
+    too. The gradient of `median_depth` and `top_depth` is that of the depth of the hit that they are taken from.
 
     Attributes:
         image: (H, W, 3) plain + textured + (1 - alpha) background (paper Eq. 7, with a background); not clamped.
@@ -101,12 +109,7 @@ class Rendering:
     @property
     def blended_normals(self) -> torch.Tensor:
         """(H, W, 3) sum over all hits of weight * unit normal, on the side that faces the camera; world frame."""
-        return self._surface.blended_normals
-
-    @property
-    def distortion(self) -> torch.Tensor:
-        """(H, W) depth distortion of 2DGS: sum over pairs of hits of w_i w_j |z_i - z_j|; see `kernels.surface`."""
-        return self._surface.distortion
+        return self._differentiable_surface.blended_normals
 
     @cached_property
     def colors(self) -> torch.Tensor:
@@ -119,13 +122,16 @@ class Rendering:
             colors = colors * (stages.factors if stages.factors.ndim == 1 else stages.factors[:, :, None])
         return colors.masked_fill(empty, 0.0)
 
+    @property
+    def _surface(self) -> ops.Surface:
+        return self._differentiable_surface
+
     @cached_property
-    def _surface(self) -> ops.DifferentiableSurface:
+    def _differentiable_surface(self) -> ops.DifferentiableSurface:
         stages = self.intermediates
-        given = (stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat)
         # It is kept for later uses, so that its gradients must not depend on where the first one is.
         with torch.set_grad_enabled(stages.projection.records.requires_grad):
-            return ops.surface(*given, low_pass=stages.low_pass)
+            return ops.surface(stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat)
 
     def request_splat_error(self, errors: torch.Tensor) -> ops.SplatErrorRequest:
         """Request `splat_error(errors)` from the backward pass, which computes it at almost no cost.
@@ -144,9 +150,23 @@ class Rendering:
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
         """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W). Not differentiable."""
         stages = self.intermediates
-        return ops.splat_error(
-            stages.projection, stages.tiles, stages.hits, stages.pinhole, errors, low_pass=stages.low_pass
-        )
+        return ops.splat_error(stages.projection, stages.tiles, stages.hits, stages.pinhole, errors)
+
+
+@dataclass(frozen=True)
+class RayRendering(Rendering):
+    """The buffers of a rendering by a `RayCamera`; not differentiable, and without `blended_normals`.
+
+    Depths are in units of the pixels' rays: distances for panoramas and fisheye lenses, else z-depths; world units.
+    `alpha` is 0 where a pixel has no ray.
+    """
+
+    intermediates: RayIntermediates  # type: ignore[assignment]  # without those of an image plane
+
+    @property
+    def _surface(self) -> ops.Surface:
+        assert isinstance(self.intermediates.hits, RayHits)
+        return self.intermediates.hits.surface
 
 
 def render(
@@ -156,13 +176,7 @@ def render(
     max_hits: int = 2,
     background: Color = (0.0, 0.0, 0.0),
     sh_degree: int = 3,
-    low_pass: bool = False,
     clamp_texture: bool = False,
-    depth_jitter: float | torch.Tensor = 0.0,
-    generator: torch.Generator | None = None,
-    *,
-    exposures: Exposures | None = None,
-    detail_limits: DetailLimits | None = None,
     order: Order = "depth",
 ) -> Rendering:
     """Render surfels from a camera (paper Sec. 4.2). `Model.render` renders a trained scene.
@@ -177,14 +191,8 @@ def render(
         max_hits: K, number of hits textured in each pixel, 0 to 8.
         background: a number, three numbers or a (3,) tensor, weighted by the final transmittance. The values of a CUDA
             tensor are not checked, which would wait for the GPU.
-        sh_degree: largest SH degree of the plain colours, 0 to 6, and of the textured ones, which have 3 at most.
-        low_pass: give surfels smaller than a pixel a screen-space Gaussian (the low-pass filter of 2DGS).
+        sh_degree: largest SH degree of the colours, 0 to 3.
         clamp_texture: clamp textured colours to >= 0; not for residual textures.
-        depth_jitter: for training, random shifts of the texture's points along their rays. A number is their standard
-            deviation in pixels at the hit's depth; a tensor (H, W, K) holds the factors of `jitter_factors`.
-        generator: random generator of the jitter, on the surfels' device; None is torch's default.
-        exposures: multiply the image by the camera's gains and lens falloff; None is the mean exposure.
-        detail_limits: detail limits of the N surfels; None limits nothing.
         order: blend surfels by their centres' z-depth, as the paper, or by their distance, which turning the camera
             does not change.
 
@@ -192,75 +200,217 @@ def render(
         TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
         OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
-    _check_types(surfels, texture, camera, max_hits, sh_degree, low_pass, clamp_texture, depth_jitter)
-    check_order(order)
+    if not isinstance(surfels, Surfels):
+        raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
+    if texture is not None and not isinstance(texture, NeuralTexture):
+        raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
+    options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)
+    return draw(surfels, texture, camera, options, background=color_tensor(background, surfels.means))
+
+
+def draw(
+    surfels: Surfels,
+    texture: NeuralTexture | None,
+    camera: Camera | RayCamera,
+    options: RenderOptions,
+    *,
+    background: Color | None = None,
+    exposures: Exposures | None = None,
+    limits: DetailLimits | None = None,
+    jitter: torch.Tensor | None = None,
+) -> Rendering:
+    """Draw surfels from a camera: the one path from the parts of a model to pixels.
+
+    Differentiable as `render`; a `RayCamera` is not.
+
+    Args:
+        surfels: the N surfels.
+        texture: the neural texture; None leaves all hits their plain colours.
+        camera: on the surfels' device.
+        options: of the rendering. Their order does not change that of panoramas and fisheye lenses, which is by
+            distance, or of parallel rays, which is by z-depth.
+        background: colour behind the surfels, as `render` takes it; None is that of the options.
+        exposures: multiply the image by the camera's gains and lens falloff, if the options say "photos". A `RayCamera`
+            has the gains only.
+        limits: detail limits of the N surfels, if the options take them.
+        jitter: (H, W, K) factors on the depths at which the texture is evaluated, see `jitter_factors`; for training.
+
+    Raises:
+        TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
+        OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
+    """
+    exposures = exposures if options.exposure == "photos" else None
+    limits = limits if options.detail_limits and len(surfels) else None
+    color = color_tensor(options.background if background is None else background, surfels.means)
+    differentiable = torch.is_grad_enabled() and isinstance(camera, Camera)
     try:
-        background = color_tensor(background, surfels.means)
-        _check_tensors(surfels, texture, camera, max_hits, background, depth_jitter, detail_limits)
-        values = (0, surfels.means.dtype) if texture is None else texture.stored_per_point(sh_degree)
-        ops.check_image(camera.width, camera.height, max_hits, surfels.means.dtype, surfels.device, texture=values)
-        options = (max_hits, background, sh_degree, low_pass, clamp_texture, depth_jitter, generator)
-        with torch.autocast(surfels.device.type, enabled=False):
-            return _render(surfels, texture, camera, *options, exposures, detail_limits, order)
+        with torch.autocast(surfels.device.type, enabled=False), torch.set_grad_enabled(differentiable):
+            _check(surfels, texture, camera, options, color, limits, jitter)
+            shape = antialiased(surfels.activated(), camera, limits)
+            eye = _eye(shape.means, camera)
+            colors = ops.plain_colors((surfels.sh0, surfels.shN), shape.means, eye, options.sh_degree)
+            projection = ops.project(*shape, colors, camera.viewmat)
+            if isinstance(camera, RayCamera):
+                hits: ops.Hits | RayHits = _ray_hits(shape, projection, camera, options)
+            else:
+                pinhole = _pinhole(camera, shape.means)
+                tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, blending=options.order)
+                hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
+            texels = None if texture is None else _texels(texture, camera, hits, options, limits, jitter)
+            residual = texture is not None and texture.residual
+            slots = (hits.plain.new_empty(*hits.alpha.shape, 0, 3), hits.weights[..., :0])  # none are textured
+            textured_slots = slots if texels is None else (texels, hits.weights)
+            base = hits.base if texels is None or residual else None
+            image, textured = ops.compose(hits.plain, *textured_slots, hits.alpha, color, base)
+            factors = None if exposures is None else exposures.factors(camera).to(image)
+            image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
+            buffers = (image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
+            if isinstance(hits, RayHits):
+                return RayRendering(*buffers, RayIntermediates(projection, hits, texels, residual, factors))
+            stages = Intermediates(projection, hits, texels, residual, factors, tiles, pinhole, camera.viewmat)
+            return Rendering(*buffers, stages)
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
             raise
     # Outside of the handler: the error's traceback would keep alive what has been allocated.
-    raise OutOfMemoryError.of(f"an image of {camera.width}x{camera.height} pixels with K = {max_hits}", needed)
+    task = f"an image of {camera.width}x{camera.height} pixels with K = {options.max_hits}"
+    raise OutOfMemoryError.of(task, needed)
 
 
-def _render(
+def _check(
     surfels: Surfels,
     texture: NeuralTexture | None,
-    camera: Camera,
-    max_hits: int,
+    camera: Camera | RayCamera,
+    options: RenderOptions,
     background: torch.Tensor,
-    sh_degree: int,
-    low_pass: bool,
-    clamp_texture: bool,
-    depth_jitter: float | torch.Tensor,
-    generator: torch.Generator | None,
-    exposures: Exposures | None,
-    detail_limits: DetailLimits | None,
-    order: Order,
-) -> Rendering:
-    """Render with arguments that have been checked; see `render`."""
-    shape = antialiased(surfels, camera, detail_limits)
-    pinhole = ops.Pinhole(camera.K.to(surfels.means), camera.width, camera.height, camera.near)
-    colors = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, sh_degree)
-    projection = ops.project(*shape, colors, camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass, blending=order)
-    hits = ops.collect(projection, tiles, pinhole, max_hits=max_hits, low_pass=low_pass)
-    texels = None
+    limits: DetailLimits | None,
+    jitter: torch.Tensor | None,
+) -> None:
+    """Check shapes, dtypes, devices and the memory of the image; checking values would wait for the GPU."""
+    dtype, device = surfels.means.dtype, surfels.device
+    if dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"surfels: expected float32 or float64 parameters, got {dtype}")
+    if device.type == "cuda":
+        torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
+    elif device.type == "cpu":
+        keep_freed_memory()
+    else:
+        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {device}")
+    if options.clamp_texture and texture is not None and texture.residual:
+        raise ValueError("clamp_texture: expected False with a residual texture, got True")
+    expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
+        "camera.viewmat": (camera.viewmat, (4, 4)),
+        "background": (background, (3,)),
+    }
+    if isinstance(camera, RayCamera):
+        expected["camera.rays"] = (camera.rays, (camera.height, camera.width, 3))
+    elif camera.K.device != device:  # of any dtype
+        raise ValueError(f"camera.K: expected a tensor on {device}, got one on {camera.K.device}")
     if texture is not None:
-        jittered = _jittered(hits.depths, camera, depth_jitter, generator)
-        positions, directions = ops.unproject(jittered, camera.viewmat, pinhole)
-        depths = limited_depths(hits.ids, hits.depths, detail_limits, camera.focal)
-        texels = texture.colors(positions, depths, directions, camera.focal, sh_degree=sh_degree, clamp=clamp_texture)
-    residual = texture is not None and texture.residual
-    base = hits.base if texture is None or residual else None
-    blended = _no_texels(hits) if texels is None else (texels, hits.weights)
-    image, textured = ops.compose(hits.plain, *blended, hits.alpha, background, base)
-    factors = None if exposures is None else exposures.factors(camera).to(image)
-    image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
-    intermediates = Intermediates(projection, tiles, hits, pinhole, camera.viewmat, low_pass, texels, residual, factors)
-    return Rendering(image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha, intermediates)
+        expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
+    if jitter is not None:
+        expected["jitter"] = (jitter, (camera.height, camera.width, options.max_hits))
+    if limits is not None:
+        expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
+        expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
+    check_tensors(expected, dtype=dtype, device=device)
+    stored = (0, dtype) if texture is None else texture.stored_per_point(options.sh_degree)
+    ops.check_image(camera.width, camera.height, options.max_hits, dtype, device, texture=stored)
 
 
-def _jittered(
-    depths: torch.Tensor, camera: Camera, jitter: float | torch.Tensor, generator: torch.Generator | None
+def antialiased(shape: Activated, camera: Camera | RayCamera, limits: DetailLimits | None) -> Activated:
+    """Return the geometry of N surfels, with those blurred that are farther away than in any training view.
+
+    Differentiable with respect to the geometry and `camera.viewmat`.
+
+    Args:
+        shape: the activated surfels.
+        camera: the camera.
+        limits: detail limits of the N surfels; None blurs nothing.
+    """
+    if limits is None:
+        return shape
+    depths, focal = _depths(shape.means, camera), camera.pixel_focal
+    blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, focal)
+    return Activated(shape.means, shape.quats, *blurred)
+
+
+def _depths(means: torch.Tensor, camera: Camera | RayCamera) -> torch.Tensor:
+    """Return the depths (N,) of the surfels' centres: z-depths; along rays from a point, distances; 1 if parallel."""
+    if isinstance(camera, RayCamera) and camera.radial:
+        return (means - camera.position).norm(dim=-1)
+    if isinstance(camera, RayCamera) and camera.parallel:
+        return torch.ones_like(means[:, 0])
+    row = camera.viewmat[2].to(means)
+    return (means * row[:3]).sum(-1) + row[3]
+
+
+def _eye(means: torch.Tensor, camera: Camera | RayCamera) -> torch.Tensor:
+    """Return the point (3,) from which plain colours are seen; parallel rays see them from far away."""
+    position = camera.position
+    if isinstance(camera, Camera) or not camera.parallel or not len(means):
+        return position
+    extent = (means - position).norm(dim=-1).max().clamp_min(1e-12)
+    return position - FAR_AWAY * extent * camera.viewmat[2, :3]
+
+
+def _pinhole(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
+    return ops.Pinhole(camera.K.to(like), camera.width, camera.height, camera.near)
+
+
+def _ray_hits(shape: Activated, projection: ops.Projection, camera: RayCamera, options: RenderOptions) -> RayHits:
+    """Collect the hits along any rays."""
+    if camera.radial:
+        keys = _depths(shape.means, camera)
+    elif options.order == "distance" and not camera.parallel:
+        keys = projection.centers.norm(dim=-1)
+    else:
+        keys = projection.centers[:, 2]
+    records = ray_records(projection, _axes(shape, camera.viewmat) if camera.parallel else None)
+    tiles = intersect_rays(records, reaches_of(shape.opacities, shape.gammas), keys, camera.rays)
+    rays, near, viewmat = camera.rays, camera.near, camera.viewmat
+    return collect_rays(records, projection.limits, tiles, rays, near, viewmat, max_hits=options.max_hits)
+
+
+def _axes(shape: Activated, viewmat: torch.Tensor) -> torch.Tensor:
+    """Return (N, 2, 3): the surfels' axes v1 / s2 and v2 / s1 in the camera frame."""
+    w, x, y, z = shape.quats.unbind(-1)
+    first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    second = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
+    axes = torch.stack([first / shape.scales[:, 1:], second / shape.scales[:, :1]], 1)
+    return axes @ viewmat[:3, :3].T
+
+
+def _texels(
+    texture: NeuralTexture,
+    camera: Camera | RayCamera,
+    hits: ops.Hits | RayHits,
+    options: RenderOptions,
+    limits: DetailLimits | None,
+    jitter: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Return depths (H, W, K) times the factors of a `depth_jitter`."""
-    if not isinstance(jitter, torch.Tensor):
-        if not jitter > 0:
-            return depths
-        jitter = jitter_factors(camera, depths.shape[2], jitter, depths.dtype, generator)
-    return depths * jitter
+    """Return the textured colours (H, W, K, 3) of the hits."""
+    shifted = hits.depths if jitter is None else hits.depths * jitter
+    if isinstance(camera, RayCamera):
+        positions, directions = _unproject_rays(shifted, camera)
+    else:
+        positions, directions = ops.unproject(shifted, camera.viewmat, _pinhole(camera, shifted))
+    depths = hits.depths
+    if isinstance(camera, RayCamera) and camera.parallel:  # empty slots keep 0, which the texture passes over
+        depths = (hits.weights > 0).to(hits.depths)
+    depths, clamp = limited_depths(hits.ids, depths, limits, camera.focal), options.clamp_texture
+    return texture.colors(positions, depths, directions, camera.focal, sh_degree=options.sh_degree, clamp=clamp)
 
 
-def _no_texels(hits: ops.Hits) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return empty colours (H, W, 0, 3) and weights (H, W, 0), for a composition without texture."""
-    return hits.base.new_empty(*hits.base.shape[:2], 0, 3), hits.weights[..., :0]
+def _unproject_rays(depths: torch.Tensor, camera: RayCamera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the hits' points (H, W, K, 3) and the rays' unit directions (H, W, 3), world frame."""
+    rotation, shift, rays = camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.rays
+    along = torch.tensor([0.0, 0.0, 1.0]).to(rays).expand_as(rays) if camera.parallel else rays
+    start = rays * rays.new_tensor([1.0, 1.0, 0.0]) if camera.parallel else torch.zeros_like(rays)
+    points = start[:, :, None] + depths[..., None] * along[:, :, None]
+    return (points - shift) @ rotation, torch.nn.functional.normalize(along @ rotation, dim=-1)
 
 
 def jitter_factors(
@@ -270,12 +420,12 @@ def jitter_factors(
     dtype: torch.dtype = torch.float32,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draw random factors on depths for the `depth_jitter` of `render`.
+    """Draw random factors on depths, which shift the texture's points along their rays.
 
     Args:
         camera: the camera of the rendering.
         max_hits: K.
-        jitter: standard deviation in pixels.
+        jitter: standard deviation in pixels at the hit's depth.
         dtype: dtype of the surfels.
         generator: random generator, on the camera's device; None is torch's default.
 
@@ -285,88 +435,3 @@ def jitter_factors(
     shape = (camera.height, camera.width, max_hits)
     noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)
     return noise.mul_(jitter / camera.focal).add_(1)
-
-
-def antialiased(surfels: Surfels, camera: Camera, limits: DetailLimits | None) -> Activated:
-    """Return the N surfels' activated geometry, with those blurred that are farther away than in any training view.
-
-    Differentiable with respect to the surfels and `camera.viewmat`.
-
-    Args:
-        surfels: the surfels.
-        camera: the camera.
-        limits: detail limits of the N surfels; None blurs nothing.
-    """
-    shape = surfels.activated()
-    if limits is None or not len(surfels):
-        return shape
-    row = camera.viewmat[2].to(shape.means)
-    depths = (shape.means * row[:3]).sum(-1) + row[3]
-    blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, camera.pixel_focal)
-    return Activated(shape.means, shape.quats, *blurred)
-
-
-def _check_types(
-    surfels: Surfels,
-    texture: NeuralTexture | None,
-    camera: Camera,
-    max_hits: int,
-    sh_degree: int,
-    low_pass: bool,
-    clamp_texture: bool,
-    depth_jitter: float | torch.Tensor,
-) -> None:
-    """Check the arguments' types and ranges."""
-    if not isinstance(surfels, Surfels):
-        raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
-    if texture is not None and not isinstance(texture, NeuralTexture):
-        raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
-    for name, number, high in (("max_hits", max_hits, MAX_HITS), ("sh_degree", sh_degree, MAX_SH_DEGREE)):
-        if isinstance(number, bool) or not isinstance(number, int):
-            raise TypeError(f"{name}: expected an int, got {type(number).__name__}")
-        check_range(name, number, 0, high)
-    for name, flag in (("low_pass", low_pass), ("clamp_texture", clamp_texture)):
-        if not isinstance(flag, bool):
-            raise TypeError(f"{name}: expected True or False, got {type(flag).__name__}")
-    if not isinstance(depth_jitter, torch.Tensor):
-        if isinstance(depth_jitter, bool) or not isinstance(depth_jitter, numbers.Real):
-            raise TypeError(f"depth_jitter: expected a number or a tensor, got {type(depth_jitter).__name__}")
-        check_range("depth_jitter", depth_jitter, 0.0, MAX_JITTER)
-    if clamp_texture and texture is not None and texture.residual:
-        raise ValueError("clamp_texture: expected False with a residual texture, got True")
-    if surfels.means.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"surfels: expected float32 or float64 parameters, got {surfels.means.dtype}")
-    if surfels.device.type == "cuda":
-        torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
-    elif surfels.device.type == "cpu":
-        keep_freed_memory()
-    else:
-        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {surfels.device}")
-
-
-def _check_tensors(
-    surfels: Surfels,
-    texture: NeuralTexture | None,
-    camera: Camera,
-    max_hits: int,
-    background: torch.Tensor,
-    depth_jitter: float | torch.Tensor,
-    limits: DetailLimits | None,
-) -> None:
-    """Check shapes, dtypes and devices; checking values would wait for the GPU."""
-    expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
-        "camera.viewmat": (camera.viewmat, (4, 4)),
-        "background": (background, (3,)),
-    }
-    if isinstance(depth_jitter, torch.Tensor):
-        expected["depth_jitter"] = (depth_jitter, (camera.height, camera.width, max_hits))
-    if texture is not None:
-        expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
-    if limits is not None:
-        expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
-        expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
-    check_tensors(expected, dtype=surfels.means.dtype, device=surfels.means.device)
-    if camera.K.device != surfels.device:  # of any dtype
-        raise ValueError(f"camera.K: expected a tensor on {surfels.device}, got one on {camera.K.device}")

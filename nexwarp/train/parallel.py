@@ -16,13 +16,12 @@ from torch import nn
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.machine import derived_seed, needed_memory
-from nexwarp.model.frames import capturing
+from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
-from nexwarp.train.graphs import Gradients, GraphKey, StepResult, UpdateError
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.recipe import Config

@@ -9,7 +9,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.data import Scene
-from nexwarp.model.background import Color
+from nexwarp.model.options import Color
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import jitter_factors
 from nexwarp.train.recipe import Config
@@ -30,7 +30,7 @@ class Target:
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
-        depth_jitter: as `nexwarp.model.render` takes it.
+        depth_jitter: (H, W, K), the `jitter` of `nexwarp.model.render.draw`; None is none.
         view: (1,) int64, index of the training view; None where poses are not learned.
         normals: factor of the normal loss in this step.
     """
@@ -43,7 +43,7 @@ class Target:
     empty: torch.Tensor | None = None
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
-    depth_jitter: float | torch.Tensor = 0.0
+    depth_jitter: torch.Tensor | None = None
     view: torch.Tensor | None = None
     normals: float = 0.0
 

@@ -16,7 +16,7 @@ from nexwarp.cameras.between import between
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.machine import derived_seed
-from nexwarp.model.frames import MOST_GRAPHS, share_graphs, without_graphs
+from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
 from nexwarp.train.recipe import Config
 from nexwarp.train.target import Target
@@ -106,7 +106,8 @@ class Teachers:
         """Return a digest of the teachers, in their order."""
         digest = hashlib.sha256()
         for model in self.models:
-            digest.update(str(model.options).encode())
+            # As 7f7bd6c wrote options, so that its runs resume.
+            digest.update(str(model.options).replace(" clamp_texture", " low_pass=False, clamp_texture").encode())
             for name, value in model.state_dict().items():
                 digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()

@@ -15,9 +15,11 @@ from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, Sce
 from nexwarp.io.files import one_line
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.exposures import Exposures
+from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.render import draw
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
@@ -25,7 +27,6 @@ from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.densify import Densifier
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, FinishSettings, finish_model
-from nexwarp.train.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.train.health import LossLog, StepFacts, check_health, go_back, oom_message, watched_tensors
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, model_facts, texture_shape
 from nexwarp.train.ranks.ranks import Ranks
@@ -127,7 +128,7 @@ class Trainer:
         self.targets = TargetMaker(scene, config, self.views, self.background, self.generator, self.noise, self.poses)
         self.views_a_step, self.ranks = 1, Ranks.alone(self.device)
         capture = config.cuda_graphs and self.device.type == "cuda" and can_capture(self.optimizer)
-        self.graphs = StepGraphs(self.device) if capture else None
+        self.graphs: StepGraphs[Target] | None = StepGraphs(self.device) if capture else None
         self.loss_log, self.checked = LossLog(), 0
         self.good: Snapshot | None = None
 
@@ -231,8 +232,9 @@ class Trainer:
         try:
             target = refined(target, self.poses)
             own, poses, grid = self.own_losses, self.poses, fused is None
-            background, jitter = target.background, target.depth_jitter
-            out = self.model().render(target.camera, background=background, depth_jitter=jitter)
+            options, background, jitter = self.render_options(), target.background, target.depth_jitter
+            texture = self.texture if options.max_hits else None
+            out = draw(self.surfels, texture, target.camera, options, background=background, jitter=jitter)
             taken = as_taken(out, target, plain=bool(own))
             given = (taken, target, self.surfels, self.texture, self.config)
             losses = step_losses(*given, cells_unit=self.cells_unit, own=own, grid_term=grid, poses=poses)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model import render_rays as module
+from nexwarp.model import render as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.ops.rays import RayTiles
@@ -163,11 +163,6 @@ def test_an_orthographic_view_is_a_pinhole_far_away():
 def test_bad_cameras_are_named(make, match):
     with pytest.raises((TypeError, ValueError), match=match):
         make(torch.eye(4))
-
-
-def test_the_low_pass_is_refused():
-    with pytest.raises(ValueError, match="low_pass: expected False"):
-        crowd().render(nw.RayCamera.panorama(VIEWMAT, 16), low_pass=True)
 
 
 def test_nothing_is_seen_of_no_surfels_and_through_no_rays():

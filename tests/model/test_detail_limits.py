@@ -1,6 +1,7 @@
 """Looks from closer and from farther than training had: the detail is training's, and surfels do not alias."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.render import antialiased
+from nexwarp.model.render import draw as draw_parts
 from nexwarp.train.finish.detail_limits import measure_detail_limits
 from tests.render_support import BACKGROUND, MAX_HITS, assert_alike, assert_same, draw
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -30,6 +32,16 @@ def limits(surfels: nw.Surfels, nearest: float = 0.0, farthest: float = NEVER) -
     return DetailLimits(*(torch.full_like(surfels.logit_opacities.detach(), x) for x in (nearest, farthest)))
 
 
+def limited(
+    surfels: nw.Surfels,
+    texture: nw.NeuralTexture | None,
+    camera: nw.Camera,
+    limits: DetailLimits | None,
+    **changes: Any,
+) -> nw.Rendering:
+    return draw_parts(surfels, texture, camera, nw.RenderOptions(**changes), limits=limits)
+
+
 def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> None:
     """A hit closer than the surfel's nearest limit is textured as from there; one further away as without."""
     scene = random_scene(device=device)
@@ -37,7 +49,7 @@ def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> Non
     texture.half_precision = False
     plain = nw.render(surfels, texture, camera, max_hits=3)
     near = limits(surfels, nearest=3.5 / camera.focal)
-    out = nw.render(surfels, texture, camera, max_hits=3, detail_limits=near)
+    out = limited(surfels, texture, camera, near, max_hits=3)
     assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
     expected = textured_at(texture, camera, out, out.depths.clamp_min(3.5))
     assert_close(out.textured, expected, kind="value", name="textured")
@@ -48,7 +60,7 @@ def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> Non
 def test_what_training_never_textured_keeps_its_plain_colour(device: torch.device) -> None:
     scene = random_scene(device=device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
-    out = nw.render(surfels, texture, camera, background=BACKGROUND, detail_limits=limits(surfels, nearest=NEVER))
+    out = limited(surfels, texture, camera, limits(surfels, nearest=NEVER), background=BACKGROUND)
     assert_alike(out, draw(scene))
     out.image.sum().backward()
     for name, parameter in surfels.named_parameters():
@@ -62,12 +74,12 @@ def test_a_farther_look_keeps_the_detail_of_training(device: torch.device) -> No
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     texture.half_precision = False
     farthest = 3.5 / camera.focal
-    out = nw.render(surfels, texture, camera, max_hits=3, detail_limits=limits(surfels, farthest=farthest))
+    out = limited(surfels, texture, camera, limits(surfels, farthest=farthest), max_hits=3)
     expected = textured_at(texture, camera, out, out.depths.clamp_max(3.5))
     assert_close(out.textured, expected, kind="value", name="textured")
     texture.residual = True
     none = limits(surfels, nearest=NEVER, farthest=farthest)
-    never, plain = (nw.render(surfels, each, camera, detail_limits=none) for each in (texture, None))
+    never, plain = (limited(surfels, each, camera, none) for each in (texture, None))
     assert_close(never.image, plain.image, kind="value", name="never textured")
 
 
@@ -78,7 +90,7 @@ def test_looks_as_far_as_training_had_are_its_own(device: torch.device) -> None:
     before = nw.render(surfels, texture, camera)
     for farthest in (1.01 * before.depths.max().item() + 3.0, NEVER):
         wide = limits(surfels, nearest=1e-6, farthest=farthest / camera.focal)
-        after = nw.render(surfels, texture, camera, detail_limits=wide)
+        after = limited(surfels, texture, camera, wide)
         for name in ("image", "textured", "weights", "depths", "ids", "alpha"):
             assert torch.equal(getattr(after, name), getattr(before, name)), name
 
@@ -97,7 +109,7 @@ def test_a_far_surfel_covers_what_it_covers_wherever_pixels_fall(device: torch.d
         for x, y in torch.rand(40, 2, generator=generator).tolist():
             K = torch.tensor([[focal, 0.0, 8 + x], [0.0, focal, 8 + y], [0.0, 0.0, 1.0]])
             camera = nw.Camera(torch.eye(4), K, 16, 16).to(device)
-            out = nw.render(surfels, None, camera, detail_limits=training)
+            out = limited(surfels, None, camera, training)
             found.append(out.alpha.detach().sum().item())
         return torch.tensor(found)
 
@@ -115,7 +127,7 @@ def test_far_looks_are_differentiable_in_the_camera(device: torch.device) -> Non
     training = DetailLimits(torch.zeros_like(farthest), farthest)
 
     def shape(viewmat: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return antialiased(surfels, dataclasses.replace(camera, viewmat=viewmat), training)[2:]
+        return antialiased(surfels.activated(), dataclasses.replace(camera, viewmat=viewmat), training)[2:]
 
     viewmat = camera.viewmat.detach().clone().requires_grad_()
     (wide, *_), (narrow, *_) = shape(viewmat), surfels.activated()[2:]
@@ -164,7 +176,7 @@ def test_training_views_are_as_training_made_them(device: torch.device) -> None:
         after = model.render(c).image
         assert (after - image).abs().max() < 1 / 255
     far = dataclasses.replace(camera, viewmat=2 * moved - camera.viewmat.detach())
-    wide = antialiased(surfels, far, training).scales > 1.001 * surfels.scales
+    wide = antialiased(surfels.activated(), far, training).scales > 1.001 * surfels.scales
     assert wide.any()
 
 
@@ -174,7 +186,7 @@ def test_no_surfels_have_no_limits(device: torch.device) -> None:
     camera = make_camera(random_scene(3, device=device))
     found = measure_detail_limits(nw.Model(surfels, None, options=nw.RenderOptions(max_hits=0)), [camera])
     assert found.nearest.shape == found.farthest.shape == (0,)
-    out = nw.render(surfels, make_texture(device=device), camera, background=BACKGROUND, detail_limits=found)
+    out = limited(surfels, make_texture(device=device), camera, found, background=BACKGROUND)
     assert (out.image - torch.tensor(BACKGROUND, device=device)).abs().max() < 1e-6
 
 
@@ -182,12 +194,12 @@ def test_limits_of_other_surfels_are_named() -> None:
     scene = random_scene(5)
     surfels, camera = make_surfels(scene), make_camera(scene)
     with pytest.raises(ValueError, match=r"^detail_limits\.nearest: expected shape \(5,?\), got \(4,\)$"):
-        nw.render(surfels, None, camera, detail_limits=DetailLimits(torch.ones(4), torch.ones(4)))
+        limited(surfels, None, camera, DetailLimits(torch.ones(4), torch.ones(4)))
     with pytest.raises(ValueError, match=r"^detail_limits: expected limits of 5 surfels, got 4$"):
         nw.Model(surfels, None, detail_limits=DetailLimits(torch.ones(4), torch.ones(4)))
     double = torch.ones(5, dtype=torch.float64)
     with pytest.raises(TypeError, match=r"^detail_limits\.nearest: expected dtype torch.float32, got torch.float64$"):
-        nw.render(surfels, None, camera, detail_limits=DetailLimits(double, double))
+        limited(surfels, None, camera, DetailLimits(double, double))
     with pytest.raises(ValueError, match=r"^farthest: expected shape \(N=5\), got \(4,\)$"):
         DetailLimits(torch.ones(5), torch.ones(4))
     with pytest.raises(TypeError, match=r"^farthest: expected dtype torch.float32, got torch.float64$"):

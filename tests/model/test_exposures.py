@@ -17,6 +17,7 @@ from nexwarp.model import exposures
 from nexwarp.model.buffers import load_buffers, render_buffers, save_buffers
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
+from nexwarp.model.render import draw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.exposure import (
@@ -370,7 +371,7 @@ def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff)
     if falloff is not None:
         gains = gains * present(photos.falloff_of(camera))
         assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
-    out = nw.render(surfels, texture, camera, background=options.background, exposures=photos)
+    out = draw(surfels, texture, camera, options, exposures=photos)
     for name in ("image", "plain", "textured"):
         assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
     for name in ("alpha", "weights", "depths"):

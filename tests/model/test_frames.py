@@ -1,7 +1,6 @@
 """Frames as CUDA graphs: the bits of launched frames, whatever changes on the way; launches where one cannot be."""
 
 import copy
-import dataclasses
 import gc
 import pickle
 import threading
@@ -16,11 +15,10 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.model import frames
-from nexwarp.model import model as model_module
+from nexwarp.model import graphs as frames
 from nexwarp.model.exposures import Exposures
-from nexwarp.model.frame_request import FrameRequest
-from nexwarp.model.render import Rendering, render
+from nexwarp.model.graphs import Frame
+from nexwarp.model.render import Rendering, draw
 from tests.narrowing import present
 from tests.render_support import BUFFERS, assert_same
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -77,14 +75,12 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
     model = finished(device)
     exposures = present(model.exposures)
     first, *others = cameras(device)
-    staged = dataclasses.replace(
-        StagedCamera.of(first), falloff=present(exposures.falloff_of(first)).clone(), checked=(1.0, 1.0, 1.0, 1.0)
-    )
+    staged = StagedCamera.like(first, device, present(exposures.falloff_of(first)).clone())
     for camera in others:
         staged.copy_(camera)
         present(staged.falloff).copy_(present(exposures.falloff_of(camera)))
         found, expected = (
-            render(model.surfels, model.texture, c, exposures=exposures, detail_limits=model.detail_limits)
+            draw(model.surfels, model.texture, c, model.options, exposures=exposures, limits=model.detail_limits)
             for c in (staged, camera)
         )
         assert_same(found, expected, (*BUFFERS, "ids", "colors"))
@@ -136,7 +132,7 @@ def test_buffers_are_copied_when_they_are_asked_for() -> None:
     [
         {},
         {"max_hits": 0},
-        {"max_hits": 4, "low_pass": True},
+        {"max_hits": 4},
         {"exposure": "mean", "detail_limits": False},
         {"sh_degree": 1, "background": (0.2, 0.5, 0.1)},
         {"background": 0.3},
@@ -231,19 +227,19 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     """Frame graphs without a GPU: what is captured is noted, as (whole, width)."""
     captured: list[tuple[bool, int]] = []
 
-    class Frame:
-        def __init__(self, graphs: frames.FrameGraphs, request: FrameRequest, whole: bool) -> None:
-            self.state = request.state
-            captured.append((whole, request.camera.width))
+    class Captured:
+        def __init__(self, graphs: frames.FrameGraphs, frame: Frame, whole: bool) -> None:
+            self.state = frame.state
+            captured.append((whole, frame.camera.width))
 
-        def replay(self, request: FrameRequest, take: object) -> tuple[torch.Tensor, bool]:
+        def replay(self, frame: Frame, take: object) -> tuple[torch.Tensor, bool]:
             return torch.zeros(3), True
 
     class Stream:
         def __init__(self, device: torch.device) -> None:
             self.device = device
 
-    monkeypatch.setattr(frames, "_Frame", Frame)
+    monkeypatch.setattr(frames, "CapturedFrame", Captured)
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "Event", object)
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
@@ -252,9 +248,9 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     return captured
 
 
-def request_of(model: nw.Model, width: int = 61) -> FrameRequest:
+def request_of(model: nw.Model, width: int = 61) -> Frame:
     camera = cameras("cpu", 1, width=width)[0]
-    return model._request(camera, (0.0, 0.0, 0.0), model.options, (0.0, None))
+    return model._frame(camera, None, {})
 
 
 def share(models: list[nw.Model]) -> frames.FrameGraphs:
@@ -378,7 +374,6 @@ def test_what_cannot_be_captured_is_launched(model: nw.Model) -> None:
         assert isinstance(model.render(camera), frames.CapturedRendering)
         with torch.autocast("cuda"):
             assert isinstance(model.render(camera), frames.CapturedRendering)
-        assert not isinstance(model.render(camera, depth_jitter=0.5), frames.CapturedRendering)
     out = model.render(camera)
     assert not isinstance(out, frames.CapturedRendering)
     out.image.sum().backward()
@@ -453,7 +448,7 @@ def test_memory_of_graphs_is_given_back_when_it_is_missing(monkeypatch: pytest.M
     """A frame that does not fit is rendered again without the graphs."""
     held = graphs(model)
     camera = cameras("cuda", 1, width=64, height=32)[0]
-    original, calls = render, []
+    original, calls = frames.draw, []
 
     def scarce(*arguments: Any, **options: Any) -> Rendering:
         calls.append(len(held.frames))
@@ -461,7 +456,7 @@ def test_memory_of_graphs_is_given_back_when_it_is_missing(monkeypatch: pytest.M
             raise OutOfMemoryError.of("an image", "1 GiB")
         return original(*arguments, **options)
 
-    monkeypatch.setattr(model_module, "render", scarce)
+    monkeypatch.setattr(frames, "draw", scarce)
     with torch.no_grad():
         out = model.render(camera)
     assert calls == [1, 0] and out.image.isfinite().all()

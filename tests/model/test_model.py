@@ -19,6 +19,7 @@ from nexwarp.model.buffers import load_buffers, render_buffers
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.model.render import draw
 from nexwarp.run.folder import SceneSource, create_run
 from nexwarp.train.recipe import Config
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -61,19 +62,8 @@ def assert_same(one: nw.Rendering, other: nw.Rendering, names: tuple[str, ...] =
 
 
 def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
-    """The rendering of a model's surfels and texture by `nexwarp.model.render`, with the given parts only."""
-    options = model.options
-    return nw.render(
-        model.surfels,
-        model.texture,
-        camera,
-        options.max_hits,
-        options.background,
-        options.sh_degree,
-        options.low_pass,
-        options.clamp_texture,
-        **parts,
-    )
+    """The rendering of a model's surfels and texture, with the given parts only."""
+    return draw(model.surfels, model.texture, camera, model.options, **parts)
 
 
 def picture(file: Path) -> torch.Tensor:
@@ -115,8 +105,8 @@ def test_options_take_the_exposure_and_the_limits_away(
 ) -> None:
     model, camera = full_model(device, falloff), cameras_of(device)[0]
     exposures, limits = model.exposures, model.detail_limits
-    assert_same(model.render(camera), pure(model, camera, exposures=exposures, detail_limits=limits))
-    assert_same(model.render(camera, exposure="mean"), pure(model, camera, detail_limits=limits))
+    assert_same(model.render(camera), pure(model, camera, exposures=exposures, limits=limits))
+    assert_same(model.render(camera, exposure="mean"), pure(model, camera, limits=limits))
     assert_same(model.render(camera, detail_limits=False), pure(model, camera, exposures=exposures))
     bare: RenderChanges = {"exposure": "mean", "detail_limits": False}
     assert_same(model.render(camera, **bare), pure(model, camera))
@@ -146,10 +136,9 @@ def test_the_mean_exposure_is_the_picture_without_gains(device: torch.device) ->
 def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
     model, camera = full_model(device), cameras_of(device)[0]
     before = model.options
-    out = model.render(camera, max_hits=0, background=(1.0, 0.0, 0.0), sh_degree=0, low_pass=True, exposure="mean")
-    expected = nw.render(
-        model.surfels, None, camera, 0, (1.0, 0.0, 0.0), 0, low_pass=True, detail_limits=model.detail_limits
-    )
+    out = model.render(camera, max_hits=0, background=(1.0, 0.0, 0.0), sh_degree=0, exposure="mean")
+    options = nw.RenderOptions(0, (1.0, 0.0, 0.0), 0)
+    expected = draw(model.surfels, None, camera, options, limits=model.detail_limits)
     assert_same(out, expected)
     assert model.options is before
     behind = torch.tensor([1.0, 0.0, 0.0], device=device)
@@ -216,8 +205,7 @@ def test_surfels_hold_parameters_only() -> None:
     }
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch, low_pass: bool) -> None:
+def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depths and normals take one more walk along the lists that are there, and none where nobody reads them."""
     calls: list[str] = []
 
@@ -234,14 +222,14 @@ def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch, low_pass: bo
     for name in (*stages, "surface"):
         counting(name)
     model, camera = full_model(), cameras_of()[0]
-    out = model.render(camera, low_pass=low_pass)
+    out = model.render(camera)
     assert calls == stages
     for _ in range(2):
         for name in LAZY:
             assert getattr(out, name).abs().max() > 0, name
     assert calls == [*stages, "surface"]
     calls.clear()
-    buffers = render_buffers(model, camera, low_pass=low_pass)
+    buffers = render_buffers(model, camera)
     assert calls == [*stages, "surface"]
     for name in LAZY:
         assert torch.equal(getattr(buffers, name), getattr(out, name)), name
@@ -261,17 +249,8 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
         if through_model:
             out = model.render(camera, background=behind)
         else:
-            model.options = OPTIONS
-            out = nw.render(
-                model.surfels,
-                model.texture,
-                camera,
-                OPTIONS.max_hits,
-                behind,
-                OPTIONS.sh_degree,
-                exposures=model.exposures,
-                detail_limits=model.detail_limits,
-            )
+            parts = {"exposures": model.exposures, "limits": model.detail_limits}
+            out = draw(model.surfels, model.texture, camera, OPTIONS, background=behind, **parts)  # type: ignore[arg-type]
         leaves: dict[str, torch.Tensor] = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
         leaves |= dict(model.surfels.named_parameters())
         gradients = torch.autograd.grad(out.image.square().sum(), list(leaves.values()))
@@ -387,7 +366,7 @@ def test_changes_that_are_no_options_are_named() -> None:
         (ValueError, {"max_hits": 9}),
         (ValueError, {"exposure": "bright"}),
         (TypeError, {"detail_limits": 1}),
-        (TypeError, {"low_pass": "no"}),
+        (TypeError, {"clamp_texture": "no"}),
         (ValueError, {"sh_degree": -1}),
     ]
     for error, changes in bad:

@@ -18,6 +18,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import FORMAT_VERSION, LATER_OPTIONS, MODEL_FILE, save_model
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.render import draw
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from tests.model_file_support import META, OPTIONS, make_model, refused, rewrite
 from tests.scenes import make_camera, make_surfels, random_scene
@@ -108,15 +109,9 @@ def test_a_file_of_version_0_1_renders_as_before(tmp_path: Path, stored: tuple[s
     assert loaded.options == OPTIONS and loaded.exposures is not None
     nearest = limits[0] if "footprints" in stored else torch.zeros(24)
     farthest = limits[1] if "far_footprints" in stored else torch.full((24,), NEVER)
-    expected = nw.render(
-        loaded.surfels,
-        loaded.texture,
-        camera,
-        background=OPTIONS.background,
-        clamp_texture=True,
-        exposures=loaded.exposures,
-        detail_limits=DetailLimits(nearest, farthest) if stored else None,
-    )
+    limits_read = DetailLimits(nearest, farthest) if stored else None
+    parts = {"exposures": loaded.exposures, "limits": limits_read}
+    expected = draw(loaded.surfels, loaded.texture, camera, loaded.options, **parts)
     assert torch.equal(loaded.render(camera).image, expected.image)
     assert (loaded.detail_limits is None) == (not stored)
 
@@ -169,7 +164,7 @@ def test_meta_survives(tmp_path):
     assert loaded.options == OPTIONS
 
 
-@pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0, "low_pass": True}])
+@pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0}])
 def test_options_survive(tmp_path: Path, changes: dict[str, Any]) -> None:
     model = Model(make_surfels(random_scene(3)), None, options=OPTIONS.changed(**changes), meta=META)
     loaded = nw.load(save_model(tmp_path, model))
@@ -234,7 +229,7 @@ def test_tensors_that_do_not_fit(tmp_path, name):
     refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
 
 
-@pytest.mark.parametrize("key", ["texture", "max_hits", "background", "sh_degree", "low_pass", "clamp_texture"])
+@pytest.mark.parametrize("key", ["texture", "max_hits", "background", "sh_degree", "clamp_texture"])
 def test_missing_metadata(tmp_path, key):
     file = save_model(tmp_path, make_model())
     rewrite(file, lambda _, meta: meta.pop(key))
@@ -271,6 +266,8 @@ def test_models_that_cannot_render_are_refused(tmp_path):
         ("max_hits", 9),
         ("background", [0, 0]),
         ("low_pass", 1),
+        ("low_pass", True),
+        ("sh_degree", 7),
         ("sh_degree", None),
         ("near", "far"),
         ("smooth_sh", "smooth"),

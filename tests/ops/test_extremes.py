@@ -84,30 +84,27 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_extreme_surfels_are_finite(case: str, low_pass: bool, device: torch.device) -> None:
+def test_extreme_surfels_are_finite(case: str, device: torch.device) -> None:
     values = dict(CASES[case])
     raw = values.pop("raw", None)
-    check_finite(scene_with(device, **values), raw, low_pass=low_pass)
+    check_finite(scene_with(device, **values), raw)
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("factor", [1e4, 1e8, 1e15])
-def test_huge_worlds_are_finite(factor: float, low_pass: bool, device: torch.device) -> None:
+def test_huge_worlds_are_finite(factor: float, device: torch.device) -> None:
     scene = scene_with(device)
     far = scene | {"means": factor * scene["means"]}
-    check_finite(far, low_pass=low_pass)
-    check_finite(far | {"scales": factor * scene["scales"]}, low_pass=low_pass)
+    check_finite(far)
+    check_finite(far | {"scales": factor * scene["scales"]})
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("near", [0.0, 0.01])
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-def test_a_camera_inside_surfels_is_finite(scale: float, near: float, low_pass: bool, device: torch.device) -> None:
+def test_a_camera_inside_surfels_is_finite(scale: float, near: float, device: torch.device) -> None:
     scene = scene_with(device, scales=scale, near=near)
     position = make_camera(scene).position.detach()
-    check_finite(scene | {"means": position.expand(24, 3).clone()}, low_pass=low_pass)
+    check_finite(scene | {"means": position.expand(24, 3).clone()})
 
 
 def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.device) -> None:
@@ -116,15 +113,6 @@ def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.devic
         scene = facing(device, means=(0.0, 0.0, depth), scales=1e3) | {"near": near}
         out = check_finite(scene)
         assert_close(out.alpha, torch.full((16, 16), 0.9 if seen else 0.0), kind="value", name=f"alpha at {depth}")
-
-
-def test_specks_are_seen_with_the_low_pass_alone(device: torch.device) -> None:
-    scene = facing(device, scales=1e-8)
-    assert not check_finite(scene).alpha.any()
-    x = torch.arange(16) + 0.5 - 8.0
-    expected = 0.9 * torch.exp(-(x[:, None] ** 2 + x[None] ** 2))  # variance 1/2 pixel^2 about the centre
-    expected = torch.where(expected >= 1 / 255, expected, 0.0)
-    assert_close(check_finite(scene, low_pass=True).alpha, expected, kind="value", name="alpha")
 
 
 def test_gamma_1000_is_a_quad(device: torch.device) -> None:

@@ -27,15 +27,14 @@ def test_repeated_renders_are_identical(device: torch.device) -> None:
         assert_same(again, first, (*BUFFERS, "ids"))
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_the_order_of_the_surfels_changes_nothing(low_pass: bool, device: torch.device) -> None:
+def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
     scene, texture = random_scene(device=device), make_texture(device=device)
     permutation = torch.randperm(len(scene["means"])).to(device)
     shuffled = scene | {
         key: scene[key][permutation] for key in ("means", "quats", "scales", "opacities", "gammas", "sh")
     }
-    out = draw(scene, texture, low_pass=low_pass)
-    other = draw(shuffled, texture, low_pass=low_pass)
+    out = draw(scene, texture)
+    other = draw(shuffled, texture)
     assert_same(other, out)
     mapped = torch.where(other.ids >= 0, permutation[other.ids.clamp_min(0).long()], -1)
     assert torch.equal(mapped, out.ids.long())
@@ -54,8 +53,7 @@ def test_moving_scene_and_camera_together_changes_nothing(device: torch.device) 
     assert_alike(draw(moved, max_hits=4), draw(scene, max_hits=4))
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_scaling_the_world_scales_depths_only(low_pass: bool, device: torch.device) -> None:
+def test_scaling_the_world_scales_depths_only(device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device)
     scene["near"] = 2.5
     factor = 37.0
@@ -67,7 +65,7 @@ def test_scaling_the_world_scales_depths_only(low_pass: bool, device: torch.devi
         "viewmat": viewmat,
         "near": factor * scene["near"],
     }
-    out, expected = draw(scaled, low_pass=low_pass), draw(scene, low_pass=low_pass)
+    out, expected = draw(scaled), draw(scene)
     assert_alike(out, expected, ("image", "plain", "textured", "weights", "alpha"))
     assert_close(out.depths / factor, expected.depths, kind="value", name="depths")
 
@@ -166,12 +164,11 @@ def awkward_scene(device: torch.device, dtype: torch.dtype = torch.float32) -> S
     return {key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in scene.items()}
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("near", [0.0, 0.01])
-def test_awkward_surfels_stay_finite(near: float, low_pass: bool, device: torch.device) -> None:
+def test_awkward_surfels_stay_finite(near: float, device: torch.device) -> None:
     scene = awkward_scene(device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene, near=near)
-    out = nw.render(surfels, texture, camera, max_hits=4, low_pass=low_pass)
+    out = nw.render(surfels, texture, camera, max_hits=4)
     for name in BUFFERS:
         assert_finite(getattr(out, name), name)
     loss(out).backward()
@@ -183,8 +180,7 @@ def test_awkward_surfels_stay_finite(near: float, low_pass: bool, device: torch.
         assert_finite(gradient, name)
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_awkward_surfels_agree_with_the_reference(low_pass: bool, device: torch.device) -> None:
+def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
     """Surfels that cross the near plane are clipped by it, never dropped.
 
     The principal point is moved so that no ray lies in the plane of a surfel, where no answer is right.
@@ -192,8 +188,8 @@ def test_awkward_surfels_agree_with_the_reference(low_pass: bool, device: torch.
     scene = awkward_scene(device, torch.float64)
     scene["K"][0, 2] += 0.1
     surfels, camera = make_surfels(scene), make_camera(scene)
-    out = nw.render(surfels, None, camera, max_hits=4, low_pass=low_pass)
-    expected = reference_render(twin(surfels), None, camera.to("cpu"), max_hits=4, low_pass=low_pass)
+    out = nw.render(surfels, None, camera, max_hits=4)
+    expected = reference_render(twin(surfels), None, camera.to("cpu"), max_hits=4)
     assert_same_ids(out.ids, expected.ids, name="ids")
     assert_alike(out, expected)
 

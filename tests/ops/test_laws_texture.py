@@ -54,12 +54,13 @@ def test_jitter_moves_lookups_along_their_rays(
     """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
     scene = random_scene(width=120, height=90, device=device)
     texture, lookups = make_texture(device=device), Lookups(monkeypatch)
-    still = draw(scene, texture)
-    torch.manual_seed(3)
-    moved = draw(scene, texture, depth_jitter=jitter)
+    still, camera = draw(scene, texture), make_camera(scene)
+    generator = torch.Generator(device).manual_seed(3)
+    factors = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)
+    moved = draw(scene, texture, jitter=factors)
     assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
     assert torch.equal(moved.ids, still.ids)
-    camera, hit = make_camera(scene), still.ids >= 0
+    hit = still.ids >= 0
     before, after = (x[hit] - camera.position.detach() for x in lookups.positions)
     share = after.norm(dim=-1) / before.norm(dim=-1)
     assert_close(after, before * share[:, None], kind="value", name="along the ray")
@@ -69,32 +70,11 @@ def test_jitter_moves_lookups_along_their_rays(
     assert abs(pixels.mean().item()) < error * jitter
     assert abs(pixels.std().item() - jitter) < error * jitter
     assert not torch.equal(moved.textured, still.textured)
-    torch.manual_seed(3)
-    assert_same(draw(scene, texture, depth_jitter=jitter), moved)
-    own = [torch.Generator(device).manual_seed(3) for _ in range(2)]
-    assert_same(*(draw(scene, texture, depth_jitter=jitter, generator=generator) for generator in own))
-    assert not torch.equal(draw(scene, texture, depth_jitter=jitter).textured, moved.textured)
-    drawn = jitter_factors(camera, 2, jitter, scene["means"].dtype, own[0].manual_seed(3))
-    assert_same(draw(scene, texture, depth_jitter=drawn), moved)
-
-
-def test_without_jitter_no_random_number_is_drawn(device: torch.device) -> None:
-    scene, texture = random_scene(device=device), make_texture(device=device)
-    torch.manual_seed(3)
-    expected = torch.rand((), device=device)
-    torch.manual_seed(3)
-    assert_same(draw(scene, texture, depth_jitter=0.0), draw(scene, texture))
-    assert torch.rand((), device=device) == expected
-
-
-@pytest.mark.parametrize(
-    ("jitter", "error"),
-    [(-1.0, ValueError), (float("nan"), ValueError), ("1", TypeError), (torch.ones(2, 3), ValueError)],
-    ids=str,
-)
-def test_jitter_that_cannot_be_is_refused(jitter: Any, error: type[Exception], device: torch.device) -> None:
-    with pytest.raises(error, match=r"^depth_jitter: expected "):
-        draw(random_scene(device=device), make_texture(device=device), depth_jitter=jitter)
+    assert_same(draw(scene, texture, jitter=factors), moved)
+    other = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)
+    assert not torch.equal(draw(scene, texture, jitter=other).textured, moved.textured)
+    with pytest.raises(ValueError, match=r"^jitter: expected shape"):
+        draw(scene, texture, jitter=torch.ones(2, 3, dtype=factors.dtype, device=device))
 
 
 def test_grid_can_be_written_in_place(device: torch.device) -> None:

@@ -11,7 +11,7 @@ import nexwarp as nw
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.web.scene_data import SceneData
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model import frames
+from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
 from nexwarp.run.optics import Optics
 from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
@@ -42,14 +42,13 @@ def wide_scene(dtype: torch.dtype, device: torch.device | str, count: int = 60) 
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_rendering_by_distance_agrees_with_the_reference(device, dtype, low_pass):
+def test_rendering_by_distance_agrees_with_the_reference(device, dtype):
     """Values and gradients, those of the camera included."""
     scene = wide_scene(dtype, device)
     surfels, camera = scenes.make_surfels(scene), scenes.make_camera(scene)
     texture = scenes.make_texture(dtype=dtype, device=device)
     texture.half_precision = False
-    options: dict[str, Any] = {"max_hits": 2, "background": BACKGROUND, "low_pass": low_pass, "order": "distance"}
+    options: dict[str, Any] = {"max_hits": 2, "background": BACKGROUND, "order": "distance"}
     out = nw.render(surfels, texture, camera, **options)
     surfels64, texture64 = twin(surfels), twin(texture)
     camera64 = scenes.make_camera(scene | {key: scene[key].double().cpu() for key in ("viewmat", "K")})
@@ -66,7 +65,7 @@ def test_rendering_by_distance_agrees_with_the_reference(device, dtype, low_pass
     assert_close(*moved, kind="gradient", name="viewmat", precision=dtype)
     by_depth = nw.render(surfels, texture, camera, **(options | {"order": "depth"}))
     assert (by_depth.image - out.image).abs().max() > 0.01
-    assert_same(nw.render(surfels, texture, camera, max_hits=2, background=BACKGROUND, low_pass=low_pass), by_depth)
+    assert_same(nw.render(surfels, texture, camera, max_hits=2, background=BACKGROUND), by_depth)
 
 
 def test_turning_the_camera_changes_no_ray(device):

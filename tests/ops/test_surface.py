@@ -21,7 +21,7 @@ from tests.scenes import (
 from tests.tolerances import FLIPS, assert_close
 
 DEPTHS = ("expected_depth", "median_depth", "top_depth")
-BUFFERS = (*DEPTHS, "normals", "blended_normals", "distortion")
+BUFFERS = (*DEPTHS, "normals", "blended_normals")
 MAX_HITS = 8
 
 
@@ -51,10 +51,9 @@ def assert_everywhere(buffer: torch.Tensor, value: float | list[float], name: st
     assert_close(buffer, expected, kind="value", name=name)
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, low_pass: bool, device: torch.device) -> None:
+def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, device: torch.device) -> None:
     if name == "layered":
         scene = layered_scene(dtype=dtype, device=device)
     else:
@@ -62,11 +61,11 @@ def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, low_pa
     if name == "specks":
         scene["scales"] *= 0.1
     surfels, camera = make_surfels(scene), make_camera(scene)
-    out = nw.render(surfels, None, camera, low_pass=low_pass)
+    out = nw.render(surfels, None, camera)
     means, quats, scales, opacities, gammas = (x.double().cpu() for x in detached_shape(surfels))
     viewmat = camera.viewmat.detach().double().cpu()
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    expected = surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics, low_pass)
+    expected = surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics)
     assert expected.expected_depth.any() and (name != "specks" or not expected.expected_depth.all())
     flips = 0.0 if dtype == torch.float64 else FLIPS
     for buffer in BUFFERS:

@@ -1,4 +1,4 @@
-"""Gradients of depths, normals and distortion: the float64 reference, differences, values by hand, and laws."""
+"""Gradients of depths and normals: the float64 reference, differences, values by hand, and laws."""
 
 import importlib
 from typing import Any
@@ -16,15 +16,15 @@ from tests.render_support import assert_gradients, rigid_gradient, twin
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import FLIPS, TOLERANCES, assert_close
 
-BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals", "distortion")
+BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals")
 GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
 
 
-def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera, low_pass: bool) -> Surface:
+def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera) -> Surface:
     """Hand tensors in float64 on the CPU to the reference."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
     means, quats, scales, opacities, gammas, viewmat = (tensors[name] for name in (*GEOMETRY, "viewmat"))
-    return surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics, low_pass)
+    return surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics)
 
 
 def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
@@ -46,18 +46,15 @@ def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
     return scene
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gradients_agree_with_the_reference(
-    dtype: torch.dtype, name: str, low_pass: bool, device: torch.device
-) -> None:
+def test_gradients_agree_with_the_reference(dtype: torch.dtype, name: str, device: torch.device) -> None:
     """With respect to every parameter and the camera; of the random scene in float64 for each buffer by itself, too."""
     scene = make_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     expected, viewmat = twin(surfels), camera.viewmat.detach().double().cpu().requires_grad_()
     tensors = {key: getattr(expected, key) for key in GEOMETRY} | {"viewmat": viewmat}
-    out, right = nw.render(surfels, None, camera, low_pass=low_pass), reference(tensors, camera, low_pass)
+    out, right = nw.render(surfels, None, camera), reference(tensors, camera)
     leaves = (surfels, camera.viewmat), (expected, viewmat)
     apart = dtype == torch.float64 and name == "random"
     for buffers in (*((buffer,) for buffer in BUFFERS if apart), BUFFERS):
@@ -71,22 +68,20 @@ def test_gradients_agree_with_the_reference(
         assert_close(*turns, kind="gradient", name=f"viewmat of {buffers}", precision=dtype)
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_gradients_of_the_reference_agree_with_differences(low_pass: bool) -> None:
+def test_gradients_of_the_reference_agree_with_differences() -> None:
     scene = random_scene(6, seed=3, width=7, height=6, dtype=torch.float64)
     camera = make_camera(scene)
     inputs = [scene[name].clone().requires_grad_() for name in (*GEOMETRY, "viewmat")]
 
     def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        out = reference(dict(zip((*GEOMETRY, "viewmat"), tensors, strict=True)), camera, low_pass)
+        out = reference(dict(zip((*GEOMETRY, "viewmat"), tensors, strict=True)), camera)
         return tuple(getattr(out, name) for name in BUFFERS)
 
     assert buffers(*inputs)[-1].max() > 0.01
     assert torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) -> None:
+def test_gradients_agree_with_differences(device: torch.device) -> None:
     """Of the rendering itself, with respect to the raw parameters."""
     scene = random_scene(8, seed=3, width=9, height=8, dtype=torch.float64, device=device)
     surfels, camera = make_surfels(scene), make_camera(scene)
@@ -94,9 +89,7 @@ def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) 
 
     def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         given = dict(zip((name for name, _ in named), tensors, strict=True))
-        out = torch.func.functional_call(
-            _Drawn(surfels, camera, low_pass), {f"surfels.{k}": x for k, x in given.items()}
-        )
+        out = torch.func.functional_call(_Drawn(surfels, camera), {f"surfels.{k}": x for k, x in given.items()})
         return tuple(out)
 
     # Sums are in no fixed order on a GPU, so that two backward passes differ by roundings.
@@ -107,12 +100,12 @@ def test_gradients_agree_with_differences(low_pass: bool, device: torch.device) 
 class _Drawn(torch.nn.Module):
     """Renders surfels whose parameters can be replaced; returns the buffers."""
 
-    def __init__(self, surfels: nw.Surfels, camera: nw.Camera, low_pass: bool) -> None:
+    def __init__(self, surfels: nw.Surfels, camera: nw.Camera) -> None:
         super().__init__()
-        self.surfels, self.camera, self.low_pass = surfels, camera, low_pass
+        self.surfels, self.camera = surfels, camera
 
     def forward(self) -> list[torch.Tensor]:
-        out = nw.render(self.surfels, None, self.camera, low_pass=self.low_pass)
+        out = nw.render(self.surfels, None, self.camera)
         return [getattr(out, name) for name in BUFFERS]
 
 
@@ -134,39 +127,11 @@ def test_the_median_and_the_top_depth_follow_the_hit_that_they_are_taken_from(de
     assert found[1] == int(out.ids[9, 11, 0])
 
 
-def test_a_distortion_gradient_pulls_sheets_together(device: torch.device) -> None:
-    """Weights 0.5, 0.25 and 0.2; the nearest and the farthest of three sheets are pulled to the one between."""
-    scene = random_scene(3, width=12, height=9, dtype=torch.float64, device=device)
-    z = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64, device=device)
-    scene |= {
-        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
-        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64, device=device).expand(3, 4).clone(),
-        "scales": torch.full((3, 2), 100.0, dtype=torch.float64, device=device),
-        "opacities": torch.tensor([0.5, 0.5, 0.8], dtype=torch.float64, device=device),
-        "gammas": torch.full((3, 2), 50.0, dtype=torch.float64, device=device),
-        "viewmat": torch.eye(4, dtype=torch.float64, device=device),
-    }
-    surfels = make_surfels(scene)
-    out = nw.render(surfels, None, make_camera(scene))
-    pairs = 0.5 * 0.25 * 1 + 0.5 * 0.2 * 3 + 0.25 * 0.2 * 2
-    assert_close(out.distortion, torch.full_like(out.distortion, pairs), kind="value", name="distortion")
-    out.distortion[4, 6].backward()
-    expected = torch.tensor([-0.5 * 0.45, 0.25 * (0.5 - 0.2), 0.2 * 0.75], dtype=torch.float64)
-    assert_close(present(surfels.means.grad)[:, 2], expected, kind="gradient", name="means")
-
-
-def test_distortion_vanishes_where_all_hits_have_one_depth(device: torch.device) -> None:
-    scene = layered_scene(1, dtype=torch.float64, device=device)
-    out = nw.render(make_surfels(scene), None, make_camera(scene))
-    assert out.alpha.any() and not out.distortion.any()
-
-
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_awkward_surfels_have_finite_gradients(low_pass: bool, device: torch.device) -> None:
+def test_awkward_surfels_have_finite_gradients(device: torch.device) -> None:
     """Behind, at, around and across the camera, edge-on, enormous and tiny."""
     scene = awkward_scene(device)
     surfels, camera = make_surfels(scene), make_camera(scene)
-    loss(nw.render(surfels, None, camera, low_pass=low_pass)).backward()
+    loss(nw.render(surfels, None, camera)).backward()
     for name, x in surfels.named_parameters():
         assert x.grad is None or x.grad.isfinite().all(), name
     assert present(camera.viewmat.grad).isfinite().all()
@@ -217,8 +182,7 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
     assert len(launched) == 2
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_sums_in_fixed_point_are_those_of_floats(low_pass: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sums_in_fixed_point_are_those_of_floats(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = random_scene(150, seed=3, width=61, height=45)
     results = []
     with launch.cpu_form("scalar"):
@@ -226,15 +190,14 @@ def test_sums_in_fixed_point_are_those_of_floats(low_pass: bool, monkeypatch: py
             module = importlib.import_module("nexwarp.ops.collect")
             monkeypatch.setattr(module, "sums_in_fixed_point", lambda like, fixed=fixed: fixed)
             surfels = make_surfels(scene)
-            loss(nw.render(surfels, None, make_camera(scene), low_pass=low_pass)).backward()
+            loss(nw.render(surfels, None, make_camera(scene))).backward()
             results.append({name: present(x.grad) for name, x in surfels.named_parameters() if x.grad is not None})
     for name, plain in results[0].items():
         assert_close(results[1][name], plain, kind="gradient", name=name)
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_gradients_repeat_bit_for_bit(low_pass: bool) -> None:
+def test_gradients_repeat_bit_for_bit() -> None:
     """Thousands of overlapping surfels: with torch's deterministic algorithms all bits repeat."""
     scene = random_scene(4000, width=400, height=300, device=torch.device("cuda"))
     surfels, camera = make_surfels(scene), make_camera(scene)
@@ -242,7 +205,7 @@ def test_gradients_repeat_bit_for_bit(low_pass: bool) -> None:
     torch.use_deterministic_algorithms(True)
     try:
         for _ in range(5):
-            out = nw.render(surfels, None, camera, low_pass=low_pass)
+            out = nw.render(surfels, None, camera)
             geometry = [x for name, x in surfels.named_parameters() if not name.startswith("sh")]
             found.append(torch.autograd.grad(loss(out), [*geometry, camera.viewmat]))
     finally:
@@ -252,14 +215,13 @@ def test_gradients_repeat_bit_for_bit(low_pass: bool) -> None:
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_cuda_agrees_with_the_cpu(low_pass: bool) -> None:
+def test_cuda_agrees_with_the_cpu() -> None:
     """Thousands of surfels, in float32: values and gradients."""
     results = []
     for device in ("cpu", "cuda"):
         scene = random_scene(3000, seed=5, width=200, height=150, device=device)
         surfels = make_surfels(scene)
-        out = nw.render(surfels, None, make_camera(scene), low_pass=low_pass)
+        out = nw.render(surfels, None, make_camera(scene))
         # Not the distortion: at a tie of depths its gradient jumps.
         loss(out, ("expected_depth", "blended_normals")).backward()
         results.append((out, surfels))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.model.render import draw, jitter_factors
 from tests.render_support import BACKGROUND, BUFFERS, assert_gradients, loss, reference_render, rigid_gradient, twin
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
@@ -14,23 +15,22 @@ from tests.tolerances import FLIPS, assert_close, assert_same_ids
 pytestmark = pytest.mark.usefixtures("form")
 
 CASES = [
-    # scene, textured (True, False or "residual"), max_hits, low_pass, sh_degree, clamp_texture
-    ("random", True, 2, False, 3, False),
-    ("random", True, 1, True, 1, True),
-    ("random", True, 4, False, 2, True),
-    ("random", False, 2, True, 3, False),
-    ("random", True, 0, False, 3, False),
-    ("layered", True, 2, True, 3, False),
-    ("layered", True, 8, False, 0, True),
-    ("layered", False, 1, False, 2, False),
-    ("off_centre", True, 8, True, 2, False),
-    ("off_centre", True, 2, False, 3, True),
-    ("specks", True, 2, True, 3, False),
-    ("specks", False, 4, False, 1, False),
-    ("random", "residual", 2, False, 3, False),
-    ("layered", "residual", 8, True, 1, False),
-    ("off_centre", "residual", 1, False, 2, False),
-    ("random", "residual", 0, False, 3, False),
+    # scene, textured (True, False or "residual"), max_hits, sh_degree, clamp_texture
+    ("random", True, 2, 3, False),
+    ("random", True, 1, 1, True),
+    ("random", True, 4, 2, True),
+    ("random", False, 2, 3, False),
+    ("random", True, 0, 3, False),
+    ("layered", True, 2, 3, False),
+    ("layered", True, 8, 0, True),
+    ("layered", False, 1, 2, False),
+    ("off_centre", True, 8, 2, False),
+    ("off_centre", True, 2, 3, True),
+    ("specks", True, 2, 3, False),
+    ("random", "residual", 2, 3, False),
+    ("layered", "residual", 8, 1, False),
+    ("off_centre", "residual", 1, 2, False),
+    ("random", "residual", 0, 3, False),
 ]
 
 
@@ -44,12 +44,11 @@ def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
 
 
 @pytest.mark.parametrize("row", [torch.float64, torch.float32, torch.float16])
-@pytest.mark.parametrize(("name", "textured", "max_hits", "low_pass", "sh_degree", "clamp_texture"), CASES)
+@pytest.mark.parametrize(("name", "textured", "max_hits", "sh_degree", "clamp_texture"), CASES)
 def test_render_agrees_with_the_reference(
     name: str,
     textured: bool | str,
     max_hits: int,
-    low_pass: bool,
     sh_degree: int,
     clamp_texture: bool,
     row: torch.dtype,
@@ -76,7 +75,6 @@ def test_render_agrees_with_the_reference(
         "max_hits": max_hits,
         "background": BACKGROUND,
         "sh_degree": sh_degree,
-        "low_pass": low_pass,
         "clamp_texture": clamp_texture,
     }
     flips = 0.0 if dtype == torch.float64 else FLIPS
@@ -120,7 +118,8 @@ def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -
     shares = (1 + drawn * jitter / camera.focal).cpu()
     expected = reference_render(surfels64, texture64, camera64, shares=shares, **options)
     torch.manual_seed(3)
-    out = nw.render(surfels, texture, camera, depth_jitter=jitter, **options)
+    factors = jitter_factors(camera, max_hits, jitter, torch.float64)
+    out = draw(surfels, texture, camera, nw.RenderOptions(**options), jitter=factors)
     loss(out).backward()
     loss(expected).backward()
     for buffer in BUFFERS:

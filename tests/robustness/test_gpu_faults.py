@@ -14,8 +14,8 @@ from nexwarp import ops
 from nexwarp.cli import main as cli
 from nexwarp.errors import DivergedError, OutOfMemoryError
 from nexwarp.machine import deterministic
+from nexwarp.model import graphs as step_graphs
 from nexwarp.model.buffers import PASSES, render_buffers
-from nexwarp.train import graphs as step_graphs
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Allocator, allocating, failing_gpu

@@ -14,8 +14,8 @@ import torch
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
+from nexwarp.model import graphs as step_graphs
 from nexwarp.model.surfels import Surfels
-from nexwarp.train import graphs as step_graphs
 from nexwarp.train import views as training_views
 from nexwarp.train.densify import Densifier
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig

@@ -1,0 +1,725 @@
+"""CUDA graphs of frames and of training steps: their launches are captured once and replayed as one.
+
+Both launch hundreds of small kernels, which keeps the host busy for longer than the GPU. What differs from one frame to
+the next (camera, background) or from one step to the next (target, learning rates) is copied into tensors that the
+graph reads. Parameters are read where they are, so that changes in place show at once. Whatever else changes needs
+another graph: the first frame or step after it is launched kernel by kernel, so that all kernels are loaded, and the
+next one is captured. Both do the same arithmetic on the same numbers. What cannot be captured is launched kernel by
+kernel, as is everything for which memory does not suffice.
+"""
+
+import dataclasses
+import functools
+import logging
+import threading
+import warnings
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+
+import torch
+from torch import nn
+
+from nexwarp import ops
+from nexwarp.cameras.camera import Camera, StagedCamera
+from nexwarp.cameras.ray_camera import RayCamera
+from nexwarp.errors import OutOfMemoryError
+from nexwarp.machine import needed_memory
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
+from nexwarp.model.options import Color, RenderOptions, color_numbers
+from nexwarp.model.render import Rendering, draw
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
+
+log = logging.getLogger(__name__)
+
+CHANCES = 3  # how often to start again without any graph when memory does not suffice
+
+# Frames. Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes
+# room. M models that share graphs have M times as many.
+MOST_GRAPHS = 4
+MOST_SEEN = 16  # kinds of frames of one model that are remembered to have been launched once
+MOST_POINTS = 2**23  # of one frame, pixels times max(K, 1): larger ones keep the GPU busy anyway
+
+# Steps. Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A
+# kind that was not used for FORGOTTEN steps makes room for another.
+MOST_KINDS = 4
+FORGOTTEN = 1000
+
+_RELEASABLE = frozenset(field.name for field in dataclasses.fields(Rendering)) - {"image"}
+
+T = TypeVar("T")
+
+
+class CaptureError(Exception):
+    """A capture failed; `memory` says whether memory did not suffice."""
+
+    def __init__(self, cause: MemoryError | RuntimeError) -> None:
+        super().__init__(" ".join(str(cause).split()))
+        self.memory = needed_memory(cause) is not None
+
+
+@contextmanager
+def _captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: tuple[int, int] | None) -> Iterator[None]:
+    """Capture what is launched inside; errors of torch and Warp become CaptureError."""
+    try:
+        with ops.captured(graph, stream, pool):
+            yield
+    except ops.UnknownLengthError:
+        raise
+    except (MemoryError, RuntimeError) as error:
+        raise CaptureError(error) from None  # whose traceback would keep what has been allocated
+
+
+def capturing(device: torch.device) -> bool:
+    """Whether a graph is being captured on the current stream; torch without CUDA cannot be asked."""
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+# Frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """What a frame renders: the arguments of `draw`. A background of None is that of the options."""
+
+    surfels: Surfels
+    texture: NeuralTexture | None
+    exposures: Exposures | None
+    limits: DetailLimits | None
+    camera: Camera | RayCamera
+    options: RenderOptions
+    background: Color | None
+
+    @property
+    def color(self) -> Color:
+        """The background."""
+        return self.options.background if self.background is None else self.background
+
+    @functools.cached_property
+    def draw(self) -> Callable[..., Rendering]:
+        """`draw` for any camera and background."""
+        parts = functools.partial(draw, self.surfels, self.texture, exposures=self.exposures, limits=self.limits)
+        return functools.partial(parts, options=self.options)
+
+    @functools.cached_property
+    def tensors(self) -> list[torch.Tensor]:
+        """Parameters and buffers of all parts."""
+        parts = (self.surfels, self.texture, self.exposures, self.limits)
+        return [x for part in parts if part is not None for x in _tensors_of(part)]
+
+    @functools.cached_property
+    def state(self) -> Hashable:
+        """What the launches depend on beside the kind; changes of values in place do not count."""
+        texture, exposures, products = self.texture, self.exposures, torch.backends.cuda.matmul
+        return (
+            *((x.data_ptr(), x.shape) for x in self.tensors),
+            texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
+            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
+            exposures and exposures.lens,
+            torch.are_deterministic_algorithms_enabled(),
+            products.allow_tf32,
+            products.allow_fp16_reduced_precision_reduction,
+        )
+
+    def kind(self) -> tuple[Hashable, ...]:
+        """Whose frame it is, and what it has in common with the next ones."""
+        o, camera = self.options, self.camera
+        options = (o.max_hits, o.sh_degree, o.clamp_texture, o.exposure, o.detail_limits, o.order)
+        parts = (self.texture is None, self.exposures is None, self.limits is None)
+        return id(self.surfels), options, parts, camera.width, camera.height, camera.near
+
+
+def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
+    """Return parameters and buffers; torch's own iterators take a tenth of a small frame's time."""
+    tensors = [x for x in (*module._parameters.values(), *module._buffers.values()) if x is not None]
+    for child in module._modules.values():
+        if child is not None:
+            tensors += _tensors_of(child)
+    return tensors
+
+
+def replayed(frame: Frame) -> Rendering | None:
+    """Return the rendering by a graph; None if the frame is to be launched kernel by kernel."""
+    graphs = _graphs_for(frame)
+    return None if graphs is None else graphs.render(frame)
+
+
+def replayed_image(frame: Frame) -> torch.Tensor | None:
+    """Return the image alone, which takes less memory; None if the frame is to be launched kernel by kernel."""
+    graphs = _graphs_for(frame)
+    return None if graphs is None else graphs.render_image(frame)
+
+
+def launched(frame: Frame) -> Rendering:
+    """Render kernel by kernel; where memory does not suffice, again without any graphs."""
+    device = frame.surfels.device
+    camera = frame.camera if frame.camera.device == device else frame.camera.to(device)
+    try:
+        return frame.draw(camera, background=frame.background)
+    except OutOfMemoryError:
+        # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
+        if capturing(device) or not release_graphs():
+            raise
+    # Outside of the handler: the error's traceback would keep alive what has been allocated.
+    return frame.draw(camera, background=frame.background)
+
+
+class FrameGraphs:
+    """The captured frames of a model, or of several that share memory, on one GPU. Threads take turns.
+
+    A graph keeps all buffers of its rendering, or only the image. All graphs use the same memory for temporary buffers,
+    so that a replay may overwrite the buffers of an earlier rendering. The buffers of a rendering that is still
+    referenced are therefore copied before the next replay.
+    """
+
+    def __init__(self, device: torch.device, models: int = 1) -> None:
+        self.most, self.most_seen = MOST_GRAPHS * models, MOST_SEEN * models
+        self.lock = threading.RLock()
+        self.stream = torch.cuda.Stream(device)
+        self.pool: tuple[int, int] | None = None
+        self.frames: OrderedDict[Hashable, CapturedFrame] = OrderedDict()
+        self.seen: OrderedDict[Hashable, Hashable] = OrderedDict()
+        self.chances = CHANCES
+        # When the memory that all graphs share was last used, and on which stream.
+        self.used = torch.cuda.Event()
+        self.user: torch.cuda.Stream | None = None
+        # The last rendering, whose buffers may still be in that memory. Any graph overwrites them: the results of one
+        # may lie where another one has its temporary buffers.
+        self.latest: weakref.ref[CapturedRendering] | None = None
+
+    def render(self, frame: Frame) -> Rendering | None:
+        """Render by a graph; None if the frame is to be launched kernel by kernel."""
+        with self.lock:
+            rendering = self._run(frame, whole=True, take=CapturedRendering.of)
+            if rendering is not None:
+                self.latest = weakref.ref(rendering)
+            return rendering
+
+    def render_image(self, frame: Frame) -> torch.Tensor | None:
+        """Render by a graph that keeps the image alone; None if the frame is to be launched kernel by kernel."""
+        with self.lock:
+            return self._run(frame, whole=False, take=_image_of)
+
+    def _run(self, frame: Frame, whole: bool, take: "Callable[[CapturedFrame, torch.cuda.Stream], T]") -> T | None:
+        """Replay the frame's graph, captured first where needed; None if the frame is to be launched."""
+        state, common = frame.state, frame.kind()
+        if not whole and (known := self.frames.get((True, *common))) is not None and known.state == state:
+            whole = True  # a graph that keeps all buffers is there: it has the image, too
+        kind = (whole, *common)
+        captured = self.frames.get(kind)
+        if captured is None or captured.state != state or not self.chances:
+            self.frames.pop(kind, None)
+            if self.seen.get(kind) != state or not self.chances:
+                self.seen[kind] = state
+                self.seen.move_to_end(kind)
+                while len(self.seen) > self.most_seen:
+                    self.seen.popitem(last=False)
+                return None
+            while len(self.frames) >= self.most:
+                self.frames.popitem(last=False)
+            captured = self._capture(frame, whole)
+            if captured is None:
+                return None
+            self.frames[kind] = captured
+        self.frames.move_to_end(kind)
+        taken, held = captured.replay(frame, take)
+        if not held:
+            # What was taken is right, but slow, as the next frame by this graph would be.
+            del self.frames[kind]
+        return taken
+
+    def _capture(self, frame: Frame, whole: bool) -> "CapturedFrame | None":
+        """Return the captured frame; None if that is not possible."""
+        if not self.frames:
+            self.pool = None  # it has gone with its last graph
+        try:
+            return CapturedFrame(self, frame, whole)
+        except Exception as error:
+            memory = getattr(error, "memory", False)
+            log.debug("frames are launched kernel by kernel: %s", error)
+        # Outside of the handler: the error's traceback would keep alive what has been allocated.
+        self.clear()
+        self.chances = self.chances - 1 if memory else 0
+        return None
+
+    def clear(self) -> bool:
+        """Drop all graphs and free their memory; return whether there were any."""
+        with self.lock:
+            had = bool(self.frames)
+            self.frames.clear()
+            self.pool = None
+            if had:
+                torch.cuda.empty_cache()
+            return had
+
+    @contextmanager
+    def using(self, stream: torch.cuda.Stream | None = None) -> Iterator[torch.cuda.Stream]:
+        """Use the graphs' memory on a stream, by default the current one, after all earlier uses."""
+        switched = nullcontext() if stream is None else torch.cuda.stream(stream)
+        stream = torch.cuda.current_stream(self.stream.device) if stream is None else stream
+        if self.user is not None and self.user != stream:
+            stream.wait_event(self.used)
+            for frame in self.frames.values():
+                # Their memory is for other use only when this stream is done with it, too.
+                for x in frame.staged:
+                    x.record_stream(stream)
+        with switched:
+            yield stream
+        self.user = stream
+        self.used.record(stream)
+
+
+class CapturedFrame:
+    """One captured frame: the tensors that it reads, the graph, and the results that each replay overwrites."""
+
+    @torch.inference_mode(False)  # later frames write to its tensors in any mode
+    @torch.no_grad()
+    def __init__(self, graphs: FrameGraphs, frame: Frame, whole: bool) -> None:
+        assert isinstance(frame.camera, Camera)
+        self.graphs, self.state = graphs, frame.state
+        device = graphs.stream.device
+        exposures = frame.exposures if frame.options.exposure == "photos" else None
+        falloff = None if exposures is None else exposures.falloff_of(frame.camera)
+        self.lens: Hashable = None
+        self.camera = StagedCamera.like(frame.camera, device, None if falloff is None else falloff.clone())
+        self.staged = [x for x in (self.camera.numbers, self.camera.falloff) if x is not None]
+        if graphs.pool is None:
+            graphs.pool = torch.cuda.graph_pool_handle()
+        self.graph = torch.cuda.CUDAGraph()
+        with graphs.using(), _captured(self.graph, graphs.stream, graphs.pool):
+            result = frame.draw(self.camera, background=self.camera.color)
+        self.image, self.room = result.image, result.intermediates.tiles.room
+        # Memory of what is not kept here serves other graphs.
+        self.result = result if whole else None
+
+    def replay(self, frame: Frame, take: "Callable[[CapturedFrame, torch.cuda.Stream], T]") -> tuple[T, bool]:
+        """Render another camera; what the rendering before still holds is copied for it first.
+
+        Args:
+            frame: of the same kind and state.
+            take: copies the wanted result, on the stream of the replay.
+
+        Returns:
+            What was taken, and whether the lists of surfels have held all entries, as far as is known.
+        """
+        if self.graphs.latest is not None and (latest := self.graphs.latest()) is not None:
+            latest.take_buffers()
+        self.graphs.latest = None
+        with self.graphs.using() as stream:
+            assert isinstance(frame.camera, Camera)
+            self._stage(frame.camera, frame.color, frame.exposures)
+            self.graph.replay()
+            return take(self, stream), ops.held(self.room)
+
+    def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
+        """Copy what differs from one frame to the next into the tensors that the graph reads."""
+        if isinstance(background, torch.Tensor):
+            self.camera.copy_(camera)
+            self.camera.color.copy_(background.detach().expand(3))
+        else:
+            self.camera.copy_(camera, color_numbers(background))
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if self.camera.falloff is not None and self.lens != lens:
+            falloff = None if exposures is None else exposures.falloff_of(camera)
+            assert falloff is not None
+            self.camera.falloff.copy_(falloff)
+            self.lens = lens
+
+
+def _image_of(frame: CapturedFrame, _: torch.cuda.Stream) -> torch.Tensor:
+    return frame.image.clone()
+
+
+class CapturedRendering(Rendering):
+    """A rendering by a graph. All but the image is copied from the graph's memory when it is first asked for.
+
+    A rendering that is still there when a graph of the model is replayed gets its copies before.
+    """
+
+    frame: CapturedFrame | None
+
+    @classmethod
+    def of(cls, frame: CapturedFrame, stream: torch.cuda.Stream) -> "CapturedRendering":
+        """Return the rendering that the graph was last replayed for, on a stream."""
+        rendering = cls.__new__(cls)
+        rendering.__dict__.update(image=_image_of(frame, stream), frame=frame, stream=stream)
+        return rendering
+
+    def __getattr__(self, name: str) -> object:
+        if name not in _RELEASABLE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self.take_buffers()
+        return self.__dict__[name]
+
+    def take_buffers(self) -> None:
+        """Copy all buffers from the graph's memory, unless that has been done."""
+        frame = self.__dict__["frame"]
+        if frame is None:
+            return
+        with frame.graphs.lock:
+            if self.__dict__["frame"] is None:  # another thread was faster
+                return
+            # On the stream of its image, whichever thread it is that needs the graph's memory.
+            with frame.graphs.using(self.__dict__["stream"]), torch.inference_mode(False), torch.no_grad():
+                copies: dict[int, torch.Tensor] = {}
+                for name in _RELEASABLE:
+                    self.__dict__[name] = _copied(getattr(frame.result, name), copies)
+            self.__dict__["frame"] = None
+
+    def __reduce__(self) -> tuple[type[Rendering], tuple[object, ...]]:
+        return Rendering, tuple(getattr(self, field.name) for field in dataclasses.fields(Rendering))
+
+
+def _copied(value: object, copies: dict[int, torch.Tensor]) -> object:
+    """Copy a tensor, or a dataclass with all tensors in it; a tensor that occurs twice is copied once."""
+    if isinstance(value, torch.Tensor):
+        if id(value) not in copies:
+            copies[id(value)] = value.clone()
+        return copies[id(value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+        return dataclasses.replace(value, **{name: _copied(part, copies) for name, part in fields.items()})
+    return value
+
+
+# By their surfels, which several models may share; released with them.
+_graphs: "weakref.WeakKeyDictionary[nn.Module, FrameGraphs]" = weakref.WeakKeyDictionary()
+_graphs_lock = threading.Lock()
+_enabled = True
+
+
+@contextmanager
+def without_graphs() -> Iterator[None]:
+    """Launch all frames, inside the context and for all threads, kernel by kernel."""
+    global _enabled
+    before, _enabled = _enabled, False
+    try:
+        yield
+    finally:
+        _enabled = before
+
+
+def share_graphs(surfels: Sequence[Surfels]) -> None:
+    """Let the graphs of several models share memory from now on, and drop the graphs that the models have.
+
+    The graphs are freed with the last of the models. If a frame of one model cannot be captured, all are dropped.
+
+    Args:
+        surfels: those of the models, at least one, all on one GPU.
+    """
+    with _graphs_lock:
+        before = {id(graphs): graphs for each in surfels if (graphs := _graphs.get(each)) is not None}
+        graphs = FrameGraphs(surfels[0].device, len(surfels))
+        for each in surfels:
+            _graphs[each] = graphs
+    for dropped in before.values():
+        dropped.clear()  # it and its frames refer to each other, so that only the garbage collector would free them
+
+
+def release_graphs() -> bool:
+    """Drop the frames' graphs of all models and free their memory; return whether there were any."""
+    with _graphs_lock:
+        everything = list(_graphs.values())
+    return any([graphs.clear() for graphs in everything])
+
+
+def _graphs_for(frame: Frame) -> FrameGraphs | None:
+    """Return the graphs of the frame's model; None if the frame cannot be captured."""
+    surfels, device = frame.surfels, frame.surfels.device
+    if not _enabled or device.type != "cuda" or not _can_capture(device, frame):
+        return None
+    with _graphs_lock:
+        graphs = _graphs.get(surfels)
+        if graphs is None or graphs.stream.device != device:
+            graphs = _graphs[surfels] = FrameGraphs(device)
+    return graphs
+
+
+def _can_capture(device: torch.device, frame: Frame) -> bool:
+    """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
+    camera, background = frame.camera, frame.background
+    if not isinstance(camera, Camera) or isinstance(camera, StagedCamera):
+        return False
+    if camera.width * camera.height * max(frame.options.max_hits, 1) > MOST_POINTS:
+        return False
+    if camera.viewmat.dtype != torch.float32 or camera.device not in (device, torch.device("cpu")):
+        return False
+    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in frame.tensors):
+        return False
+    differentiated = [*frame.tensors, camera.viewmat]
+    if isinstance(background, torch.Tensor):
+        if (background.dtype, background.device) != (torch.float32, device) or background.shape not in ((), (3,)):
+            return False
+        differentiated.append(background)
+    if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
+        return False
+    return not capturing(device)
+
+
+# Training steps
+
+
+class GraphKey(NamedTuple):
+    """Key that decides whether a captured step can be reused, beside its target's kind.
+
+    Attributes:
+        kernels: what decides which kernels a step launches.
+        tensors: what they read and write.
+    """
+
+    kernels: Hashable
+    tensors: Hashable
+
+
+class Gradients(NamedTuple):
+    """What the ranks of a training sum after a graph, where the graph cannot.
+
+    Attributes:
+        of_parameters: their gradients, in the order of the optimizer's groups.
+        errors: (N,) sums of the surfels' errors; None outside of density control.
+    """
+
+    of_parameters: list[torch.Tensor | None]
+    errors: torch.Tensor | None
+
+
+class StepResult(NamedTuple):
+    """What a step leaves behind, without a gradient.
+
+    Attributes:
+        losses: terms of the loss, scalars.
+        image: (H, W, 3) the rendering.
+        room: capacity of its lists of surfels and tiles.
+        gradients: what is left to sum over the ranks; None where the step has updated the parameters.
+    """
+
+    losses: dict[str, torch.Tensor]
+    image: torch.Tensor
+    room: ops.ListCapacity
+    gradients: Gradients | None = None
+
+
+class UpdateError(OutOfMemoryError):
+    """Memory did not suffice while the parameters were updated: to repeat the step would update some of them twice."""
+
+
+@contextmanager
+def updating() -> Iterator[None]:
+    """Turn memory errors of an update of the parameters into UpdateError."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if (needed := needed_memory(error)) is None:
+            raise
+        raise UpdateError(f"out of memory while the parameters were updated: needed {needed}", needed) from None
+
+
+class StepTarget(Protocol):
+    """What a step compares with: a dataclass of a camera, tensors, and values on which the launches depend."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the step renders."""
+
+
+S = TypeVar("S", bound=StepTarget)
+
+
+class StepGraphs(Generic[S]):
+    """Runs the GPU's part of training steps, as graphs where that pays.
+
+    Where only tensors have been replaced, as by a round of density control, the first step after it is captured. Where
+    memory does not suffice for graphs, or a step cannot be captured, all later steps are launched kernel by kernel.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.stream = torch.cuda.Stream(device)
+        self.pool: tuple[int, int] | None = None
+        self.keeper: torch.cuda.CUDAGraph | None = None
+        self.stages: dict[Hashable, _Stage[S]] = {}
+        self.steps = 0
+        self.chances = CHANCES
+
+    def run(self, target: S, work: Callable[[S], StepResult], state: GraphKey) -> StepResult:
+        """Do a step.
+
+        Args:
+            target: of the step.
+            work: does the step for a target; its launches may depend on nothing but the target's kind and `state`.
+            state: whatever else the launches depend on; see `graph_key`.
+
+        Returns:
+            What `work` returns.
+        """
+        if self.chances > 0:
+            try:
+                return self._run(target, work, state)
+            except CaptureError as error:
+                self.chances = self.chances - 1 if error.memory else 0
+                if not error.memory:
+                    message = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
+                    warnings.warn(message, stacklevel=2)
+            except (MemoryError, RuntimeError) as error:
+                if not self._can_repeat(error):
+                    raise
+                self.chances -= 1
+            self.clear()
+        return work(target)
+
+    def beside(self, work: Callable[[], T]) -> T:
+        """Do work that is not part of a step; where it lacks memory, drop all graphs and do it again."""
+        try:
+            return work()
+        except (MemoryError, RuntimeError) as error:
+            if not self._can_repeat(error):
+                raise
+            self.chances -= 1
+        self.clear()
+        return work()
+
+    def _can_repeat(self, error: Exception) -> bool:
+        """Whether failed work can be repeated: it lacked memory, of which graphs keep some, and it updated nothing."""
+        return needed_memory(error) is not None and self.keeper is not None and not isinstance(error, UpdateError)
+
+    def clear(self) -> None:
+        """Drop all graphs, those of frames too, and free their memory."""
+        self.stages.clear()
+        self.keeper = self.pool = None
+        release_graphs()
+        torch.cuda.empty_cache()
+
+    def _run(self, target: S, work: Callable[[S], StepResult], state: GraphKey) -> StepResult:
+        self.steps += 1
+        kind = _kind(target)
+        stage = self.stages.get(kind)
+        if stage is None and len(self.stages) == MOST_KINDS:
+            oldest = min(self.stages, key=lambda kind: self.stages[kind].seen)
+            if self.stages[oldest].seen >= self.steps - FORGOTTEN:
+                return work(target)
+            del self.stages[oldest]
+        if stage is None:
+            stage = self.stages[kind] = _Stage(target)
+        else:
+            stage.take(target)
+        stage.seen = self.steps
+        if stage.state != state:
+            # Kernels that have been launched are loaded, which a capture must not do.
+            known = stage.graph is not None and stage.state is not None and stage.state.kernels == state.kernels
+            stage.forget()
+            stage.state = state
+            if not known:
+                return work(stage.target)
+        if stage.graph is None:
+            self._keep_pool()
+            with suppress(ops.UnknownLengthError):
+                stage.capture(work, self.stream, self.pool)
+        return work(stage.target) if stage.graph is None else stage.replay()
+
+    def _keep_pool(self) -> None:
+        """Make a graph that keeps the memory pool: torch frees a pool with its last graph."""
+        if self.keeper is not None:
+            return
+        keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=self.stream.device)
+        self.pool = torch.cuda.graph_pool_handle()
+        with _captured(keeper, self.stream, self.pool):
+            mark.add_(1)
+        self.keeper = keeper
+
+
+def beside(graphs: StepGraphs[S] | None, work: Callable[[], T]) -> T:
+    """Do work that is not part of a step; see `StepGraphs.beside`. Without graphs there is nothing to drop for it."""
+    return work() if graphs is None else graphs.beside(work)
+
+
+class _Stage(Generic[S]):
+    """Tensors that targets of one kind are copied into, and the graph that reads them."""
+
+    def __init__(self, target: S) -> None:
+        tensors = {field.name: getattr(target, field.name) for field in dataclasses.fields(target)}
+        self.tensors = {name: x.clone() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
+        self.camera = StagedCamera.like(target.camera, target.camera.device)
+        self.camera.copy_(target.camera)
+        self.target = dataclasses.replace(target, camera=self.camera, **self.tensors)
+        self.seen = 0
+        self.state: GraphKey | None = None
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self.result: StepResult | None = None
+        self.losses: torch.Tensor | None = None
+
+    def take(self, target: S) -> None:
+        """Overwrite the tensors with those of another target of the kind."""
+        for name, place in self.tensors.items():
+            place.copy_(getattr(target, name))
+        self.camera.copy_(target.camera)
+
+    def capture(self, work: Callable[[S], StepResult], stream: torch.cuda.Stream, pool: tuple[int, int] | None) -> None:
+        """Capture the work."""
+        graph = torch.cuda.CUDAGraph()
+        with _captured(graph, stream, pool):
+            self.result = work(self.target)
+            self.losses = torch.stack(list(self.result.losses.values()))
+        self.graph = graph
+
+    def replay(self) -> StepResult:
+        """Replay the captured work."""
+        assert self.graph is not None and self.result is not None and self.losses is not None
+        self.graph.replay()
+        result = self.result
+        with updating():  # the replay has done that
+            if not ops.fits(result.room):
+                self.state = None
+            # Copies: they may be read after the next replay has overwritten the graph's own.
+            losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
+            return result._replace(losses=losses, image=result.image.clone())
+
+    def forget(self) -> None:
+        """Drop the graph."""
+        self.graph = self.result = self.losses = None
+
+
+def _kind(target: StepTarget) -> Hashable:
+    """Key of a target's kind: everything but its tensors' values."""
+    camera = target.camera
+    parts: list[Hashable] = [camera.width, camera.height, camera.near, camera.viewmat.dtype]
+    for field in dataclasses.fields(target):
+        value = getattr(target, field.name)
+        if isinstance(value, torch.Tensor):
+            parts.append((field.name, value.shape, value.dtype))
+        elif field.name != "camera":
+            parts.append(value)
+    return tuple(parts)
+
+
+def can_capture(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether an optimizer's step can be captured: it says so, and its learning rates are tensors on the GPU."""
+    rates = [group["lr"] for group in optimizer.param_groups if group.get("capturable")]
+    on_gpu = all(isinstance(rate, torch.Tensor) and rate.is_cuda for rate in rates)
+    return on_gpu and len(rates) == len(optimizer.param_groups)
+
+
+def graph_key(
+    options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
+) -> GraphKey:
+    """Return the key of a step.
+
+    Args:
+        options: how the step renders.
+        optimizer: whose learning rates are tensors; a step reads and writes its moments.
+        tensors: what else a step reads and writes: the parameters and the densifier's sums.
+        densify: whether the step adds to these sums.
+    """
+    moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
+    return GraphKey(
+        (densify, options.max_hits, options.sh_degree, torch.are_deterministic_algorithms_enabled()),
+        (
+            *((x.data_ptr(), x.shape) for x in (*tensors, *moments)),
+            *(group["lr"].data_ptr() for group in optimizer.param_groups),
+        ),
+    )
