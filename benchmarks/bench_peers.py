@@ -24,6 +24,7 @@ from benchmarks.gpu_time import gpu_time
 from benchmarks.scenes import Geometry, SurfelScene, entries, fox, garden, geometry, outputs, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, ratio
+from nexwarp.kernels.types import TILE_SIZE
 
 NEARS = (0.01, 0.05, 0.2)
 HEADLINE = 0.2
@@ -131,7 +132,7 @@ def our_call(g: Geometry, max_hits: int = 2) -> Call:
         projection = g.project()
         tiles = g.tiles(projection)
         hits = g.collect(projection, tiles, max_hits)
-        starts = tile_starts(tiles.tile_offsets[:-1].view(-1, tiles.columns), tiles.tile_size, hits.stops)
+        starts = tile_starts(tiles.tile_offsets[:-1].view(-1, tiles.columns), TILE_SIZE, hits.stops)
         return entries(tiles), (hits.stops - starts).float().mean().item()
 
     return Call("ours", lambda: outputs(g.hits(max_hits)), g.leaves, walked)

@@ -24,14 +24,12 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "real": (wp.float32,),
     "storage": (wp.float16,),
     "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
-    "tile_size": (16,),
     "max_hits": (0, 1, 2, MAX_HITS),
     "degree": range(4),
     "features": (1, 2, 4, 8),
     "clamp": (False, True),
     "with_errors": (False, True),
     "fixed_point": (False, True),
-    "low_pass": (False,),
     "by_place": (False,),  # True is for CPUs
 }
 ALL = VALUES | {"max_hits": range(MAX_HITS + 1)}
@@ -45,7 +43,8 @@ def made_by(factory: Any, values: dict[str, tuple[Any, ...]]) -> Iterator[wp.Ker
     names = inspect.signature(factory).parameters
     for chosen in itertools.product(*(values[name] for name in names)):
         made = factory(*chosen)
-        yield from [made] if isinstance(made, wp.Kernel) else vars(made).values()
+        members = [made] if isinstance(made, wp.Kernel) else vars(made).values()
+        yield from (member for member in members if isinstance(member, wp.Kernel))
 
 
 def kernels(choice: str) -> Iterator[wp.Kernel]:

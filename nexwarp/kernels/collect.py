@@ -1,6 +1,6 @@
 """Collection pass, forward (paper Sec. 4.2): walk a tile's list near to far, blend, keep the K heaviest hits.
 
-A thread is a pixel (see `walk`). Read: records, centres and limits of the surfels, and the tiles' lists. Written:
+A thread is a pixel (see `walk`). Read: the surfels' records and limits, and the tiles' lists. Written:
 
     plain    N = sum over the hits outside the buffer of weight * plain colour (paper Eq. 6)
     base     the same sum over the hits in the buffer: what they would look like without a texture
@@ -9,31 +9,58 @@ A thread is a pixel (see `walk`). Read: records, centres and limits of the surfe
     stops    end of the part of the walk that was taken
 
 A hit counts where alpha >= 1/255 and its depth lies beyond `near`; the walk ends behind the hit that takes the
-transmittance below 1e-4. `collect_backward` differentiates all outputs but ids and stops with respect to records and,
-with the low-pass, centres. Frozen there: the lists, which hits count, which are in the buffer, where the walk ends.
+transmittance below 1e-4. `collect_backward` differentiates all outputs but ids and stops with respect to records.
+Frozen there: the lists, which hits count, which are in the buffer, where the walk ends.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.surfel import hit_functions
-from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import BLOCK_DIM, buffer_types, overflowed, walk, walk_functions
-from nexwarp.native.vector_loads import record_row_function
+from nexwarp.kernels.shape import alpha_at, far_outside
+from nexwarp.kernels.surfel import hit
+from nexwarp.kernels.types import TileLists, types
+from nexwarp.kernels.walk import PIXELS, block_of, overflowed, pixel_of, stage, walk
+from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
+from nexwarp.native.vector_loads import load_record, record_row
 from nexwarp.native.warp import any_in_warp, lane_index, warp_size
 
 
 @functools.cache
-def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) -> wp.Kernel:
+def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
+    """Make the types `reals` and `integers` of the K-buffer, registers of static length, and its `insert`."""
+    slots = max(max_hits, 1)  # one unused slot for K = 0
+    reals = wp.types.vector(length=slots, dtype=real)
+    integers = wp.types.vector(length=slots, dtype=wp.int32)
+
+    @wp.func
+    def insert(ids: integers, weights: reals, i: wp.int32, weight: real):
+        """Insert a hit before the first lighter one; return (ids, weights, id and weight of the hit that falls out).
+
+        That and all behind it move down by one, so that of equal ones the nearer stays. Out of an empty slot comes the
+        weight 0.
+        """
+        displaced = bool(False)
+        for j in range(wp.static(max_hits)):
+            w_ = weights[j]
+            i_ = ids[j]
+            displaced = displaced or weight > w_
+            weights[j] = wp.where(displaced, weight, w_)
+            ids[j] = wp.where(displaced, i, i_)
+            weight = wp.where(displaced, w_, weight)
+            i = wp.where(displaced, i_, i)
+        return ids, weights, i, weight
+
+    return SimpleNamespace(reals=reals, integers=integers, insert=insert)
+
+
+@functools.cache
+def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
     """Make the forward kernel."""
     t = types(real)
-    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    h = hit_functions(real, low_pass)
-    load = record_row_function(real)
-    vec, ivec, _ = buffer_types(real, max_hits)
-    w = walk_functions(real, low_pass, tile_size)
-    pixels = w.pixels
+    vec3 = t.vec3
+    buffer = hit_buffer(real, max_hits)
     ALPHA_MIN, TRANSMITTANCE_MIN, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ONE
 
     @wp.kernel(
@@ -44,125 +71,65 @@ def collect_kernel(real: type, max_hits: int, low_pass: bool, tile_size: int) ->
         # As many blocks at once as 64 registers allow.
         launch_bounds=(BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 else BLOCK_DIM,
     )
-    def collect(
-        first: wp.int32,
-        records: wp.array2d(dtype=vec4),
-        centers: wp.array(dtype=vec3),
-        limits: wp.array(dtype=real),
-        surfel_ids: wp.array(dtype=wp.int32),
-        tile_offsets: wp.array(dtype=wp.int32),
-        order: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        size: wp.vec2i,
-        tile_columns: wp.int32,
-        Ks: wp.array(dtype=mat33),
-        near: real,
-        reaches: wp.array(dtype=vec2),
-        # outputs
-        plain: wp.array(dtype=vec3),
-        base: wp.array(dtype=vec3),
-        ids: wp.array2d(dtype=wp.int32),
-        depths: wp.array2d(dtype=real),
-        weights: wp.array2d(dtype=real),
-        alphas: wp.array(dtype=real),
-        stops: wp.array(dtype=wp.int32),
-    ):
+    def collect(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, hits: t.Hits):
         thread = first + wp.tid()
-        xy, inside, d, intrinsics = w.pixel_of(thread, tile_columns, size, Ks)
-        middle, half = w.block_of(xy, intrinsics)
-        focal = vec2(intrinsics[0], intrinsics[1])
+        xy, inside, d = pixel_of(thread, view)
+        middle, half = block_of(xy, view)
         # Threads outside the image cull along: all lanes of a warp must reach the votes together. They hit nothing, as
         # pixels whose walk has ended: their transmittance is too low.
         transmittance = real(1.0)
         if not inside:
             transmittance = real(0.0)
         color = vec3()
-        buffer_ids = ivec()
-        buffer_weights = vec()
+        ids = buffer.integers()
+        weights = buffer.reals()
         for j in range(wp.static(max_hits)):
-            buffer_ids[j] = -1
-        overflow = overflowed(ends, surfel_ids)
-        bounds = walk(thread // pixels, tile_offsets, ends, overflow)
+            ids[j] = -1
+        overflow = overflowed(lists)
+        bounds = walk(thread // PIXELS, lists, overflow)
         stop = int(bounds[0])
         width = warp_size()
         lane = lane_index()
         for batch in range(bounds[0], bounds[1], width):
             if any_in_warp(wp.where(transmittance >= TRANSMITTANCE_MIN, 1, 0)) == 0:
                 break
-            batch_size = w.stage(
-                batch + lane,
-                bounds[1],
-                surfel_ids,
-                order,
-                overflow,
-                records,
-                centers,
-                limits,
-                reaches,
-                middle,
-                half,
-                focal,
-            )
-            for k in range(batch_size[0]):
-                name = w.staged(k, batch_size[1], batch)
+            staged = stage(batch + lane, bounds[1], surfels, lists, overflow, middle, half)
+            for slot in range(staged[0]):
+                name = staged_name(slot, staged[1], batch)
                 i = name[0]
-                ra = w.staged_row(k, 0, records, i)
-                rb = w.staged_row(k, 1, records, i)
-                rn = w.staged_row(k, 2, records, i)
-                rc = w.staged_row(k, 3, records, i)
-                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
+                a, b, n, c = staged_record(slot, surfels.records, i)
+                u, v, depth = hit(a, b, n, c[3], d)
                 alpha = real(0.0)
                 # On a GPU some lane nearly always needs the exponentials.
-                if width > 1 or not h.far_outside(u, v, limits[i]):
-                    center = vec3()
-                    if wp.static(low_pass):
-                        center = centers[i]
-                    alpha, depth = h.kernel(u, v, depth, ra, rb, rn, center, d[0], d[1], focal, near)
-                if alpha >= ALPHA_MIN and depth > near and transmittance >= TRANSMITTANCE_MIN:
+                if width > 1 or not far_outside(u, v, surfels.limits[i]):
+                    alpha = alpha_at(u, v, a[3], b[3], n[3])
+                if alpha >= ALPHA_MIN and depth > view.near and transmittance >= TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)
                     stop = name[1] + 1
-                    out_id = int(i)
-                    out_weight = real(weight)
                     if wp.static(max_hits > 0):
-                        if weight > buffer_weights[wp.static(max_hits - 1)]:
-                            # Insert into the buffer before the first lighter hit, and move that and all behind it down
-                            # by one, so that of equal ones the nearer stays; what falls out is blended as plain.
-                            displaced = bool(False)
-                            for j in range(wp.static(max_hits)):
-                                w_ = buffer_weights[j]
-                                i_ = buffer_ids[j]
-                                displaced = displaced or out_weight > w_
-                                buffer_weights[j] = wp.where(displaced, out_weight, w_)
-                                buffer_ids[j] = wp.where(displaced, out_id, i_)
-                                out_weight = wp.where(displaced, w_, out_weight)
-                                out_id = wp.where(displaced, i_, out_id)
-                            # Its colour is read again: colours in the buffer would cost registers and moves. Out of an
-                            # empty slot comes the weight 0.
-                            rc = load(records, wp.max(out_id, 0), 3)
-                    color += vec3(rc[0], rc[1], rc[2]) * out_weight
+                        if weight > weights[wp.static(max_hits - 1)]:
+                            ids, weights, i, weight = buffer.insert(ids, weights, i, weight)
+                            # Its colour is read again: colours in the buffer would cost registers and moves.
+                            c = record_row(surfels.records, wp.max(i, 0), 3)
+                    color += vec3(c[0], c[1], c[2]) * weight
         if not inside:
             return
-        p = xy[1] * size[0] + xy[0]
-        plain[p] = color
-        kept = vec3()
+        p = xy[1] * view.size[0] + xy[0]
+        base = vec3()
         for j in range(wp.static(max_hits)):
-            i = buffer_ids[j]
+            i = ids[j]
             depth = real(0.0)
             if i >= 0:
-                ra = load(records, i, 0)
-                rb = load(records, i, 1)
-                rn = load(records, i, 2)
-                rc = load(records, i, 3)
-                kept += vec3(rc[0], rc[1], rc[2]) * buffer_weights[j]
-                u, v, depth = h.plane(ra, rb, rn, rc[3], d[0], d[1])
-                if wp.static(low_pass):
-                    _alpha, depth = h.kernel(u, v, depth, ra, rb, rn, centers[i], d[0], d[1], focal, near)
-            ids[p, j] = i
-            depths[p, j] = depth
-            weights[p, j] = buffer_weights[j]
-        base[p] = kept
-        alphas[p] = ONE - transmittance
-        stops[p] = stop
+                a, b, n, c = load_record(surfels.records, i)
+                base += vec3(c[0], c[1], c[2]) * weights[j]
+                u, v, depth = hit(a, b, n, c[3], d)
+            hits.ids[p, j] = i
+            hits.depths[p, j] = depth
+            hits.weights[p, j] = weights[j]
+        hits.plain[p] = color
+        hits.base[p] = base
+        hits.alphas[p] = ONE - transmittance
+        hits.stops[p] = stop
 
     return collect

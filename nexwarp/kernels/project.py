@@ -2,7 +2,7 @@
 
 A thread is a surfel. Read: means, rotations, scales, opacities, gammas, plain colours and the world-to-camera matrix.
 Written: records, centres and limits; backward, the gradients of every float input, that of the matrix a surfel, from
-those of records and centres. Limits only cull and are frozen. The backward kernel writes what `wp.grad` gives for the
+those of records. Centres sort and limits cull: both are frozen. The backward kernel writes what `wp.grad` gives for the
 product of outputs and their gradients: Warp's own adjoint, which serves tapes, adds by atomics to rows that only one
 thread has.
 """
@@ -12,12 +12,40 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.surfel import frame_functions
-from nexwarp.kernels.types import LIMIT_MARGIN, types
-from nexwarp.native.vector_loads import record_row_function, store_record_row_function
+from nexwarp.kernels.shape import exponent_limit
+from nexwarp.kernels.surfel import axes, rotate, translation
+from nexwarp.kernels.types import Mat44, Vec2, Vec3, Vec4, types
+from nexwarp.native.vector_loads import load_record, store_record_row
 
 # Nobody sees a surfel as small: its inverse is finite, and so are products with what a scene has else.
-SMALLEST_SCALE = 1e-20
+SMALLEST_SCALE = wp.constant(wp.float64(1e-20))
+
+
+@wp.func
+def placed(mean: Vec3, quat: Vec4, scale: Vec2, viewmat: Mat44):
+    """(a, b, n, c) of the surfel's record, see `surfel`."""
+    x, y, z = axes(quat)
+    center = rotate(viewmat, mean) + translation(viewmat)
+    v1 = rotate(viewmat, x)
+    v2 = rotate(viewmat, y)
+    n = rotate(viewmat, z)
+    # Not vectors over scalars: the adjoint of those has the square of the scale, which may be too small for it.
+    one = scale.dtype(1.0)
+    a = wp.cross(v2, center) * (one / wp.max(scale[0], scale.dtype(SMALLEST_SCALE)))
+    b = wp.cross(center, v1) * (one / wp.max(scale[1], scale.dtype(SMALLEST_SCALE)))
+    return a, b, n, center
+
+
+@wp.func
+def placed_dot(mean: Vec3, quat: Vec4, scale: Vec2, viewmat: Mat44, grad_a: Vec4, grad_b: Vec4, grad_n: Vec4, m: Vec4):
+    """Sum of outputs * gradients, those of m in m[3]: its gradient is the vector-Jacobian product."""
+    a, b, n, center = placed(mean, quat, scale, viewmat)
+    return (
+        wp.dot(a, wp.vector(grad_a[0], grad_a[1], grad_a[2]))
+        + wp.dot(b, wp.vector(grad_b[0], grad_b[1], grad_b[2]))
+        + wp.dot(n, wp.vector(grad_n[0], grad_n[1], grad_n[2]))
+        + wp.dot(center, n) * m[3]
+    )
 
 
 @functools.cache
@@ -25,51 +53,6 @@ def project_kernels(real: type) -> SimpleNamespace:
     """Make the projection kernel and its derivative."""
     t = types(real)
     vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
-    f = frame_functions(real)
-    ONE, TWO, TINY, MARGIN = t.ONE, t.TWO, t.TINY, wp.constant(real(LIMIT_MARGIN))
-    SMALLEST = wp.constant(real(SMALLEST_SCALE))
-
-    load, store = record_row_function(real), store_record_row_function(real)
-
-    @wp.func
-    def placed(
-        mean: vec3,
-        quat: vec4,
-        scale: vec2,
-        viewmat: mat44,
-    ):
-        """(a, b, n, c) of the surfel's record, see `surfel`."""
-        axes = f.rotation(quat)
-        center = f.rotate(viewmat, mean) + f.translation(viewmat)
-        v1 = f.rotate(viewmat, vec3(axes[0, 0], axes[1, 0], axes[2, 0]))
-        v2 = f.rotate(viewmat, vec3(axes[0, 1], axes[1, 1], axes[2, 1]))
-        n = f.rotate(viewmat, vec3(axes[0, 2], axes[1, 2], axes[2, 2]))
-        # Not vectors over scalars: the adjoint of those has the square of the scale, which may be too small for it.
-        a = wp.cross(v2, center) * (ONE / wp.max(scale[0], SMALLEST))
-        b = wp.cross(center, v1) * (ONE / wp.max(scale[1], SMALLEST))
-        return a, b, n, center
-
-    @wp.func
-    def placed_dot(
-        mean: vec3,
-        quat: vec4,
-        scale: vec2,
-        viewmat: mat44,
-        grad_a: vec3,
-        grad_b: vec3,
-        grad_n: vec3,
-        grad_m: real,
-        grad_center: vec3,
-    ):
-        """Sum of outputs * gradients: its gradient is the vector-Jacobian product."""
-        a, b, n, center = placed(mean, quat, scale, viewmat)
-        return (
-            wp.dot(a, grad_a)
-            + wp.dot(b, grad_b)
-            + wp.dot(n, grad_n)
-            + wp.dot(center, n) * grad_m
-            + wp.dot(center, grad_center)
-        )
 
     @wp.kernel(module="unique")
     def project(
@@ -89,12 +72,12 @@ def project_kernels(real: type) -> SimpleNamespace:
         i = first + wp.tid()
         a, b, n, center = placed(means[i], quats[i], scales[i], viewmats[0])
         color = colors[i]
-        store(records, i, 0, vec4(a[0], a[1], a[2], opacities[i]))
-        store(records, i, 1, vec4(b[0], b[1], b[2], gammas[i][0]))
-        store(records, i, 2, vec4(n[0], n[1], n[2], gammas[i][1]))
-        store(records, i, 3, vec4(color[0], color[1], color[2], wp.dot(center, n)))
+        store_record_row(records, i, 0, vec4(a[0], a[1], a[2], opacities[i]))
+        store_record_row(records, i, 1, vec4(b[0], b[1], b[2], gammas[i][0]))
+        store_record_row(records, i, 2, vec4(n[0], n[1], n[2], gammas[i][1]))
+        store_record_row(records, i, 3, vec4(color[0], color[1], color[2], wp.dot(center, n)))
         centers[i] = center
-        limits[i] = TWO * wp.log(real(255.0) * wp.max(opacities[i], TINY)) + MARGIN
+        limits[i] = exponent_limit(opacities[i])
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_backward(
@@ -104,7 +87,6 @@ def project_kernels(real: type) -> SimpleNamespace:
         scales: wp.array(dtype=vec2),
         viewmats: wp.array(dtype=mat44),
         grad_records: wp.array2d(dtype=vec4),
-        grad_centers: wp.array(dtype=vec3),
         # outputs
         grad_means: wp.array(dtype=vec3),
         grad_quats: wp.array(dtype=vec4),
@@ -115,30 +97,16 @@ def project_kernels(real: type) -> SimpleNamespace:
         grad_viewmats: wp.array(dtype=mat44),
     ):
         i = first + wp.tid()
-        r0 = load(grad_records, i, 0)
-        r1 = load(grad_records, i, 1)
-        r2 = load(grad_records, i, 2)
-        r3 = load(grad_records, i, 3)
-        grad_center = vec3()
-        if grad_centers:
-            grad_center = grad_centers[i]
-        mean, quat, scale, viewmat, _a, _b, _n, _m, _c = wp.grad(placed_dot)(
-            means[i],
-            quats[i],
-            scales[i],
-            viewmats[0],
-            vec3(r0[0], r0[1], r0[2]),
-            vec3(r1[0], r1[1], r1[2]),
-            vec3(r2[0], r2[1], r2[2]),
-            r3[3],
-            grad_center,
+        a, b, n, c = load_record(grad_records, i)
+        mean, quat, scale, viewmat, _a, _b, _n, _c = wp.grad(placed_dot)(
+            means[i], quats[i], scales[i], viewmats[0], a, b, n, c
         )
         grad_means[i] = mean
         grad_quats[i] = quat
         grad_scales[i] = scale
-        grad_opacities[i] = r0[3]
-        grad_gammas[i] = vec2(r1[3], r2[3])
-        grad_colors[i] = vec3(r3[0], r3[1], r3[2])
+        grad_opacities[i] = a[3]
+        grad_gammas[i] = vec2(b[3], n[3])
+        grad_colors[i] = vec3(c[0], c[1], c[2])
         if grad_viewmats:
             grad_viewmats[i] = viewmat
 

@@ -48,7 +48,7 @@ def list_threads(surfels: int, on_gpu: bool) -> int:
 
 
 @functools.cache
-def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
+def list_kernels(real: type) -> SimpleNamespace:
     """Make the kernels that count and emit (tile, surfel) entries, a thread a surfel in depth order.
 
     `count` gives each surfel's entries. `emit` reads the sums of these along the order, `totals`, and repeats them as
@@ -57,8 +57,7 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     last entry get the tile `no_tile`.
     """
     t = types(real)
-    vec2, vec3 = t.vec2, t.vec3
-    span = span_function(real, low_pass, tile_size)
+    span = span_function(real)
 
     @wp.func
     def shared_row(
@@ -67,10 +66,7 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         i: wp.int32,
         start: wp.int32,
         tile_columns: wp.int32,
-        corners: wp.array2d(dtype=vec2),
-        shapes: wp.array(dtype=wp.vec3i),
-        margins: wp.array(dtype=real),
-        discs: wp.array(dtype=vec3),
+        polygons: t.Polygons,
     ):
         """(surfel, tile row, first tile, number of tiles) of one of the warp's `rows` rows.
 
@@ -81,19 +77,19 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         row = place - from_lane(start, owner)
         s = wp.vec2i(0, -1)
         if place < rows:
-            shape = shapes[surfel]
+            shape = polygons.shapes[surfel]
             row += shape[1]
-            s = span(surfel, row, tile_columns, shape[0], corners, margins[surfel], discs)
+            s = span(surfel, row, tile_columns, shape[0], polygons)
         return surfel, row, s[0], wp.max(s[1] - s[0] + 1, 0)
 
     @wp.func
-    def rows_of(thread: wp.int32, order: wp.array(dtype=wp.int32), shapes: wp.array(dtype=wp.vec3i)):
+    def rows_of(thread: wp.int32, order: wp.array(dtype=wp.int32), polygons: t.Polygons):
         """(surfel, its number of tile rows) of a thread."""
         i = int(0)
         rows = int(0)
         if thread < order.shape[0]:
             i = order[thread]
-            shape = shapes[i]
+            shape = polygons.shapes[i]
             rows = wp.max(shape[2] - shape[1] + 1, 0)
         return i, rows
 
@@ -101,25 +97,20 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     def count(
         first: wp.int32,
         order: wp.array(dtype=wp.int32),
-        corners: wp.array2d(dtype=vec2),
-        shapes: wp.array(dtype=wp.vec3i),
-        margins: wp.array(dtype=real),
-        discs: wp.array(dtype=vec3),
+        polygons: t.Polygons,
         grid: wp.vec2i,
         # outputs
         counts: wp.array(dtype=wp.int64),
     ):
         thread = first + wp.tid()
-        i, rows = rows_of(thread, order, shapes)
+        i, rows = rows_of(thread, order, polygons)
         end = warp_running_sum(rows)
         start = end - rows
         width = warp_size()
         all_rows = from_lane(end, width - 1)
         total = int(0)
         for batch in range(0, all_rows, width):
-            _surfel, _row, _left, tiles = shared_row(
-                batch + lane_index(), all_rows, i, start, grid[0], corners, shapes, margins, discs
-            )
+            _surfel, _row, _left, tiles = shared_row(batch + lane_index(), all_rows, i, start, grid[0], polygons)
             sums = warp_running_sum(tiles)
             # Those of this lane's rows that are in the batch.
             low = wp.clamp(start - batch, 0, width)
@@ -137,10 +128,7 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
     def emit(
         first: wp.int32,
         order: wp.array(dtype=wp.int32),
-        corners: wp.array2d(dtype=vec2),
-        shapes: wp.array(dtype=wp.vec3i),
-        margins: wp.array(dtype=real),
-        discs: wp.array(dtype=vec3),
+        polygons: t.Polygons,
         grid: wp.vec2i,
         totals: wp.array(dtype=wp.int64),
         threads: wp.int32,
@@ -163,16 +151,14 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
         if thread > lane:
             e = int(wp.min(totals[thread - lane - 1], room))
         end = int(wp.min(totals[wp.min(thread - lane + width, surfel_count) - 1], room))
-        i, rows = rows_of(thread, order, shapes)
+        i, rows = rows_of(thread, order, polygons)
         start = warp_running_sum(rows)
         all_rows = from_lane(start, width - 1)
         start -= rows
         if e >= end:
             all_rows = int(0)
         for batch in range(0, all_rows, width):
-            surfel, row, left, number = shared_row(
-                batch + lane, all_rows, i, start, grid[0], corners, shapes, margins, discs
-            )
+            surfel, row, left, number = shared_row(batch + lane, all_rows, i, start, grid[0], polygons)
             begin = warp_running_sum(number)
             all_tiles = from_lane(begin, width - 1)
             begin -= number
@@ -181,16 +167,16 @@ def list_kernels(real: type, low_pass: bool, tile_size: int) -> SimpleNamespace:
                 place = part + lane
                 owner = owner_lane(begin, place)
                 tile = from_lane(left, owner) + place
-                found = from_lane(surfel, owner)
+                owned = from_lane(surfel, owner)
                 at = e + place
                 # A compiler may round here otherwise than in `count`: the next warp's entries begin at `end`.
                 if place < all_tiles and at < end:
                     tiles[at] = tile
                     if surfels:
                         entries[at] = at
-                        surfels[at] = found
+                        surfels[at] = owned
                     else:
-                        entries[at] = found
+                        entries[at] = owned
             e = wp.min(e + all_tiles, end)
         for at in range(e + lane, end, width):
             tiles[at] = no_tile

@@ -11,23 +11,34 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.surfel import frame_functions
-from nexwarp.kernels.types import types
+from nexwarp.kernels.surfel import intrinsics_of, ray_through, rotate_back, translation
+from nexwarp.kernels.types import Mat33, Mat44, Vec3, types
+
+
+@wp.func
+def ray_of(p: int, width: int, K: Mat33):
+    """Direction through pixel p in the camera frame; its z is 1."""
+    half = K.dtype(0.5)
+    d = ray_through(K.dtype(float(p % width)) + half, K.dtype(float(p // width)) + half, intrinsics_of(K))
+    return wp.vector(d[0], d[1], K.dtype(1.0))
+
+
+@wp.func
+def direction_dot(viewmat: Mat44, ray: Vec3, grad: Vec3):
+    return wp.dot(wp.normalize(rotate_back(viewmat, ray)), grad)
+
+
+@wp.func
+def position_dot(viewmat: Mat44, point: Vec3, grad: Vec3):
+    """Of a point in the camera frame."""
+    return wp.dot(rotate_back(viewmat, point - translation(viewmat)), grad)
 
 
 @functools.cache
 def unproject_kernels(real: type) -> SimpleNamespace:
     """Make the kernel and its derivative."""
     t = types(real)
-    vec3, vec4, mat33, mat44 = t.vec3, t.vec4, t.mat33, t.mat44
-    f = frame_functions(real)
-
-    @wp.func
-    def ray_of(p: int, width: int, intrinsics: vec4):
-        """Direction through pixel p in the camera frame; its z is 1."""
-        x = (real(float(p % width)) + real(0.5) - intrinsics[2]) / intrinsics[0]
-        y = (real(float(p // width)) + real(0.5) - intrinsics[3]) / intrinsics[1]
-        return vec3(x, y, real(1.0))
+    vec3, mat33, mat44 = t.vec3, t.mat33, t.mat44
 
     @wp.kernel(module="unique")
     def unproject(
@@ -42,20 +53,11 @@ def unproject_kernels(real: type) -> SimpleNamespace:
     ):
         p = first + wp.tid()
         viewmat = viewmats[0]
-        ray = f.rotate_back(viewmat, ray_of(p, width, f.intrinsics_of(Ks)))
-        origin = -f.rotate_back(viewmat, f.translation(viewmat))
+        ray = rotate_back(viewmat, ray_of(p, width, Ks[0]))
+        origin = -rotate_back(viewmat, translation(viewmat))
         directions[p] = wp.normalize(ray)
         for h in range(depths.shape[1]):
             positions[p, h] = origin + ray * depths[p, h]
-
-    @wp.func
-    def direction_dot(viewmat: mat44, ray: vec3, grad: vec3):
-        return wp.dot(wp.normalize(f.rotate_back(viewmat, ray)), grad)
-
-    @wp.func
-    def position_dot(viewmat: mat44, point: vec3, grad: vec3):
-        """Of a point in the camera frame."""
-        return wp.dot(f.rotate_back(viewmat, point - f.translation(viewmat)), grad)
 
     @wp.kernel(enable_backward=False, module="unique")
     def unproject_backward(
@@ -72,8 +74,8 @@ def unproject_kernels(real: type) -> SimpleNamespace:
     ):
         p = first + wp.tid()
         viewmat = viewmats[0]
-        d = ray_of(p, width, f.intrinsics_of(Ks))
-        ray = f.rotate_back(viewmat, d)
+        d = ray_of(p, width, Ks[0])
+        ray = rotate_back(viewmat, d)
         grad_viewmat = mat44()
         if grad_directions:
             if grad_viewmats:

@@ -15,7 +15,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records, reaches_of
+from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records
 from nexwarp.ops.tiles import Order
 
 MAX_JITTER = 1000.0  # pixels
@@ -369,7 +369,7 @@ def _ray_hits(shape: Activated, projection: ops.Projection, camera: RayCamera, o
     else:
         keys = projection.centers[:, 2]
     records = ray_records(projection, _axes(shape, camera.viewmat) if camera.parallel else None)
-    tiles = intersect_rays(records, reaches_of(shape.opacities, shape.gammas), keys, camera.rays)
+    tiles = intersect_rays(records, keys, camera.rays)
     rays, near, viewmat = camera.rays, camera.near, camera.viewmat
     return collect_rays(records, projection.limits, tiles, rays, near, viewmat, max_hits=options.max_hits)
 

@@ -5,17 +5,22 @@ record and the next, so that the compiler computes two at once. On a CPU a warp 
 reads the record itself.
 """
 
-import functools
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
+
+from nexwarp.native import for_both_reals
+from nexwarp.native.vector_loads import load_record
+
+# Of a CUDA block whose warps stage records.
+BLOCK_DIM = 128
 
 # One function writes and reads, since a shared array belongs to the function that declares it: step 0 writes, step
 # j + 1 reads row j. Rows of neighbouring slots are neighbours, so that writes meet no bank twice.
 _ROW = """
 #if defined(__CUDA_ARCH__)
     struct __align__(16) Row { REAL x, y, z, w; };
-    __shared__ Row rows[WARPS * 4 * 32];
+    __shared__ Row rows[4 * BLOCK_DIM];
     Row* mine = rows + (threadIdx.x >> 5) * 128 + slot;
     if (step == 0) {
         mine[0] = {a.c[0], a.c[1], a.c[2], a.c[3]};
@@ -33,7 +38,7 @@ _ROW = """
 
 _NAME = """
 #if defined(__CUDA_ARCH__)
-    __shared__ int2 names[WARPS * 32];
+    __shared__ int2 names[BLOCK_DIM];
     int2* mine = names + (threadIdx.x >> 5) * 32 + slot;
     if (step == 0) *mine = make_int2(i, place);
     const int2 name = *mine;
@@ -44,20 +49,13 @@ _NAME = """
 """
 
 
-@functools.cache
-def staging_functions(real: type, threads: int) -> SimpleNamespace:
-    """Make the functions that stage records (four vec4 each, see `surfel`) in blocks of `threads` threads.
-
-    `put(slot, i, place, a, b, n, c)` stages the surfel i, which is at a place of the walk, with the rows of its record.
-    `name(slot, i, place)` returns (i, place) of a slot, and `row(slot, j, records, i)` row j of its record. On a CPU
-    these return what they are given, and the record i's.
-    """
+@for_both_reals
+def _access(real: type) -> wp.Function:
     vec4 = wp.types.vector(length=4, dtype=real)
     kind = "float" if real is wp.float32 else "double"
-    snippet = _ROW.replace("REAL", kind).replace("WARPS", str(threads // 32))
 
-    @wp.func_native(snippet)
-    def access(
+    @wp.func_native(_ROW.replace("REAL", kind).replace("BLOCK_DIM", str(BLOCK_DIM)))
+    def access_row(
         step: wp.int32,
         slot: wp.int32,
         a: vec4,
@@ -68,30 +66,34 @@ def staging_functions(real: type, threads: int) -> SimpleNamespace:
         i: wp.int32,
     ) -> vec4: ...
 
-    @wp.func_native(_NAME.replace("WARPS", str(threads // 32)))
-    def access_name(step: wp.int32, slot: wp.int32, i: wp.int32, place: wp.int32) -> wp.vec2i: ...
+    return access_row
 
-    @wp.func
-    def put(
-        slot: wp.int32,
-        i: wp.int32,
-        place: wp.int32,
-        a: vec4,
-        b: vec4,
-        n: vec4,
-        c: vec4,
-        records: wp.array2d(dtype=vec4),
-    ):
-        access(0, slot, a, b, n, c, records, i)
-        access_name(0, slot, i, place)
 
-    @wp.func
-    def name(slot: wp.int32, i: wp.int32, place: wp.int32):
-        return access_name(1, slot, i, place)
+@wp.func_native(_NAME.replace("BLOCK_DIM", str(BLOCK_DIM)))
+def _access_name(step: wp.int32, slot: wp.int32, i: wp.int32, place: wp.int32) -> wp.vec2i: ...
 
-    @wp.func
-    def row(slot: wp.int32, j: wp.int32, records: wp.array2d(dtype=vec4), i: wp.int32):
-        none = vec4()
-        return access(j + 1, slot, none, none, none, none, records, i)
 
-    return SimpleNamespace(put=put, name=name, row=row)
+@wp.func
+def stage_record(slot: wp.int32, i: wp.int32, place: wp.int32, records: Any):
+    """Stage the record of the surfel i, which is at a place of the walk."""
+    a, b, n, c = load_record(records, i)
+    _access(0, slot, a, b, n, c, records, i)
+    _access_name(0, slot, i, place)
+
+
+@wp.func
+def staged_name(slot: wp.int32, i: wp.int32, place: wp.int32):
+    """(surfel, place) of a slot; on a CPU, those given."""
+    return _access_name(1, slot, i, place)
+
+
+@wp.func
+def staged_record(slot: wp.int32, records: Any, i: wp.int32):
+    """(a, b, n, c) rows of a slot's record; on a CPU, of the record i."""
+    none = type(records[0, 0])()
+    return (
+        _access(1, slot, none, none, none, none, records, i),
+        _access(2, slot, none, none, none, none, records, i),
+        _access(3, slot, none, none, none, none, records, i),
+        _access(4, slot, none, none, none, none, records, i),
+    )

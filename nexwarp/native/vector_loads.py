@@ -4,8 +4,11 @@ Rows must be aligned to their own size, as rows of whole arrays from an allocato
 """
 
 import functools
+from typing import Any
 
 import warp as wp
+
+from nexwarp.native import for_both_reals
 
 _LOAD_FLOAT4 = """
 #if defined(__CUDA_ARCH__)
@@ -95,9 +98,20 @@ def load_function(length: int, scalar: type) -> wp.Function:
     return load
 
 
-@functools.cache
-def record_row_function(real: type) -> wp.Function:
-    """Make the function that returns row j of the record i (see `surfel`), records being contiguous, (N, 4) vec4."""
+@for_both_reals
+def load_pair(real: type) -> wp.Function:
+    """Return rows[i, j], a vec2, in one load."""
+    pair = wp.types.vector(length=2, dtype=real)
+
+    @wp.func_native(_SNIPPETS.get((2, real), "    return wp::index(rows, i, j);"))
+    def load_pair(rows: wp.array2d(dtype=pair), i: wp.int32, j: wp.int32) -> pair: ...
+
+    return load_pair
+
+
+@for_both_reals
+def record_row(real: type) -> wp.Function:
+    """Return row j of the record i (see `surfel`), records being contiguous, (N, 4) vec4."""
     row = wp.types.vector(length=4, dtype=real)
     exact = "    return records.data[4 * (size_t)i + j];"
 
@@ -107,9 +121,15 @@ def record_row_function(real: type) -> wp.Function:
     return record_row
 
 
-@functools.cache
-def store_record_row_function(real: type) -> wp.Function:
-    """Make the function that writes row j of the record i; differentiable."""
+@wp.func
+def load_record(records: Any, i: wp.int32):
+    """(a, b, n, c) rows of the record i."""
+    return record_row(records, i, 0), record_row(records, i, 1), record_row(records, i, 2), record_row(records, i, 3)
+
+
+@for_both_reals
+def store_record_row(real: type) -> wp.Function:
+    """Write row j of the record i; differentiable."""
     row_type = wp.types.vector(length=4, dtype=real)
     exact = "    records.data[4 * (size_t)i + j] = row;"
 

@@ -8,8 +8,7 @@ from nexwarp.ops.expose import expose
 from nexwarp.ops.graphs import captured
 from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
-from nexwarp.ops.pinhole import Pinhole
-from nexwarp.ops.project import Projection, project
+from nexwarp.ops.project import Pinhole, Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import DifferentiableSurface, Surface, surface
 from nexwarp.ops.texture import texture

@@ -72,6 +72,21 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
+def _itself(value: Argument) -> Argument:
+    return value
+
+
+def struct(kind: Any, **fields: Argument) -> Argument:
+    """Make a `wp.struct` argument of arrays, scalars and vectors; None is an array that is not there."""
+    kind.ctype.__ctype__ = _itself  # how Warp asks its own instances
+    value = kind.ctype()
+    for name, field in fields.items():
+        if field is not None:
+            setattr(value, name, field)
+    value.fields = fields  # views of arrays keep their tensors alive
+    return value
+
+
 @functools.lru_cache(maxsize=64)
 def _array_at(pointer: int, length: int, dtype: type, kind: str, index: int | None) -> "wp.array[Any]":
     return wp.array(ptr=pointer, dtype=dtype, shape=(length,), device=_device(kind, index))

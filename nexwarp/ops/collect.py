@@ -1,6 +1,7 @@
 """Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -8,11 +9,10 @@ from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
-from nexwarp.kernels.collect_backward import collect_backward_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types
 from nexwarp.kernels.reduce import reduce_slots_kernel
-from nexwarp.kernels.splat_error import splat_error_kernel
-from nexwarp.kernels.types import MAX_HITS, types
-from nexwarp.kernels.walk import BLOCK_DIM
+from nexwarp.kernels.types import MAX_HITS, TILE_SIZE, TileLists, types
+from nexwarp.native.staging import BLOCK_DIM
 from nexwarp.ops._interop import (
     Argument,
     Context,
@@ -20,11 +20,11 @@ from nexwarp.ops._interop import (
     from_fixed_point,
     launch,
     real_of,
+    struct,
     sums_in_fixed_point,
     sums_like,
 )
-from nexwarp.ops.pinhole import Pinhole
-from nexwarp.ops.project import Projection
+from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
 
 
@@ -66,43 +66,24 @@ class Hits:
     error_request: SplatErrorRequest
 
 
-def collect(
-    projection: Projection, tiles: Tiles, camera: Pinhole, *, max_hits: int = 2, low_pass: bool = False
-) -> Hits:
-    """Walk every pixel's list front to back; differentiable with respect to the projection.
+def collect(projection: Projection, tiles: Tiles, camera: Pinhole, *, max_hits: int = 2) -> Hits:
+    """Walk every pixel's list front to back; differentiable with respect to the projection's records.
 
     Args:
         projection: surfels in the camera's frame.
         tiles: their lists.
         camera: the image plane.
         max_hits: K, length of the buffer, 0 to 8.
-        low_pass: use max(surfel, screen-space Gaussian) as the kernel, for surfels smaller than a pixel.
     """
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
     request = SplatErrorRequest()
-    buffers = _Collect.apply(
-        projection.records.contiguous(),
-        projection.centers,
-        projection.limits,
-        tiles,
-        camera,
-        max_hits,
-        low_pass,
-        request,
-    )
-    plain, base, ids, depths, weights, alpha, stops = buffers
-    return Hits(plain, base, ids, depths, weights, alpha, stops, request)
+    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
+    return Hits(*_Collect.apply(projection.records, scene, max_hits, request), request)
 
 
 def splat_error(
-    projection: Projection,
-    tiles: Tiles,
-    hits: Hits,
-    camera: Pinhole,
-    errors: torch.Tensor,
-    *,
-    low_pass: bool = False,
+    projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, errors: torch.Tensor
 ) -> torch.Tensor:
     """Give each surfel the sum over pixels of its blending weight times the pixel's error.
 
@@ -112,54 +93,62 @@ def splat_error(
         hits: as returned by `collect`.
         camera: as given to `collect`.
         errors: (H, W) error of each pixel, >= 0.
-        low_pass: as given to `collect`.
 
     Returns:
         (N,) blended errors. Not differentiable.
     """
     check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
-    records = projection.records.detach()
-    real = real_of(records)
-    sums = SlotSums(records, tiles)
-    slots = sums.new()
-    errors = errors.detach().to(records.dtype).contiguous()
-    inputs = walk_inputs(records, projection.centers.detach(), projection.limits, tiles, camera)
-    pixels = [sums.slots, array(hits.stops.view(-1), wp.int32), array(errors.view(-1), real)]
-    variant = (real, low_pass, tiles.tile_size)
-    kernel = splat_error_kernel(*variant, sums.fixed_point)
-    launch_walk(records, kernel, tiles, inputs + pixels, [sums.array(slots, real), sums.bad_array])
-    return sums.reduce(slots[:, None], real)[:, 0]
+    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
+    outputs = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
+    outputs = tuple(x.detach() for x in outputs)
+    plain, base, _ids, depths, weights, alpha, _stops = (torch.zeros_like(x) for x in outputs)
+    errors = errors.detach().to(scene.records.dtype).contiguous()
+    _, sums = _backward(scene, outputs, (plain, base, depths, weights, alpha), errors)
+    assert sums is not None
+    return sums
 
 
-def launch_walk(
-    like: torch.Tensor, kernel: wp.Kernel, tiles: Tiles, inputs: list[Argument], outputs: list[Argument]
-) -> None:
-    """Launch a kernel over the pixels of all tiles."""
-    pixels = tiles.tile_size**2
-    count = (len(tiles.tile_offsets) - 1) * pixels
+class Walked(NamedTuple):
+    """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane."""
+
+    records: torch.Tensor
+    limits: torch.Tensor
+    tiles: Tiles
+    camera: Pinhole
+
+    @property
+    def real(self) -> type:
+        """Warp's scalar type."""
+        return real_of(self.records)
+
+    def arguments(self) -> list[Argument]:
+        """The structs `Surfels`, `TileLists` and `View` of the kernels."""
+        t, tiles, camera = types(self.real), self.tiles, self.camera
+        records, limits, reaches = array(self.records, t.vec4), array(self.limits, t.real), array(tiles.reaches, t.vec2)
+        lists = {name: array(getattr(tiles, name), wp.int32) for name in TileLists.vars}
+        return [
+            struct(t.Surfels, records=records, limits=limits, reaches=reaches),
+            struct(TileLists, **lists),
+            view_of(camera, t.real, tiles.columns),
+        ]
+
+    def launch(self, kernel: wp.Kernel, arguments: list[Argument]) -> None:
+        """Launch a kernel over the pixels of all tiles, with these arguments behind those of `arguments`."""
+        launch_pixels(self.records, kernel, len(self.tiles.tile_offsets) - 1, [*self.arguments(), *arguments])
+
+
+def view_of(camera: Pinhole, real: type, columns: int) -> Argument:
+    """The image plane as the kernels read it; `columns` tiles in a row."""
+    t = types(real)
+    K, size = array(camera.K.contiguous()[None], t.mat33), wp.vec2i(camera.width, camera.height)
+    return struct(t.View, Ks=K, size=size, tile_columns=columns, near=camera.near)
+
+
+def launch_pixels(like: torch.Tensor, kernel: wp.Kernel, tiles: int, arguments: list[Argument]) -> None:
+    """Launch a kernel over the pixels of a number of tiles."""
+    pixels = TILE_SIZE**2
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    launch(like, kernel, count, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
-
-
-def walk_inputs(
-    records: torch.Tensor,
-    centers: torch.Tensor,
-    limits: torch.Tensor,
-    tiles: Tiles,
-    camera: Pinhole,
-) -> list[Argument]:
-    """Arguments that the kernels share, from `records` to `near`."""
-    t = types(real_of(records))
-    return [
-        array(records, t.vec4),
-        array(centers, t.vec3),
-        array(limits, t.real),
-        *(array(x, wp.int32) for x in (tiles.surfel_ids, tiles.tile_offsets, tiles.order, tiles.ends)),
-        wp.vec2i(camera.width, camera.height),
-        tiles.columns,
-        array(camera.K.contiguous()[None], t.mat33),
-        camera.near,
-    ]
+    launch(like, kernel, tiles * pixels, arguments, [], block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
 
 
 class SlotSums:
@@ -170,29 +159,42 @@ class SlotSums:
     add by atomics: in fixed point, if the order must not matter.
     """
 
-    def __init__(self, like: torch.Tensor, tiles: Tiles) -> None:
-        self.like, self.tiles = like, tiles
-        self.count = len(tiles.entries) if tiles.exact else len(like)
-        self.slots = array(tiles.entries if tiles.exact else None, wp.int32)
+    def __init__(self, like: torch.Tensor, tiles: Tiles, *, with_errors: bool = False) -> None:
+        self.like, self.tiles, self.exact = like, tiles, tiles.exact
         self.fixed_point = sums_in_fixed_point(like)
+        count = len(tiles.entries) if tiles.exact else len(like)
         self.bad = torch.zeros(1, dtype=torch.int32, device=like.device) if self.fixed_point else None
-        self.bad_array = array(self.bad, wp.int32)
+        self.records = sums_like(like, (count, 4, 4), self.fixed_point)
+        self.errors = sums_like(like, (count,), self.fixed_point) if with_errors else None
 
-    def new(self, *shape: int) -> torch.Tensor:
-        """Zeros (slots, *shape), in fixed point (slots, *shape, 2)."""
-        return sums_like(self.like, (self.count, *shape), self.fixed_point)
+    def argument(self) -> Argument:
+        """The struct `Sums` of the kernels."""
+        real = real_of(self.like)
+        errors = None
+        if self.fixed_point:
+            records = array(self.records.view(len(self.records), -1), wp.int64)
+            errors = array(self.errors, wp.int64)
+        else:
+            records, errors = array(self.records, types(real).vec4), array(self.errors, real)
+        return struct(
+            gradient_types(real, self.fixed_point).Sums,
+            slots=array(self.tiles.entries if self.exact else None, wp.int32),
+            records=records,
+            errors=errors,
+            bad=array(self.bad, wp.int32),
+        )
 
-    def array(self, slots: torch.Tensor | None, dtype: type) -> Argument:
-        """View what `new` returned as the kernels do: (slots, ...) of `dtype`, in fixed point (slots, integers)."""
-        if slots is not None and self.fixed_point:
-            return array(slots.view(len(slots), -1), wp.int64)
-        return array(slots, dtype)
+    def totals(self) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,)."""
+        real = real_of(self.like)
+        records = self._reduced(self.records, types(real).vec4)
+        return records, None if self.errors is None else self._reduced(self.errors[:, None], real)[:, 0]
 
-    def reduce(self, slots: torch.Tensor, dtype: type) -> torch.Tensor:
+    def _reduced(self, slots: torch.Tensor, dtype: type) -> torch.Tensor:
         """Return each surfel's sum (N, columns, ...) of slots (slots, columns, ...), a column being a `dtype`."""
         if self.bad is not None:
             slots = from_fixed_point(slots, self.bad, self.like.dtype)
-        if not self.tiles.exact:
+        if not self.exact:
             return slots
         sums = slots.new_zeros(len(self.like), *slots.shape[1:])
         order, ends = (array(x, wp.int32) for x in (self.tiles.order, self.tiles.ends))
@@ -202,90 +204,82 @@ class SlotSums:
 
 
 class _Context(Context):
-    rest: tuple[Tiles, Pinhole, int, bool, SplatErrorRequest]
+    rest: tuple[Walked, SplatErrorRequest]
 
 
 class _Collect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context,
-        records: torch.Tensor,
-        centers: torch.Tensor,
-        limits: torch.Tensor,
-        tiles: Tiles,
-        camera: Pinhole,
-        max_hits: int,
-        low_pass: bool,
-        request: SplatErrorRequest,
+        ctx: _Context, records: torch.Tensor, scene: Walked, max_hits: int, request: SplatErrorRequest
     ) -> tuple[torch.Tensor, ...]:
-        real = real_of(records)
-        shape = (camera.height, camera.width)
+        shape = (scene.camera.height, scene.camera.width)
         plain, base = (records.new_empty(*shape, 3) for _ in range(2))
         ids = torch.empty(*shape, max_hits, dtype=torch.int32, device=records.device)
         depths, weights = (records.new_empty(*shape, max_hits) for _ in range(2))
         alphas = records.new_empty(shape)
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
-        outputs = [
-            *(array(x.view(-1, 3), types(real).vec3) for x in (plain, base)),
-            _buffer_array(ids, wp.int32),
-            _buffer_array(depths, real),
-            _buffer_array(weights, real),
-            array(alphas.view(-1), real),
-            array(stops.view(-1), wp.int32),
-        ]
-        inputs = [*walk_inputs(records, centers, limits, tiles, camera), array(tiles.reaches, types(real).vec2)]
-        variant = (real, max_hits, low_pass, tiles.tile_size)
-        launch_walk(records, collect_kernel(*variant), tiles, inputs, outputs)
-        ctx.save_for_backward(records, centers, limits, plain, base, ids, weights, alphas, stops)
+        outputs = (plain, base, ids, depths, weights, alphas, stops)
+        scene.launch(collect_kernel(scene.real, max_hits), [hits_argument(scene.real, outputs)])
+        ctx.save_for_backward(*outputs)
+        ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
-        ctx.rest = (tiles, camera, max_hits, low_pass, request)
-        return plain, base, ids, depths, weights, alphas, stops
+        return outputs
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: _Context,
-        grad_plain: torch.Tensor,
-        grad_base: torch.Tensor,
-        _ids: None,
-        grad_depths: torch.Tensor,
-        grad_weights: torch.Tensor,
-        grad_alphas: torch.Tensor,
-        _stops: None,
-    ) -> tuple[torch.Tensor | None, ...]:
-        records, centers, limits, plain, base, ids, weights, alphas, stops = ctx.saved_tensors
-        tiles, camera, max_hits, low_pass, request = ctx.rest
-        real = real_of(records)
-        t = types(real)
-        sums = SlotSums(records, tiles)
-        inputs = [
-            *walk_inputs(records, centers, limits, tiles, camera),
-            array(tiles.reaches, t.vec2),
-            sums.slots,
-            *(array(x.view(-1, 3), t.vec3) for x in (plain, base)),
-            _buffer_array(ids, wp.int32),
-            _buffer_array(weights, real),
-            array(alphas.view(-1), real),
-            array(stops.view(-1), wp.int32),
-            *(array(x.contiguous().view(-1, 3), t.vec3) for x in (grad_plain, grad_base)),
-            *(_buffer_array(x.contiguous(), real) for x in (grad_depths, grad_weights)),
-            array(grad_alphas.contiguous().view(-1), real),
-            array(None if request.errors is None else request.errors.view(-1), real),
-        ]
-        variant = (real, max_hits, low_pass, tiles.tile_size, request.errors is not None)
-        grad_records = sums.new(4, 4)
-        # Centres carry a gradient only through the low-pass.
-        grad_centers = sums.new(3) if low_pass else None
-        error_sums = None if request.errors is None else sums.new()
-        outputs = [sums.array(grad_records, t.vec4), sums.array(grad_centers, t.vec3), sums.array(error_sums, real)]
-        kernel = collect_backward_kernel(*variant, sums.fixed_point, tiles.exact)
-        launch_walk(records, kernel, tiles, inputs, [*outputs, sums.bad_array])
-        if error_sums is not None:
-            request.sums_after_backward = sums.reduce(error_sums[:, None], real)[:, 0]
-        grad_records = sums.reduce(grad_records, t.vec4)
-        if grad_centers is not None:
-            grad_centers = sums.reduce(grad_centers[:, None], t.vec3)[:, 0]
-        return grad_records, grad_centers, *(None,) * 6
+    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        scene, request = ctx.rest
+        plain, base, _ids, depths, weights, alphas, _stops = grads
+        grad_records, errors = _backward(
+            scene, ctx.saved_tensors, (plain, base, depths, weights, alphas), request.errors
+        )
+        if errors is not None:
+            request.sums_after_backward = errors
+        return grad_records, None, None, None
+
+
+def _backward(
+    scene: Walked,
+    outputs: tuple[torch.Tensor, ...],
+    grads: tuple[torch.Tensor, ...],
+    errors: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Gradients of the records (N, 4, 4), and sums of weight * error (N,) where there are errors (H, W).
+
+    `outputs` are those of `collect`, and `grads` those of the differentiable ones.
+    """
+    real, max_hits = scene.real, outputs[2].shape[-1]
+    t = types(real)
+    plain, base, depths, weights, alphas = (x.contiguous() for x in grads)
+    sums = SlotSums(scene.records, scene.tiles, with_errors=errors is not None)
+    incoming = struct(
+        gradient_types(real).HitGradients,
+        plain=array(plain.view(-1, 3), t.vec3),
+        base=array(base.view(-1, 3), t.vec3),
+        depths=_buffer_array(depths, real),
+        weights=_buffer_array(weights, real),
+        alphas=array(alphas.view(-1), real),
+        errors=array(None if errors is None else errors.view(-1), real),
+    )
+    kernel = collect_backward_kernel(real, max_hits, errors is not None, sums.fixed_point, scene.tiles.exact)
+    scene.launch(kernel, [hits_argument(real, outputs), incoming, sums.argument()])
+    return sums.totals()
+
+
+def hits_argument(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
+    """The struct `Hits` of the kernels, of (plain, base, ids, depths, weights, alphas, stops)."""
+    t = types(real)
+    plain, base, ids, depths, weights, alphas, stops = outputs
+    return struct(
+        t.Hits,
+        plain=array(plain.view(-1, 3), t.vec3),
+        base=array(base.view(-1, 3), t.vec3),
+        ids=_buffer_array(ids, wp.int32),
+        depths=_buffer_array(depths, real),
+        weights=_buffer_array(weights, real),
+        alphas=array(alphas.view(-1), real),
+        stops=array(None if stops is None else stops.view(-1), wp.int32),
+    )
 
 
 def _buffer_array(buffer: torch.Tensor, dtype: type) -> Argument:

@@ -1,4 +1,4 @@
-"""Projection of surfels into a camera's frame."""
+"""Projection of surfels into a camera's frame, and its image plane."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,28 @@ from nexwarp.ops._interop import Argument, Context, array, launch, real_of
 
 
 @dataclass(frozen=True)
+class Pinhole:
+    """The image plane that the passes see: a camera without its pose.
+
+    Attributes:
+        K: (3, 3) intrinsics in pixels, on the surfels' device and of their dtype; pixel centres lie at +0.5.
+        width, height: pixels.
+        near: hits with a z-depth of at most this (world units) are ignored.
+    """
+
+    K: torch.Tensor
+    width: int
+    height: int
+    near: float
+
+
+@dataclass(frozen=True)
 class Projection:
     """Surfels in the camera's frame, as the walk along a ray reads them.
 
     Attributes:
         records: (N, 4, 4), see `nexwarp.kernels.surfel`; differentiable.
-        centers: (N, 3) centres in the camera frame, world units; differentiable.
+        centers: (N, 3) centres in the camera frame, world units; they sort.
         limits: (N,) what a hit's exponent |u|^(2 g1) + |v|^(2 g2) cannot exceed; only culls.
     """
 
@@ -88,30 +104,26 @@ class _Project(torch.autograd.Function):
             outputs,
         )
         ctx.save_for_backward(*inputs[:3], inputs[6])
-        ctx.mark_non_differentiable(limits)
+        ctx.mark_non_differentiable(centers, limits)
         ctx.set_materialize_grads(False)
         return records, centers, limits
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Context, grad_records: torch.Tensor | None, grad_centers: torch.Tensor | None, _limits: None
+        ctx: Context, grad_records: torch.Tensor | None, _centers: None, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:
+        if grad_records is None:
+            return (None,) * 7
         means, quats, scales, viewmat = ctx.saved_tensors
         real, count = real_of(means), len(means)
         t = types(real)
-        if grad_records is None:
-            grad_records = means.new_zeros(count, 4, 4)
         grads = [torch.empty_like(x) for x in (means, quats, scales)]
         grads += [means.new_empty(count), torch.empty_like(scales), torch.empty_like(means)]
         # A slot a surfel, then one sum: no contention, and a fixed order.
         grad_viewmats = viewmat.new_empty(count, 4, 4) if ctx.needs_input_grad[6] else None
         inputs = [array(x, dtype) for x, dtype in zip((means, quats, scales), (t.vec3, t.vec4, t.vec2), strict=True)]
-        inputs += [
-            array(viewmat[None], t.mat44),
-            array(grad_records.contiguous(), t.vec4),
-            array(None if grad_centers is None else grad_centers.contiguous(), t.vec3),
-        ]
+        inputs += [array(viewmat[None], t.mat44), array(grad_records.contiguous(), t.vec4)]
         launch(means, project_kernels(real).backward, count, inputs, _arrays(real, (*grads, grad_viewmats)))
         wanted = [x if need else None for x, need in zip(grads, ctx.needs_input_grad, strict=False)]
         return (*wanted, None if grad_viewmats is None else grad_viewmats.sum(0))

@@ -6,16 +6,15 @@ import torch
 import warp as wp
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.rays import UNBOUNDED, collect_rays_kernel, ray_list_kernels
+from nexwarp.kernels.rays import UNBOUNDED, collect_rays_kernel, ray_list_kernel
 from nexwarp.kernels.tiles import check_entries
-from nexwarp.kernels.types import types
-from nexwarp.kernels.walk import BLOCK_DIM
-from nexwarp.ops._interop import array, launch, real_of
+from nexwarp.kernels.types import TILE_SIZE, types
+from nexwarp.ops._interop import array, launch, real_of, struct
+from nexwarp.ops.collect import hits_argument, launch_pixels
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.project import Projection
-from nexwarp.ops.surface import Surface
+from nexwarp.ops.surface import Surface, surface_argument
 
-TILE_SIZE = 16
 SPAN = 8  # tiles along the side of a block of tiles
 BYTES_AN_ENTRY = 40  # of the arrays that `intersect_rays` makes, the sort's included
 # A block whose rays are farther than this from its mean, as a cosine, has no bound.
@@ -97,18 +96,11 @@ def ray_records(projection: Projection, axes: torch.Tensor | None) -> RayRecords
     return RayRecords(records, planes, normals, normals[:, 2].sign().contiguous())
 
 
-def reaches_of(opacities: torch.Tensor, gammas: torch.Tensor) -> torch.Tensor:
-    """Return (N, 2): what |u| and |v| of a hit cannot exceed, 0 for a surfel that is too transparent to be hit."""
-    limits = 2 * (255.0 * 1.001 * opacities).log()
-    return (limits.clamp_min(0)[:, None] ** (0.5 / gammas)).where(limits[:, None] > 0, 0).contiguous()
-
-
-def intersect_rays(surfels: RayRecords, reaches: torch.Tensor, keys: torch.Tensor, rays: torch.Tensor) -> RayTiles:
+def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) -> RayTiles:
     """List the surfels of each tile of 16 x 16 rays, by rising key; no surfel that a ray hits is left out.
 
     Args:
         surfels: the N surfels.
-        reaches: (N, 2), see `reaches_of`.
         keys: (N,) what sorts surfels near to far; ties by index.
         rays: (H, W, 3).
 
@@ -120,29 +112,29 @@ def intersect_rays(surfels: RayRecords, reaches: torch.Tensor, keys: torch.Tenso
     real = real_of(rays)
     t = types(real)
     order = torch.sort(keys.float(), stable=True).indices.int()
-    bounds = [*_bounds(rays, TILE_SIZE), *_bounds(rays, TILE_SIZE * SPAN)]
     count, device = len(order), rays.device
     counts = torch.zeros(count, dtype=torch.int64, device=device)
-    none = torch.zeros(0, dtype=torch.int64, device=device)
+    kernels = ray_list_kernel(real)
+    bounds = (
+        dict(zip(kernels.Bounds.vars, map(array, _bounds(rays, side), (t.mat33, t.vec2, t.vec2)), strict=True))
+        for side in (TILE_SIZE, TILE_SIZE * SPAN)
+    )
     inputs = [
         array(order, wp.int32),
         array(surfels.records.contiguous(), t.vec4),
         array(surfels.facings, real),
-        array(reaches, t.vec2),
-        *(array(x, dtype) for x, dtype in zip(bounds, (t.mat33, t.vec2, t.vec2) * 2, strict=True)),
+        *(struct(kernels.Bounds, **fields) for fields in bounds),
         wp.vec2i(columns, rows),
         SPAN,
     ]
-    kernel = ray_list_kernels(real).lists
-    unused = array(order.new_zeros(1), wp.int32)
-    launch(rays, kernel, count, [*inputs, array(none, wp.int64)], [array(counts, wp.int64), unused, unused])
+    launch(rays, kernels.lists, count, [*inputs, None], [array(counts, wp.int64), None, None])
     ends = counts.cumsum(0)
     total = check_entries(int(ends[-1]), count, columns * rows) if count else 0
     check_memory(BYTES_AN_ENTRY * total, device, f"a list of {total:,} (tile, surfel) entries")
     tiles, ids = (torch.zeros(total, dtype=torch.int32, device=device) for _ in range(2))
     outputs = [array(counts, wp.int64), array(tiles, wp.int32), array(ids, wp.int32)]
     if total:
-        launch(rays, kernel, count, [*inputs, array(ends, wp.int64)], outputs)
+        launch(rays, kernels.lists, count, [*inputs, array(ends, wp.int64)], outputs)
     tiles, sorting = torch.sort(tiles, stable=True)
     every = torch.arange(columns * rows + 1, dtype=torch.int32, device=device)
     return RayTiles(ids[sorting].contiguous(), torch.searchsorted(tiles, every).contiguous(), columns)
@@ -209,30 +201,23 @@ def collect_rays(
     alpha, expected, median, top = (rays.new_zeros(height, width) for _ in range(4))
     ids = torch.full((height, width, max_hits), -1, dtype=torch.int32, device=rays.device)
     depths, weights = (rays.new_zeros(height, width, max_hits) for _ in range(2))
-    parallel = surfels.planes is not None
-    inputs = [
-        array(surfels.records.contiguous(), t.vec4),
-        array(surfels.normals if surfels.planes is None else surfels.planes, t.vec3),
-        array(surfels.normals, t.vec3),
-        array(limits, real),
+    kernels = collect_rays_kernel(real, max_hits)
+    records = struct(
+        kernels.Surfels,
+        records=array(surfels.records.contiguous(), t.vec4),
+        planes=array(surfels.planes, t.vec3),
+        normals=array(surfels.normals, t.vec3),
+        limits=array(limits, real),
+    )
+    arguments = [
+        records,
         array(tiles.surfel_ids, wp.int32),
         array(tiles.tile_offsets, wp.int64),
         array(rays.contiguous().view(-1, 3), t.vec3),
-        wp.vec2i(width, height),
-        tiles.columns,
-        int(parallel),
-        near,
+        struct(t.View, size=wp.vec2i(width, height), tile_columns=tiles.columns, near=near),
+        hits_argument(real, (plain, base, ids, depths, weights, alpha, None)),
+        surface_argument(real, (expected, median, top, normals)),
     ]
-    buffers = [(ids, wp.int32), (depths, real), (weights, real)]
-    outputs = [
-        *(array(x.view(-1, 3), t.vec3) for x in (plain, base)),
-        *(array(x.view(-1, max_hits) if max_hits else x.new_empty(1, 1), dtype) for x, dtype in buffers),
-        *(array(x.view(-1), real) for x in (alpha, expected, median, top)),
-        array(normals.view(-1, 3), t.vec3),
-    ]
-    pixels = TILE_SIZE**2
-    threads = (len(tiles.tile_offsets) - 1) * pixels
-    kernel = collect_rays_kernel(real, max_hits, TILE_SIZE)
-    launch(rays, kernel, threads, inputs, outputs, block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
+    launch_pixels(rays, kernels.collect, len(tiles.tile_offsets) - 1, arguments)
     normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
     return RayHits(plain, base, ids, depths, weights, alpha, Surface(expected, median, top, normals))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from nexwarp.kernels.collect import collect_kernel
-from nexwarp.kernels.collect_backward import collect_backward_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.project import project_kernels
@@ -31,9 +31,10 @@ from nexwarp.kernels.tile_lists import (
     tile_offsets_kernel,
 )
 from nexwarp.kernels.tiles import MAX_CORNERS, check_entries, tile_polygon_kernel
-from nexwarp.kernels.types import types
+from nexwarp.kernels.types import TILE_SIZE, TileLists, types
 from nexwarp.kernels.unproject import unproject_kernels
-from nexwarp.kernels.walk import BLOCK_DIM
+from nexwarp.native.staging import BLOCK_DIM
+from nexwarp.ops._interop import Argument
 
 
 class Image(NamedTuple):
@@ -58,7 +59,6 @@ class Lists(NamedTuple):
     order: wp.array
     ends: wp.array
     reaches: wp.array
-    tile_size: int
     columns: int
 
 
@@ -75,13 +75,12 @@ class Hits(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Depths, normals in the camera frame, not normalised, and distortion of the P pixels, see `kernels.surface`."""
+    """Depths, and normals in the camera frame, not normalised, of the P pixels, see `kernels.surface`."""
 
     expected: wp.array
     median: wp.array
     top: wp.array
     normals: wp.array
-    distortion: wp.array
 
 
 def _real(array: wp.array) -> type:
@@ -92,14 +91,16 @@ def _new(like: wp.array, shape: Any, dtype: type, requires_grad: bool = True) ->
     return wp.zeros(shape, dtype=dtype, device=like.device, requires_grad=requires_grad)
 
 
-def _launch(tape: wp.Tape, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+def _launch(tape: wp.Tape, kernel: wp.Kernel, dim: int, inputs: list[Argument], outputs: list[wp.array]) -> None:
     with tape:
         wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=outputs[0].device)
 
 
-def _silent(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any], block_dim: int = 256) -> None:
+def _silent(
+    kernel: wp.Kernel, dim: Any, inputs: list[Argument], outputs: list[wp.array | None], block_dim: int = 256
+) -> None:
     device = next(x.device for x in outputs if x is not None)
-    wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=device, record_tape=False, block_dim=block_dim)
+    wp.launch(kernel, dim, inputs=[0, *inputs], outputs=outputs, device=device, record_tape=False)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -174,10 +175,13 @@ def project(
     colors: wp.array,
     viewmat: wp.array,
 ) -> tuple[wp.array, wp.array, wp.array]:
-    """Records (N, 4) vec4, centers (N) vec3 and limits (N) of activated surfels; viewmat is (1) mat44."""
+    """Records (N, 4) vec4, centers (N) vec3 and limits (N) of activated surfels; viewmat is (1) mat44.
+
+    Only the records have gradients.
+    """
     real = _real(means)
     records = _new(means, (len(means), 4), types(real).vec4)
-    centers = _new(means, len(means), means.dtype)
+    centers = _new(means, len(means), means.dtype, requires_grad=False)
     limits = _new(means, len(means), real, requires_grad=False)
     inputs = [means, quats, scales, opacities, gammas, colors, viewmat]
     _launch(tape, project_kernels(real).forward, len(means), inputs, [records, centers, limits])
@@ -193,13 +197,11 @@ def intersect_tiles(
     centers: wp.array,
     viewmat: wp.array,
     image: Image,
-    low_pass: bool = False,
-    tile_size: int = 16,
 ) -> Lists:
     """Tile lists; integers, so no tape is needed."""
     real, count = _real(means), len(means)
     t = types(real)
-    columns, rows = (-(-pixels // tile_size) for pixels in image.size)
+    columns, rows = (-(-pixels // TILE_SIZE) for pixels in image.size)
 
     def integers(length: int, dtype: type = wp.int32) -> wp.array:
         return _new(means, length, dtype, requires_grad=False)
@@ -209,14 +211,15 @@ def intersect_tiles(
     def reals(shape: Any, dtype: type) -> wp.array:
         return _new(means, shape, dtype, requires_grad=False)
 
-    shapes = integers(count, wp.vec3i)
-    reaches, corners = reals(count, t.vec2), reals((count, MAX_CORNERS), t.vec2)
-    margins, discs = reals(count, real), reals(count if low_pass else 1, t.vec3)
+    reaches = reals(count, t.vec2)
+    polygons = t.Polygons()
+    polygons.corners = reals((count, MAX_CORNERS), t.vec2)
+    polygons.shapes = integers(count, wp.vec3i)
+    polygons.margins = reals(count, real)
     surfels = [means, quats, scales, opacities, gammas, viewmat, image.matrices(means), image.near, rows]
-    polygons = [corners, shapes, margins, discs]
-    _silent(tile_polygon_kernel(real, low_pass, tile_size), count, surfels, [reaches, *polygons])
-    kernels = list_kernels(real, low_pass, tile_size)
-    arguments = [order[:count], *polygons, wp.vec2i(columns, rows)]
+    _silent(tile_polygon_kernel(real), count, surfels, [reaches, polygons])
+    kernels = list_kernels(real)
+    arguments = [order[:count], polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.device.is_cuda)
     totals = integers(count, wp.int64)
     total = 0
@@ -235,20 +238,42 @@ def intersect_tiles(
         _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
     offsets = integers(columns * rows + 1)
     _silent(tile_offsets_kernel, len(offsets), [tiles.view(wp.int32), total], [offsets])
-    return Lists(ids, offsets, order[:count], ends, reaches, tile_size, columns)
+    return Lists(ids, offsets, order[:count], ends, reaches, columns)
 
 
-def collect(
-    tape: wp.Tape,
-    records: wp.array,
-    centers: wp.array,
-    limits: wp.array,
-    lists: Lists,
-    image: Image,
-    max_hits: int,
-    low_pass: bool = False,
-) -> Hits:
-    """Collection pass; plain, base, depths, weights and alphas differentiate to records and, with low_pass, centers."""
+def _walk_arguments(records: wp.array, limits: wp.array, lists: Lists, image: Image) -> list[Argument]:
+    """The structs `Surfels`, `TileLists` and `View` of the kernels."""
+    t = types(_real(records))
+    view = {
+        "Ks": image.matrices(records),
+        "size": wp.vec2i(*image.size),
+        "tile_columns": lists.columns,
+        "near": image.near,
+    }
+    return [
+        _filled(t.Surfels, {"records": records, "limits": limits, "reaches": lists.reaches}),
+        _filled(TileLists, {name: getattr(lists, name) for name in TileLists.vars}),
+        _filled(t.View, view),
+    ]
+
+
+def _filled(kind: Any, fields: dict[str, Argument]) -> Argument:
+    """A struct; None is an array that is not there."""
+    value = kind()
+    for name, field in fields.items():
+        if field is not None:
+            setattr(value, name, field)
+    return value
+
+
+def _walk(kernel: wp.Kernel, records: wp.array, lists: Lists, arguments: list[Argument]) -> None:
+    threads = (len(lists.tile_offsets) - 1) * TILE_SIZE**2
+    device = records.device
+    wp.launch(kernel, threads, inputs=[0, *arguments], device=device, record_tape=False, block_dim=BLOCK_DIM)
+
+
+def collect(tape: wp.Tape, records: wp.array, limits: wp.array, lists: Lists, image: Image, max_hits: int) -> Hits:
+    """Collection pass; plain, base, depths, weights and alphas differentiate to records."""
     real = _real(records)
     t = types(real)
     pixels, slots = image.size[0] * image.size[1], max(max_hits, 1)
@@ -261,53 +286,38 @@ def collect(
         alphas=_new(records, pixels, real),
         stops=_new(records, pixels, wp.int32, requires_grad=False),
     )
-    threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
-    view = [wp.vec2i(*image.size), lists.columns, image.matrices(records), image.near]
-    walked = [lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
-    inputs = [records, centers, limits, *walked, *view, lists.reaches]
-    kernel = collect_kernel(real, max_hits, low_pass, lists.tile_size)
-    _silent(kernel, threads, inputs, list(hits), BLOCK_DIM)
+    inputs = [*_walk_arguments(records, limits, lists, image), _filled(t.Hits, hits._asdict())]
+    _walk(collect_kernel(real, max_hits), records, lists, inputs)
+    differentiable = ("plain", "base", "depths", "weights", "alphas")
 
     def backward() -> None:
-        found = [hits.plain, hits.base, hits.ids, hits.weights, hits.alphas, hits.stops]
-        grads = [hits.plain.grad, hits.base.grad, hits.depths.grad, hits.weights.grad, hits.alphas.grad]
-        kernel = collect_backward_kernel(real, max_hits, low_pass, lists.tile_size)
-        outputs = [records.grad, centers.grad, None, None]
-        _silent(kernel, threads, [*inputs, None, *found, *grads, None], outputs, BLOCK_DIM)
+        g = gradient_types(real)
+        grads = _filled(g.HitGradients, {name: getattr(hits, name).grad for name in differentiable})
+        sums = _filled(g.Sums, {"records": records.grad})
+        _walk(collect_backward_kernel(real, max_hits), records, lists, [*inputs, grads, sums])
 
-    tape.record_func(backward, [records, centers, hits.plain, hits.base, hits.depths, hits.weights, hits.alphas])
+    tape.record_func(backward, [records, *(getattr(hits, name) for name in differentiable)])
     return hits
 
 
-def surface(
-    tape: wp.Tape,
-    records: wp.array,
-    centers: wp.array,
-    limits: wp.array,
-    lists: Lists,
-    image: Image,
-    stops: wp.array,
-    low_pass: bool = False,
-) -> Surface:
-    """Depths and normals over all hits; all outputs differentiate to records and, with low_pass, centers."""
+def surface(tape: wp.Tape, records: wp.array, limits: wp.array, lists: Lists, image: Image, stops: wp.array) -> Surface:
+    """Depths and normals over all hits; all outputs differentiate to records."""
     real = _real(records)
     t = types(real)
     pixels = image.size[0] * image.size[1]
-    found = Surface(*(_new(records, pixels, dtype) for dtype in (real, real, real, t.vec3, real)))
-    totals, picks = (_new(records, pixels, dtype, requires_grad=False) for dtype in (t.vec3, wp.vec2i))
-    threads = (len(lists.tile_offsets) - 1) * lists.tile_size**2
-    view = [wp.vec2i(*image.size), lists.columns, image.matrices(records), image.near]
-    walked = [lists.surfel_ids, lists.tile_offsets, lists.order, lists.ends]
-    inputs = [records, centers, limits, *walked, *view, lists.reaches, stops]
-    _silent(surface_kernel(real, low_pass, lists.tile_size), threads, inputs, [*found, totals, picks], BLOCK_DIM)
+    buffers = Surface(*(_new(records, pixels, dtype) for dtype in (real, real, real, t.vec3)))
+    totals, picks = (_new(records, pixels, dtype, requires_grad=False) for dtype in (real, wp.vec2i))
+    outputs = _filled(t.Surface, buffers._asdict() | {"totals": totals, "picks": picks})
+    inputs = [*_walk_arguments(records, limits, lists, image), stops, outputs]
+    _walk(surface_kernel(real), records, lists, inputs)
 
     def backward() -> None:
-        known = [None, found.expected, found.normals, found.distortion, totals, picks, *(x.grad for x in found)]
-        kernel = surface_backward_kernel(real, low_pass, lists.tile_size)
-        _silent(kernel, threads, [*inputs, *known], [records.grad, centers.grad, None], BLOCK_DIM)
+        grads = _filled(t.Surface, {name: array.grad for name, array in buffers._asdict().items()})
+        sums = _filled(gradient_types(real).Sums, {"records": records.grad})
+        _walk(surface_backward_kernel(real), records, lists, [*inputs, grads, sums])
 
-    tape.record_func(backward, [records, centers, *found])
-    return found
+    tape.record_func(backward, [records, *buffers])
+    return buffers
 
 
 def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) -> tuple[wp.array, wp.array]:

@@ -14,13 +14,11 @@ from nexwarp.kernels.tile_lists import (
     tile_offsets_kernel,
 )
 from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
-from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, warp_array, warp_streams
+from nexwarp.kernels.types import TILE_SIZE, types
+from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, struct, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
-from nexwarp.ops.pinhole import Pinhole
-from nexwarp.ops.project import Projection
+from nexwarp.ops.project import Pinhole, Projection
 
-TILE_SIZE = 16
 # Of the arrays that `intersect_tiles` makes, on a CPU two more than on CUDA.
 BYTES_AN_ENTRY = 24
 
@@ -44,12 +42,12 @@ class ListCapacity:
     Attributes:
         entries: M, the number of entries that the lists can hold.
         ends: (N,) int32, as in `Tiles`.
-        kind: (tile columns, tile rows, low-pass): renderings of one kind need about as many entries.
+        kind: (tile columns, tile rows): renderings of one kind need about as many entries.
     """
 
     entries: int
     ends: torch.Tensor
-    kind: tuple[int, int, bool]
+    kind: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,6 @@ class Tiles:
         entries: (M,) int32, emission index of each of those; empty unless `exact`.
         tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
         reaches: (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed.
-        tile_size: pixels along a tile's side.
         columns: tiles in a row.
         exact: whether the lists hold exactly the entries that there are. Otherwise unused places are at the end; or,
             where `ends` counts more than M entries, the lists are incomplete and the walk goes over `order`.
@@ -76,10 +73,9 @@ class Tiles:
     entries: torch.Tensor
     tile_offsets: torch.Tensor
     reaches: torch.Tensor
-    tile_size: int
     columns: int
     exact: bool
-    kind: tuple[int, int, bool]
+    kind: tuple[int, int]
 
     @property
     def room(self) -> ListCapacity:
@@ -97,9 +93,7 @@ def intersect_tiles(
     viewmat: torch.Tensor,
     camera: Pinhole,
     *,
-    low_pass: bool = False,
     blending: Order = "depth",
-    tile_size: int = TILE_SIZE,
     room: int | None = None,
 ) -> Tiles:
     """List, for each tile, the surfels whose support touches it.
@@ -113,9 +107,7 @@ def intersect_tiles(
         projection: of the same surfels.
         viewmat: (4, 4) world to camera.
         camera: the image plane.
-        low_pass: whether supports include the screen-space low-pass.
         blending: whether `Tiles.order` is by the centres' z-depths or by their distances from the camera.
-        tile_size: pixels along a tile's side, a multiple of 8.
         room: number of entries that the lists can hold. By default, on a CPU, the exact number; on CUDA, where the
             exact number would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
 
@@ -123,15 +115,13 @@ def intersect_tiles(
         ValueError, OutOfMemoryError: there are more than MAX_ENTRIES entries, or more than memory holds; on CUDA only
             when that is noticed without a wait.
     """
-    if tile_size % 8 or tile_size < 8:
-        raise ValueError(f"tile_size: expected a multiple of 8, got {tile_size}")
     tensors = [x.detach().contiguous() for x in (means, quats, scales, opacities, gammas)]
     real, count = real_of(means), len(means)
-    columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
+    columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
     order = _depth_order(projection.centers.detach(), blending)
-    kernels, kind = list_kernels(real, low_pass, tile_size), (columns, rows, low_pass)
-    polygons, reaches = _tile_polygons(tensors, viewmat, camera, low_pass, tile_size)
-    arguments = [array(order, wp.int32), *polygons, wp.vec2i(columns, rows)]
+    kernels, kind = list_kernels(real), (columns, rows)
+    polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
+    arguments = [array(order, wp.int32), polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
     launch(means, kernels.count, threads, arguments, [array(totals, wp.int64)], even=False)
@@ -146,13 +136,13 @@ def intersect_tiles(
         _ask(ends, kind)
     offsets = order.new_empty(columns * rows + 1)
     launch(means, tile_offsets_kernel, len(offsets), [array(tile_ids, wp.int32), room], [array(offsets, wp.int32)])
-    return Tiles(order, ends, surfel_ids, entries, offsets, reaches, tile_size, columns, exact, kind)
+    return Tiles(order, ends, surfel_ids, entries, offsets, reaches, columns, exact, kind)
 
 
 def _tile_polygons(
-    shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, low_pass: bool, tile_size: int
-) -> tuple[list[Argument], torch.Tensor]:
-    """The tile polygons, as the arguments that counting and emitting share, and `Tiles.reaches`."""
+    shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, rows: int
+) -> tuple[Argument, torch.Tensor]:
+    """The tile polygons, as counting and emitting read them, and `Tiles.reaches`."""
     like, count = shape[0], len(shape[0])
     real = real_of(like)
     t = types(real)
@@ -162,14 +152,16 @@ def _tile_polygons(
         array(viewmat.contiguous()[None], t.mat44),
         array(camera.K.contiguous()[None], t.mat33),
         camera.near,
-        -(-camera.height // tile_size),
+        rows,
     ]
-    reaches, corners = like.new_empty(count, 2), like.new_empty(count, MAX_CORNERS, 2)
-    shapes = torch.empty(count, 3, dtype=torch.int32, device=like.device)
-    margins, discs = like.new_empty(count), like.new_empty(count if low_pass else 1, 3)
-    polygons = [array(corners, t.vec2), array(shapes, wp.vec3i), array(margins, real), array(discs, t.vec3)]
-    kernel = tile_polygon_kernel(real, low_pass, tile_size)
-    launch(like, kernel, count, arguments, [array(reaches, t.vec2), *polygons])
+    reaches = like.new_empty(count, 2)
+    polygons = struct(
+        t.Polygons,
+        corners=array(like.new_empty(count, MAX_CORNERS, 2), t.vec2),
+        shapes=array(torch.empty(count, 3, dtype=torch.int32, device=like.device), wp.vec3i),
+        margins=array(like.new_empty(count), real),
+    )
+    launch(like, tile_polygon_kernel(real), count, arguments, [array(reaches, t.vec2), polygons])
     return polygons, reaches
 
 
@@ -251,10 +243,10 @@ class _Need:
     asked: bool = False
 
 
-_needs: dict[tuple[int | None, int, int, int, bool], _Need] = {}
+_needs: dict[tuple[int | None, int, int, int], _Need] = {}
 
 
-def _room(totals: torch.Tensor, kind: tuple[int, int, bool]) -> int:
+def _room(totals: torch.Tensor, kind: tuple[int, int]) -> int:
     """Capacity of lists on CUDA: what renderings of this kind needed so far, and half as much again.
 
     Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
@@ -293,7 +285,7 @@ def _room(totals: torch.Tensor, kind: tuple[int, int, bool]) -> int:
     return need.room
 
 
-def _ask(ends: torch.Tensor, kind: tuple[int, int, bool]) -> None:
+def _ask(ends: torch.Tensor, kind: tuple[int, int]) -> None:
     """Ask the GPU for the number of entries that a rendering of a kind needed, unless an answer is on its way."""
     need = _needs.get(_key(ends, kind))
     if need is None or need.asked or torch.cuda.is_current_stream_capturing():
@@ -303,7 +295,7 @@ def _ask(ends: torch.Tensor, kind: tuple[int, int, bool]) -> None:
     need.asked = True
 
 
-def _key(ends: torch.Tensor, kind: tuple[int, int, bool]) -> tuple[int | None, int, int, int, bool]:
+def _key(ends: torch.Tensor, kind: tuple[int, int]) -> tuple[int | None, int, int, int]:
     return (ends.device.index, len(ends).bit_length(), *kind)
 
 

@@ -6,7 +6,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernels
 from nexwarp.ops._interop import Argument, Context, array, launch, real_of
-from nexwarp.ops.pinhole import Pinhole
+from nexwarp.ops.project import Pinhole
 
 
 def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> tuple[torch.Tensor, torch.Tensor]:

@@ -231,6 +231,6 @@ def test_entries_walked_by_our_side_end_at_each_pixel_s_last_hit() -> None:
     listed, walked = bench_peers.our_call(g).walked()
     assert listed == len(tiles.surfel_ids)
     y, x = torch.meshgrid(torch.arange(30), torch.arange(43), indexing="ij")
-    starts = tiles.tile_offsets[(y // tiles.tile_size) * tiles.columns + x // tiles.tile_size]
+    starts = tiles.tile_offsets[(y // 16) * tiles.columns + x // 16]
     assert walked == pytest.approx((hits.stops - starts).double().mean().item())
     assert 0 < walked < listed

@@ -16,7 +16,6 @@ from tests.scenes import Scene, intrinsics, random_scene, rigid
 from tests.tolerances import assert_close
 
 FLOATS = ("means", "quats", "scales", "opacities", "gammas")
-HALF = 2**-0.5
 
 
 def tensor(*values: float | tuple[float, ...]) -> torch.Tensor:
@@ -168,28 +167,6 @@ def test_near_tests_the_depth_of_the_hit() -> None:
     assert collect(**scene, **(VIEW | {"near": 3.001}), max_hits=2).ids[2, 2].tolist() == [-1, -1]
 
 
-def test_low_pass_by_hand() -> None:
-    """A speck spreads like exp(-r^2) over the pixels, at its centre's depth; a large surfel stays as is."""
-    speck = sheets((2.0, 0.8), scale=(1e-4, 1e-4))
-    hits = collect(**speck, **VIEW, max_hits=1, low_pass=True)
-    value_of(hits.alpha[2, 3], 0.8 * math.exp(-1.0), "r = 1")
-    value_of(hits.alpha[1, 1], 0.8 * math.exp(-2.0), "r^2 = 2")
-    value_of(hits.depths[1, 1, 0], 2.0, "depth")
-    value_of(collect(**speck, **VIEW, max_hits=1).alpha[2, 3], 0.0, "without")
-    value_of(collect(**speck, **(VIEW | {"near": 2.0}), max_hits=1, low_pass=True).alpha[2, 2], 0.0, "before near")
-    large = sheets((2.0, 0.8), scale=(3.0, 3.0))
-    plain, filtered = (collect(**large, **VIEW, max_hits=1, low_pass=flag).alpha for flag in (False, True))
-    assert_close(filtered[2, 3], plain[2, 3], kind="value", name="large")
-
-
-def test_low_pass_sees_a_surfel_edge_on() -> None:
-    scene = sheets((2.0, 0.8), scale=(0.5, 0.5))
-    scene["quats"] = tensor((HALF, 0.0, HALF, 0.0))
-    hits = collect(**scene, **VIEW, max_hits=1, low_pass=True)
-    value_of(hits.alpha[2, 3], 0.8 * math.exp(-1.0), "r = 1, off the plane")
-    value_of(hits.depths[2, 2, 0], 2.0, "depth")
-
-
 def test_power_at_zero() -> None:
     u = tensor(0.0, 1e-30, 1e30).requires_grad_()
     values = power(u, tensor(1.5, 1.5, 1.5))
@@ -197,18 +174,15 @@ def test_power_at_zero() -> None:
     assert values[:2].max() < 1e-25 and values[2] > 1e20 and gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("max_hits", [0, 2])
-def test_gradients_of_collect(max_hits: int, low_pass: bool) -> None:
+def test_gradients_of_collect(max_hits: int) -> None:
     scene = random_scene(6, seed=7, width=4, height=3, off_centre=True, dtype=torch.float64)
-    if low_pass:
-        scene["scales"][::2] *= 0.01
     colors = torch.rand(6, 3, dtype=torch.float64)
     inputs = leaves(*(scene[key] for key in FLOATS), colors, scene["viewmat"])
 
     def blend(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         named: dict[str, Any] = dict(zip((*FLOATS, "colors", "viewmat"), tensors, strict=True))
-        hits = collect(**named, **pinhole(scene), max_hits=max_hits, low_pass=low_pass)
+        hits = collect(**named, **pinhole(scene), max_hits=max_hits)
         return hits.plain, hits.base, hits.depths, hits.weights, hits.alpha
 
     assert blend(*inputs)[4].max() > 0.3
@@ -322,10 +296,9 @@ def test_no_texture_makes_no_difference_of_max_hits() -> None:
         assert_close(image, images[0], kind="value", name="image")
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("textured", [False, True])
 @pytest.mark.parametrize("sh_degree", [1, 3])
-def test_gradients_of_the_whole_render(sh_degree: int, textured: bool, low_pass: bool) -> None:
+def test_gradients_of_the_whole_render(sh_degree: int, textured: bool) -> None:
     scene = random_scene(3, seed=5, width=4, height=3, sh_degree=sh_degree, dtype=torch.float64)
     scene["K"] = intrinsics(5.0, 6.0, 1.7, 1.4)
     scene["sh"] = 0.3 * scene["sh"]
@@ -335,7 +308,7 @@ def test_gradients_of_the_whole_render(sh_degree: int, textured: bool, low_pass:
     def picture(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         named: dict[str, Any] = dict(zip((*FLOATS, "sh", "viewmat"), tensors[:7], strict=True))
         texture = Texture(tensors[7], field.resolutions, tensors[8:]) if textured else None
-        out = render(**named, texture=texture, **pinhole(scene), background=(0.2, 0.4, 0.6), low_pass=low_pass)
+        out = render(**named, texture=texture, **pinhole(scene), background=(0.2, 0.4, 0.6))
         return out.image, out.plain, out.textured, out.depths, out.weights, out.alpha
 
     assert picture(*inputs)[5].max() > 0.3

@@ -1,5 +1,6 @@
 """Gradients of depths and normals: the float64 reference, differences, values by hand, and laws."""
 
+import functools
 import importlib
 from typing import Any
 
@@ -166,13 +167,14 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
     """Neither a rendering nor its backward pass launches a kernel of the surface."""
     launched: list[str] = []
     module = importlib.import_module("nexwarp.ops.surface")
-    plain = module.launch_walk
+    kernels = {name: getattr(module, name) for name in ("surface_kernel", "surface_backward_kernel")}
 
-    def noted(*given: Any) -> None:
-        launched.append("walk")
-        plain(*given)
+    def noted(name: str, *arguments: Any) -> Any:
+        launched.append(name)
+        return kernels[name](*arguments)
 
-    monkeypatch.setattr(module, "launch_walk", noted)
+    for name in kernels:
+        monkeypatch.setattr(module, name, functools.partial(noted, name))
     scene = random_scene()
     surfels = make_surfels(scene)
     out = nw.render(surfels, make_texture(), make_camera(scene))
@@ -185,13 +187,12 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
 def test_sums_in_fixed_point_are_those_of_floats(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = random_scene(150, seed=3, width=61, height=45)
     results = []
-    with launch.cpu_form("scalar"):
-        for fixed in (False, True):
-            module = importlib.import_module("nexwarp.ops.collect")
-            monkeypatch.setattr(module, "sums_in_fixed_point", lambda like, fixed=fixed: fixed)
-            surfels = make_surfels(scene)
-            loss(nw.render(surfels, None, make_camera(scene))).backward()
-            results.append({name: present(x.grad) for name, x in surfels.named_parameters() if x.grad is not None})
+    for fixed in (False, True):
+        module = importlib.import_module("nexwarp.ops.collect")
+        monkeypatch.setattr(module, "sums_in_fixed_point", lambda like, fixed=fixed: fixed)
+        surfels = make_surfels(scene)
+        loss(nw.render(surfels, None, make_camera(scene))).backward()
+        results.append({name: present(x.grad) for name, x in surfels.named_parameters() if x.grad is not None})
     for name, plain in results[0].items():
         assert_close(results[1][name], plain, kind="gradient", name=name)
 
@@ -222,7 +223,6 @@ def test_cuda_agrees_with_the_cpu() -> None:
         scene = random_scene(3000, seed=5, width=200, height=150, device=device)
         surfels = make_surfels(scene)
         out = nw.render(surfels, None, make_camera(scene))
-        # Not the distortion: at a tie of depths its gradient jumps.
         loss(out, ("expected_depth", "blended_normals")).backward()
         results.append((out, surfels))
     (cpu, one), (cuda, two) = results

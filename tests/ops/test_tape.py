@@ -61,8 +61,7 @@ def test_tape_and_torch_give_the_same_gradients(residual: bool, device: torch.de
     assert_close(gradients["viewmat"] + position, present(viewmat.grad), kind="gradient", name="viewmat")
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
-def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, device: torch.device) -> None:
+def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
     leaves = {key: scene[key].clone().requires_grad_() for key in SURFEL_KEYS[:5]}
     viewmat = scene["viewmat"].clone().requires_grad_()
@@ -71,11 +70,11 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, dev
     means, quats, scales, opacities, gammas = leaves.values()
     given = (means, quats, scales, opacities, gammas)
     projection = ops.project(*given, torch.zeros_like(means), viewmat)
-    tiles = ops.intersect_tiles(*given, projection, viewmat, pinhole, low_pass=low_pass)
-    hits = ops.collect(projection, tiles, pinhole, low_pass=low_pass)
-    found = ops.surface(projection, tiles, hits, pinhole, viewmat.detach(), low_pass=low_pass)
+    tiles = ops.intersect_tiles(*given, projection, viewmat, pinhole)
+    hits = ops.collect(projection, tiles, pinhole)
+    found = ops.surface(projection, tiles, hits, pinhole, viewmat.detach())
     normals = found.blended_normals @ viewmat[:3, :3].detach().T  # back to the camera's frame
-    buffers = [found.expected_depth, found.median_depth, found.top_depth, normals, found.distortion]
+    buffers = [found.expected_depth, found.median_depth, found.top_depth, normals]
     cotangents = [torch.randn_like(x) for x in buffers]
     torch.autograd.backward(buffers, cotangents)
 
@@ -90,9 +89,9 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(low_pass: bool, dev
     view, colors = to_warp(viewmat[None], t.mat44), to_warp(torch.zeros_like(scene["means"]), t.vec3)
     image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
     records, centers, limits = passes.project(tape, *shape, colors, view)
-    lists = passes.intersect_tiles(*shape, centers, view, image, low_pass)
-    stops = passes.collect(tape, records, centers, limits, lists, image, HITS, low_pass).stops
-    surface = passes.surface(tape, records, centers, limits, lists, image, stops, low_pass)
+    lists = passes.intersect_tiles(*shape, centers, view, image)
+    stops = passes.collect(tape, records, limits, lists, image, HITS).stops
+    surface = passes.surface(tape, records, limits, lists, image, stops)
     for buffer, expected in zip(surface, buffers, strict=True):
         assert_close(wp.to_torch(buffer).view_as(expected), expected, kind="value", name="buffer")
     grads = {
@@ -134,7 +133,7 @@ def warp_program(
     shape = (x["means"], x["quats"], x["scales"], x["opacities"], x["gammas"])
     records, centers, limits = passes.project(tape, *shape, colors, view)
     lists = passes.intersect_tiles(*shape, centers, view, image)
-    hits = passes.collect(tape, records, centers, limits, lists, image, HITS)
+    hits = passes.collect(tape, records, limits, lists, image, HITS)
     positions, directions = passes.unproject(tape, hits.depths, view, image)
     resolutions = to_warp(texture.resolutions.double(), REAL)
     features = passes.hashgrid(tape, table, positions.flatten(), hits.depths.flatten(), resolutions, focal)

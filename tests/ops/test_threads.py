@@ -1,6 +1,4 @@
-"""Results depend neither on the number of threads nor on the size of tiles; blended errors are what they say."""
-
-from typing import Any
+"""Results depend do not depend on the number of threads; blended errors are what they say."""
 
 import pytest
 import torch
@@ -31,20 +29,17 @@ def leaf(tensor: torch.Tensor) -> torch.Tensor:
 class Passes:
     """The passes of one rendering, their inputs being leaves: project -> tiles -> collect, then a fixed random loss."""
 
-    def __init__(self, scene: Scene, *, tile_size: int = 16, max_hits: int = 2, low_pass: bool = False) -> None:
+    def __init__(self, scene: Scene, *, max_hits: int = 2) -> None:
         surfels, camera = make_surfels(scene), make_camera(scene)
         viewmat = leaf(camera.viewmat)
         means, quats, scales = leaf(surfels.means), leaf(surfels.quats), leaf(surfels.scales)
         shape = (means, quats, scales, leaf(surfels.opacities), leaf(surfels.gammas))
         self.pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-        self.low_pass = low_pass
         sh = leaf(surfels.sh)
         self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
         self.projection = ops.project(*shape, self.colors, viewmat)
-        self.tiles = ops.intersect_tiles(
-            *shape, self.projection, viewmat, self.pinhole, low_pass=low_pass, tile_size=tile_size
-        )
-        self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits, low_pass=low_pass)
+        self.tiles = ops.intersect_tiles(*shape, self.projection, viewmat, self.pinhole)
+        self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits)
         names = ("means", "quats", "scales", "opacities", "gammas", "sh", "viewmat")
         self.leaves = dict(zip(names, (*shape, sh, viewmat), strict=True))
 
@@ -61,9 +56,7 @@ class Passes:
         return {name: present(leaf.grad) for name, leaf in self.leaves.items()}
 
     def blended(self, errors: torch.Tensor) -> torch.Tensor:
-        return ops.splat_error(
-            self.projection, self.tiles, self.hits, self.pinhole, errors, low_pass=self.low_pass
-        ).detach()
+        return ops.splat_error(self.projection, self.tiles, self.hits, self.pinhole, errors).detach()
 
 
 def errors_of(scene: Scene, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -81,14 +74,14 @@ def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
 # Threads
 
 
-@pytest.mark.parametrize(("low_pass", "size"), [(False, BIG), (True, BIG), (False, WIDE)])
-def test_collect_does_not_depend_on_threads(low_pass, size):
+@pytest.mark.parametrize("size", [BIG, WIDE])
+def test_collect_does_not_depend_on_threads(size):
     scene = random_scene(600, **size)
     errors = errors_of(scene)
     results = []
     for count in (1, 2, 3, 20):  # 20 threads share more chunks
         launch.set_num_threads(count)
-        passes = Passes(scene, low_pass=low_pass)
+        passes = Passes(scene)
         request = passes.hits.error_request
         request.errors = errors
         results.append(passes.buffers() | {"blended": passes.blended(errors)})
@@ -156,31 +149,6 @@ def test_many_threads_share_more_chunks():
     assert len(launch.chunks(4096, most=160)) == 16  # chunks have a smallest size
 
 
-# Tiles
-
-
-@pytest.mark.parametrize("make", [random_scene, layered_scene])
-def test_hits_do_not_depend_on_the_size_of_tiles(make):
-    """Values to the last bit; gradients to rounding, as the sums over tiles change their order."""
-    scene = make(40, seed=1)
-    results: list[tuple[dict[str, Any], dict[str, Any], torch.Tensor]] = []
-    for tile_size in (8, 16, 32):
-        passes = Passes(scene, tile_size=tile_size)
-        assert len(passes.tiles.tile_offsets) - 1 == -(-23 // tile_size) * -(-18 // tile_size)
-        results.append((passes.buffers(), passes.gradients(), passes.blended(errors_of(scene))))
-    assert_identical([buffers for buffers, _, _ in results])
-    for _, gradients, blended in results[1:]:
-        for name, gradient in gradients.items():
-            assert_close(gradient, results[0][1][name], kind="gradient", name=name)
-        assert_close(blended, results[0][2], kind="value", name="blended")
-
-
-@pytest.mark.parametrize("tile_size", [0, 4, 12, -8])
-def test_tile_size_must_be_a_multiple_of_eight(tile_size):
-    with pytest.raises(ValueError, match=f"^tile_size: expected a multiple of 8, got {tile_size}$"):
-        Passes(random_scene(2), tile_size=tile_size)
-
-
 # Blended errors
 
 
@@ -192,12 +160,11 @@ def summed(passes: Passes, errors: torch.Tensor, count: int) -> torch.Tensor:
     return torch.zeros(count, dtype=torch.float64).index_add(0, ids.clamp_min(0).flatten(), shares.flatten())
 
 
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_blended_error_is_the_sum_of_weight_times_error(dtype, low_pass):
+def test_blended_error_is_the_sum_of_weight_times_error(dtype):
     scene = random_scene(8, seed=6, dtype=dtype)
     errors = errors_of(scene, dtype)
-    passes = Passes(scene, max_hits=8, low_pass=low_pass)
+    passes = Passes(scene, max_hits=8)
     assert int((passes.hits.ids >= 0).sum(-1).max()) >= 3
     assert_close(passes.blended(errors), summed(passes, errors, 8), kind="value", name="blended")
 

@@ -22,26 +22,25 @@ def one_thread() -> Iterator[None]:
     launch.set_num_threads(threads)
 
 
-def passes(scene: Scene, low_pass: bool, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[torch.Tensor]]:
+def passes(scene: Scene, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[torch.Tensor]]:
     surfels = nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS})
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, 3)
     projection = ops.project(*shape, colors, camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, low_pass=low_pass, room=room)
-    hits = ops.collect(projection, tiles, pinhole, low_pass=low_pass)
+    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=room)
+    hits = ops.collect(projection, tiles, pinhole)
     total = hits.plain.square().sum() + hits.weights.sum() + hits.depths.sum() + hits.alpha.square().sum()
     return tiles, hits, list(torch.autograd.grad(total, list(surfels.parameters()), allow_unused=True))
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("low_pass", [False, True])
 @pytest.mark.parametrize("room", [0, 3, 10_000])
-def test_too_little_or_too_much_room_changes_nothing(room: int, low_pass: bool, device: torch.device) -> None:
+def test_too_little_or_too_much_room_changes_nothing(room: int, device: torch.device) -> None:
     scene = random_scene(60, width=70, height=40, device=device)
-    tiles, hits, gradients = passes(scene, low_pass, None)
-    other_tiles, other_hits, other_gradients = passes(scene, low_pass, room)
+    tiles, hits, gradients = passes(scene, None)
+    other_tiles, other_hits, other_gradients = passes(scene, room)
     assert len(other_tiles.surfel_ids) == room and int(tiles.ends[-1]) > 3
     for name in ("plain", "ids", "depths", "weights", "alpha"):
         assert torch.equal(getattr(hits, name), getattr(other_hits, name)), name
@@ -51,7 +50,7 @@ def test_too_little_or_too_much_room_changes_nothing(room: int, low_pass: bool, 
 
 def test_lists_are_near_to_far_and_cover_every_hit(device: torch.device) -> None:
     scene = random_scene(60, width=70, height=40, device=device)
-    tiles, hits, _ = passes(scene, False, None)
+    tiles, hits, _ = passes(scene, None)
     viewmat = scene["viewmat"]
     depths = scene["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]
     offsets = tiles.tile_offsets.tolist()
@@ -77,7 +76,7 @@ def test_a_surfel_is_listed_in_the_tiles_of_its_quad_not_of_its_box(device: torc
         "viewmat": torch.eye(4, device=device),
         "K": torch.tensor([[320.0, 0.0, 64.0], [0.0, 320.0, 64.0], [0.0, 0.0, 1.0]], device=device),
     }
-    tiles, hits, _ = passes(scene, False, None)
+    tiles, hits, _ = passes(scene, None)
     touched = int(tiles.ends[-1])
     assert (hits.alpha > 0).any()
     assert 8 <= touched <= 24, f"{touched} tiles of 64"

@@ -119,7 +119,6 @@ def collect(
     height: int,
     near: float,
     max_hits: int,
-    low_pass: bool = False,
     order: str = "depth",
 ) -> Hits:
     """Blend every pixel; differentiable with respect to every float tensor.
@@ -140,11 +139,10 @@ def collect(
         height: of the image in pixels.
         near: hits count beyond this z-depth.
         max_hits: K.
-        low_pass: let no surfel be smaller on screen than a Gaussian of standard deviation sqrt(1/2) pixel.
         order: "depth" or "distance" of the surfels' centres, which sorts them.
     """
     walked = walk(
-        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, low_pass, order
+        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, order
     )  # fmt: skip
     ranked, t, alphas = walked.order, walked.t, walked.alphas
     weights = alphas * walked.before
@@ -186,7 +184,6 @@ def walk(
     width: int,
     height: int,
     near: float,
-    low_pass: bool,
     order: str = "depth",
 ) -> Walk:
     """Meet every pixel's ray with every surfel; arguments as of `collect`."""
@@ -198,8 +195,6 @@ def walk(
     # The hit (paper Eq. 3).
     u, v, t, meets = intersect(centers, axes, scales, camera_rays(pixels, fx, fy, cx, cy))
     exponent = power(u, gammas[:, 0]) + power(v, gammas[:, 1])
-    if low_pass:
-        t, exponent, meets = widen(centers, pixels, fx, fy, cx, cy, near, t, exponent, meets)
     alphas = (opacities * torch.exp(-exponent / 2)).clamp_max(ALPHA_MAX)
     counts = meets & (alphas >= ALPHA_MIN) & (t > near)
     alphas = torch.where(counts, alphas, 0.0)
@@ -216,28 +211,3 @@ def transmittance_before(alphas: torch.Tensor) -> torch.Tensor:
     """Transmittance (P, N) in front of each of the sorted `alphas` (P, N): 1, 1 - a_0, (1 - a_0)(1 - a_1)."""
     shifted = torch.nn.functional.pad(1 - alphas, (1, 0), value=1.0)[:, : alphas.shape[1]]
     return torch.cumprod(shifted, dim=-1)
-
-
-def widen(
-    centers: torch.Tensor,
-    pixels: torch.Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    near: float,
-    t: torch.Tensor,
-    exponent: torch.Tensor,
-    meets: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Apply the screen-space low-pass filter: the smaller of `exponent` and 2 r^2, and the winner's depth.
-
-    r is the distance in pixels from the pixel centre to the projected centre; a centre at or before the near
-    depth has no projection, and so no filter.
-    """
-    visible = centers[:, 2] > near
-    z = torch.where(visible, centers[:, 2], 1.0)
-    projected = torch.stack([fx * centers[:, 0] / z + cx, fy * centers[:, 1] / z + cy], dim=-1)
-    screen = 2 * (pixels[:, None] - projected).square().sum(-1)
-    wins = visible & ((screen < exponent) | ~meets)
-    return torch.where(wins, z, t), torch.where(wins, screen, exponent), meets | wins

@@ -67,7 +67,6 @@ def render(
     max_hits: int = 2,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     sh_degree: int = 3,
-    low_pass: bool = False,
     clamp_texture: bool = False,
     shares: torch.Tensor | None = None,
     order: str = "depth",
@@ -82,7 +81,7 @@ def render(
     colors = plain_colors(sh, means, position, sh_degree)
     hits = collect(
         means, quats, scales, opacities, gammas, colors, viewmat,
-        fx, fy, cx, cy, width, height, near, max_hits, low_pass, order,
+        fx, fy, cx, cy, width, height, near, max_hits, order,
     )  # fmt: skip
 
     filled = hits.ids >= 0

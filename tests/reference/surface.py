@@ -17,7 +17,6 @@ class Surface:
         top_depth: (H, W) depth of the heaviest hit.
         normals: (H, W, 3) unit, world frame: weighted mean of the normals, each facing the camera.
         blended_normals: (H, W, 3) their weighted sum.
-        distortion: (H, W) sum over hits i of w_i |sum over hits j before i of w_j (t_i - t_j)|.
     """
 
     expected_depth: torch.Tensor
@@ -25,7 +24,6 @@ class Surface:
     top_depth: torch.Tensor
     normals: torch.Tensor
     blended_normals: torch.Tensor
-    distortion: torch.Tensor
 
 
 def surface(
@@ -42,11 +40,10 @@ def surface(
     width: int,
     height: int,
     near: float,
-    low_pass: bool = False,
 ) -> Surface:
     """Give the depths and normals; arguments as of `tests.reference.collect.collect`."""
     walked = walk(
-        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, low_pass
+        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near
     )  # fmt: skip
     t, weights = walked.t, walked.alphas * walked.before
     hit = weights > 0
@@ -68,16 +65,12 @@ def surface(
     normals = rotations(quats)[walked.order][:, :, 2]
     facing = torch.where(rays @ normals.T > 0, -1.0, 1.0)
     mean = (weights * facing) @ normals
-    before = torch.ones(t.shape[1], t.shape[1], dtype=t.dtype).triu(1)  # [j, i] where j < i
-    depths = torch.where(hit, t, 0.0)
-    gaps = depths * (weights @ before) - (weights * depths) @ before
     return Surface(
         expected_depth=expected.reshape(height, width),
         median_depth=depth_at(median_place, median_place > 0).reshape(height, width),
         top_depth=depth_at(top_place, total > 0).reshape(height, width),
         normals=torch.nn.functional.normalize(mean, dim=-1).reshape(height, width, 3),
         blended_normals=mean.reshape(height, width, 3),
-        distortion=(weights * gaps.abs()).sum(dim=-1).reshape(height, width),
     )
 
 

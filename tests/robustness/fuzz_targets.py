@@ -264,7 +264,7 @@ def _read_log(folder: Path) -> None:
 
 
 def _options(folder: Path) -> list[Files]:
-    render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": True, "clamp_texture": True}
+    render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": False, "clamp_texture": True}
     render |= {"exposure": "photos", "detail_limits": False}
     settings = ["skybox=10", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
     write_json(folder / "options.json", {"render": render, "settings": settings})

@@ -11,9 +11,6 @@ from tests.render_support import BACKGROUND, BUFFERS, assert_gradients, loss, re
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
 
-# On a CPU both forms of the kernels: see `conftest.form`.
-pytestmark = pytest.mark.usefixtures("form")
-
 CASES = [
     # scene, textured (True, False or "residual"), max_hits, sh_degree, clamp_texture
     ("random", True, 2, 3, False),
