@@ -9,7 +9,8 @@ from typing import TypeAlias
 import numpy as np
 
 from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, check_points
-from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.files import one_line
+from nexwarp.io.ply import write_elements
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -89,26 +90,16 @@ def write_ply(path: str | os.PathLike[str], cloud: Cloud) -> None:
     Raises:
         OSError: `path` cannot be written.
     """
-    columns = {axis: ("double", cloud.positions[:, index]) for index, axis in enumerate("xyz")}
-    columns |= {name: ("uchar", cloud.colors[:, index]) for index, name in enumerate(COLORS[0])}
+    vertices = {axis: cloud.positions[:, index].astype(np.float64) for index, axis in enumerate("xyz")}
+    vertices |= {name: cloud.colors[:, index] for index, name in enumerate(COLORS[0])}
     if (cloud.track_lengths > 0).any():
-        columns[TRACK] = ("int", cloud.track_lengths)
+        vertices[TRACK] = cloud.track_lengths.astype(np.int32)
     if (cloud.reprojection_errors >= 0).any():
-        columns[ERRORS[0]] = ("float", cloud.reprojection_errors)
-    elements = {"vertex": columns}
+        vertices[ERRORS[0]] = cloud.reprojection_errors.astype(np.float32)
+    elements = {"vertex": vertices}
     if cloud.observations is not None:
-        elements[OBSERVATION] = {name: ("int", cloud.observations[:, i]) for i, name in enumerate(PAIR)}
-    header, bodies = ["ply", "format binary_little_endian 1.0"], []
-    for element, members in elements.items():
-        count = len(next(iter(members.values()))[1])
-        header += [f"element {element} {count}", *(f"property {kind} {name}" for name, (kind, _) in members.items())]
-        rows = np.empty(count, [(name, "<" + TYPES[kind]) for name, (kind, _) in members.items()])
-        for name, (_, values) in members.items():
-            rows[name] = values
-        bodies.append(rows.tobytes())
-    with written_aside(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join([*header, "end_header", ""]).encode())
-        file.writelines(bodies)
+        elements[OBSERVATION] = {name: cloud.observations[:, i].astype(np.int32) for i, name in enumerate(PAIR)}
+    write_elements(path, elements)
 
 
 def _names(rows: np.ndarray) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import RunError, SettingError
-from nexwarp.io.files import written_aside
+from nexwarp.io.ply import write_elements
 from nexwarp.kernels.tsdf import BLOCK_SIDE
 from nexwarp.model.model import Model
 from nexwarp.ops.tsdf import DistanceField
@@ -24,6 +23,7 @@ LEAST_ALPHA = 0.25  # of a pixel whose depth counts
 LEAST_WEIGHT = 1.1  # of a voxel that counts: a view that sees a surface there weighs 1, one that sees past it a fifth
 LEAST_SHARE = 5e-4  # of all triangles: smaller components are removed
 MOST_BLOCKS = 2_000_000
+CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]  # of a cell; itself and its neighbours
 WELD = 1e4  # vertices that agree to a part of this many of a voxel are one
 
 Progress = Callable[[str, int, int], None]
@@ -121,22 +121,25 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
     from scipy.ndimage import map_coordinates
     from skimage.measure import marching_cubes
 
-    side, count = BLOCK_SIDE, len(field.blocks)
-    values, known, colors = _with_borders(field)
-    corners = field.blocks.cpu().numpy()
+    shape = (-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    neighbors = torch.stack([field.neighbors(corner) for corner in CORNERS], 1).cpu().numpy()
+    distances, weights = (x.cpu().numpy().reshape(shape) for x in (field.distances, field.weights))
+    colors = field.means.cpu().numpy().reshape(*shape, 4)[..., :3]
+    origins = field.blocks.cpu().numpy() * BLOCK_SIDE
     parts: list[tuple[np.ndarray, ...]] = []
-    total = 0
-    for b in range(count):
-        volume, sure = values(b), known(b)
-        cells = _all_corners(sure)
-        if cells.any() and volume[sure].min() < 0 < volume[sure].max():
-            volume = np.where(sure, volume, 1.0)
+    total, count = 0, len(origins)
+    for b, origin in enumerate(origins):
+        volume, known = _bordered(distances, neighbors[b]), _bordered(weights, neighbors[b]) >= LEAST_WEIGHT
+        cells = np.logical_and.reduce([known[_cells(corner)] for corner in CORNERS])
+        if cells.any() and volume[known].min() < 0 < volume[known].max():
+            volume = np.where(known, volume, 1.0)
             vertices, triangles, normals, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
-            at = np.minimum(vertices[triangles].mean(1).astype(int), side - 1)
+            at = np.minimum(vertices[triangles].mean(1).astype(int), BLOCK_SIDE - 1)
             triangles = triangles[cells[at[:, 0], at[:, 1], at[:, 2]]]
-            shades = np.stack([map_coordinates(c, vertices.T, order=1, mode="nearest") for c in colors(b)], -1)
+            channels = np.moveaxis(_bordered(colors, neighbors[b]), -1, 0)
+            shades = np.stack([map_coordinates(c, vertices.T, order=1, mode="nearest") for c in channels], -1)
             # The normals are those of a volume that falls outwards.
-            parts.append((vertices + corners[b] * side, -normals, shades, triangles + total))
+            parts.append((vertices + origin, -normals, shades, triangles + total))
             total += len(vertices)
         if b % 256 == 255 or b + 1 == count:
             observe("marching cubes", b + 1, count)
@@ -144,9 +147,8 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
         return Mesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.float32, np.uint8, np.int32)))
     vertices, normals, shades, triangles = (np.concatenate(each) for each in zip(*parts, strict=True))
     # Blocks share the vertices on their borders.
-    _, first, place = np.unique(
-        np.round(vertices * WELD).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
+    keys = np.round(vertices * WELD).astype(np.int64)
+    _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     triangles = place.reshape(-1)[triangles]
     whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     return Mesh(
@@ -157,40 +159,25 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
     )
 
 
-def _all_corners(sure: np.ndarray) -> np.ndarray:
-    """Return which cells (n - 1)^3 of n^3 voxels have eight known corners."""
-    n = sure.shape[0] - 1
-    parts = [sure[i : i + n, j : j + n, k : k + n] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    return np.logical_and.reduce(parts)
+def _bordered(source: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
+    """Return a block of (B, 16, 16, 16, ...) values with one layer more: the first ones of its neighbours, or 0.
 
-
-def _with_borders(
-    field: DistanceField,
-) -> tuple[Callable[[int], np.ndarray], Callable[[int], np.ndarray], Callable[[int], np.ndarray]]:
-    """Return functions of a block: distances and known (17, 17, 17), colours (3, 17, 17, 17).
-
-    The last layers are the first ones of the neighbours.
+    Args:
+        source: values of all B blocks.
+        neighbors: (8,) the blocks at `CORNERS`, the block itself first; B where there is none.
     """
     side = BLOCK_SIDE
-    offsets = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    neighbors = torch.stack([field.neighbors(offset) for offset in offsets], 1).cpu().numpy()
-    shape = (-1, side, side, side)
-    distances, weights = (x.cpu().numpy().reshape(shape) for x in (field.distances, field.weights))
-    means = field.means.cpu().numpy().reshape(*shape, 4)
+    out = np.zeros((side + 1, side + 1, side + 1, *source.shape[4:]), source.dtype)
+    for corner, block in zip(CORNERS, neighbors, strict=True):
+        if block < len(source):
+            there = tuple(slice(side, None) if beyond else slice(0, side) for beyond in corner)
+            out[there] = source[block][tuple(slice(0, 1) if beyond else slice(0, side) for beyond in corner)]
+    return out
 
-    def gathered(source: np.ndarray, b: int, empty: float) -> np.ndarray:
-        out = np.full((side + 1, side + 1, side + 1, *source.shape[4:]), empty, dtype=source.dtype)
-        for offset, n in zip(offsets, neighbors[b], strict=True):
-            if n < len(source):
-                there = tuple(slice(side, None) if o else slice(0, side) for o in offset)
-                out[there] = source[n][tuple(slice(0, 1) if o else slice(0, side) for o in offset)]
-        return out
 
-    return (
-        lambda b: gathered(distances, b, 0.0),
-        lambda b: gathered(weights, b, 0.0) >= LEAST_WEIGHT,
-        lambda b: np.moveaxis(gathered(means, b, 0.0)[..., :3], -1, 0),
-    )
+def _cells(corner: tuple[int, int, int]) -> tuple[slice, ...]:
+    """Slices of (17, 17, 17) values that select this corner of the (16, 16, 16) cells."""
+    return tuple(slice(first, first + BLOCK_SIDE) for first in corner)
 
 
 def _without_crumbs(mesh: Mesh) -> Mesh:
@@ -207,8 +194,8 @@ def _without_crumbs(mesh: Mesh) -> Mesh:
     sizes = np.bincount(labels)
     triangles = triangles[sizes[labels] >= LEAST_SHARE * len(triangles)]
     used, place = np.unique(triangles, return_inverse=True)
-    kept = (mesh.vertices[used], mesh.normals[used], mesh.colors[used])
-    return Mesh(*kept, place.reshape(-1, 3).astype(np.int32))
+    triangles = place.reshape(-1, 3).astype(np.int32)
+    return Mesh(mesh.vertices[used], mesh.normals[used], mesh.colors[used], triangles)
 
 
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
@@ -217,27 +204,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
     Raises:
         OSError: `path` cannot be written.
     """
-    axes = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    colors = [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(mesh.vertices), [*axes, *colors])
-    for names, values in ((axes[:3], mesh.vertices), (axes[3:], mesh.normals), (colors, mesh.colors)):
-        for column, (name, _) in enumerate(names):
-            rows[name] = values[:, column]
-    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("vertices", "<i4", 3)])
-    faces["count"], faces["vertices"] = 3, mesh.triangles
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment nexwarp mesh",
-        f"element vertex {len(rows)}",
-        *(f"property {kinds[kind]} {name}" for name, kind in (*axes, *colors)),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-        "",
-    ]
-    with written_aside(Path(path)) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(header).encode())
-        file.write(rows.tobytes())
-        file.write(faces.tobytes())
+    values = [*mesh.vertices.T, *mesh.normals.T, *mesh.colors.T]
+    names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    vertices = dict(zip(names, values, strict=True))
+    write_elements(path, {"vertex": vertices, "face": {"vertex_indices": mesh.triangles}}, "nexwarp mesh")

@@ -12,21 +12,13 @@ from functools import lru_cache
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
 
-# Distance between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %.
-SPACING = 1.4
-
-# Largest number of pieces on either side of a surfel's centre, along one axis.
-MOST_STEPS = 16
-
-# Number of opacities that grids are fitted for; other opacities scale the nearest grid.
-LEVELS = 128
-
-LARGEST_ALPHA, LEAST_ALPHA = 0.99, 1.0 / 255.0  # of a surfel's hit
-
+SPACING = 1.4  # between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %
+MOST_STEPS = 16  # pieces on either side of a surfel's centre, along one axis
+LEVELS = 128  # opacities that grids are fitted for; other opacities scale the nearest grid
 FITTING_STEPS = 40
-# Candidate widths of a row of pieces, in standard deviations of the surfel.
-WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
+WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)  # candidates of a row of pieces, in standard deviations of the surfel
 
 
 @dataclass(frozen=True)
@@ -68,12 +60,12 @@ def split_large(
     for camera in cameras:
         position = camera.position.to(means)
         limit = torch.minimum(limit, max_extent * (means - position).norm(dim=1))
-    peak = opacities.clamp(max=LARGEST_ALPHA)
+    peak = opacities.clamp(max=ALPHA_MAX)
     level = (peak * LEVELS).round().clamp(1, LEVELS - 1)
     reach = _reach(level / LEVELS)
     steps = (reach[:, None] * scales / (SPACING * limit[:, None])).ceil().clamp(0, MOST_STEPS)
     steps = torch.where(scales > limit[:, None], steps.clamp(min=1), torch.zeros_like(steps)).long()
-    whole = (steps == 0).all(dim=1) | (peak < LEAST_ALPHA)
+    whole = (steps == 0).all(dim=1) | (peak < ALPHA_MIN)
     ids = [whole.nonzero()[:, 0]]
     offsets, sizes, alphas = [means.new_zeros(len(ids[0]), 2)], [scales[whole]], [opacities[whole]]
     large = (~whole).nonzero()[:, 0]
@@ -84,26 +76,18 @@ def split_large(
         ids.append(members.repeat_interleave(len(grid)))
         offsets.append((scales[members, None] * grid).flatten(0, 1))
         sizes.append((scales[members, None] * size).expand(-1, len(grid), 2).flatten(0, 1))
-        alphas.append((peak[members, None] * LEVELS / grade * alpha).clamp(max=LARGEST_ALPHA).flatten())
+        alphas.append((peak[members, None] * LEVELS / grade * alpha).clamp(max=ALPHA_MAX).flatten())
     return Pieces(torch.cat(ids), torch.cat(offsets), torch.cat(sizes), torch.cat(alphas), len(ids[0]))
 
 
 def _reach(peak: torch.Tensor) -> torch.Tensor:
     """Return the distance from the centre, in standard deviations, at which a hit's alpha falls to 1/255."""
-    return (2 * (peak / LEAST_ALPHA).log().clamp(min=0)).sqrt()
+    return (2 * (peak / ALPHA_MIN).log().clamp(min=0)).sqrt()
 
 
 @lru_cache(4096)
 def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Fit the pieces of a surfel of one opacity.
-
-    Blending adds optical depths -log(1 - alpha). Those of the pieces are scaled until their sum at each piece's centre
-    is the surfel's.
-
-    Args:
-        across: number of pieces on either side of the centre, along x.
-        along: likewise along y.
-        level: opacity of the surfel times `LEVELS`.
+    """Fit `across` pieces on either side of the centre along x, `along` along y, to an opacity of `level` / `LEVELS`.
 
     Returns:
         Centres (P, 2) and standard deviations (2,), in standard deviations of the surfel, and opacities (P,).
@@ -113,7 +97,7 @@ def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tens
     spacing = [reach / n if n else 0.0 for n in (across, along)]
     steps = [torch.arange(-n, n + 1, dtype=torch.float64) for n in (across, along)]
     grid = torch.cartesian_prod(*steps) * torch.tensor(spacing, dtype=torch.float64)
-    grid = grid[_falloff(grid) * peak >= LEAST_ALPHA / 2]
+    grid = grid[_falloff(grid) * peak >= ALPHA_MIN / 2]
     side = torch.linspace(-reach, reach, 41, dtype=torch.float64)
     places = torch.cartesian_prod(side, side)
     wanted = peak * _falloff(places)
@@ -126,7 +110,7 @@ def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tens
         error = float((1 - (1 - fitted * falloff).prod(1) - wanted).square().mean())
         if error < best:
             best, size, alpha = error, candidate, fitted
-    kept = alpha >= LEAST_ALPHA
+    kept = alpha >= ALPHA_MIN
     return grid[kept], size, alpha[kept]
 
 
@@ -135,7 +119,10 @@ def _falloff(offsets: torch.Tensor) -> torch.Tensor:
 
 
 def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
-    """Return the opacities (P,) of pieces whose optical depths add up to the surfel's at each piece's centre."""
+    """Return the opacities (P,) of pieces whose optical depths add up to the surfel's at each piece's centre.
+
+    Blending adds optical depths -log(1 - alpha).
+    """
     wanted = -torch.log1p(-peak * _falloff(grid))
     falloff = _falloff((grid[:, None] - grid) / size)
     depths = wanted / falloff.sum(1)

@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import numpy as np
 
@@ -48,21 +48,20 @@ def save_splats_spz(
         save_splats_ply(ply, surfels, sh_degree, cameras=cameras, max_extent=max_extent)
         content = ply.read_bytes()
     library = gaussforge.GaussForge()
-    gaussians = cast("dict[str, object]", _checked(path, library.read(content, "ply")))
-    count = cast(int, gaussians["numPoints"])
-    values = {name: np.frombuffer(cast(bytes, gaussians[name]), np.float32) for name in ARRAYS}
-    arrays = {name: array.reshape(count, array.size // max(count, 1)) for name, array in values.items()}
-    near = (np.abs(arrays["positions"]) < LARGEST_COORDINATE).all(1)
+    gaussians = _checked(path, library.read(content, "ply"))
+    count = gaussians["numPoints"]
+    arrays = {name: np.frombuffer(gaussians[name], np.float32).reshape(count, -1) for name in ARRAYS if count}
+    near = (np.abs(arrays["positions"]) < LARGEST_COORDINATE).all(1) if count else np.zeros(0, bool)
     if (~near).sum() > LARGEST_LOSS * count:
         raise FormatError(
             f"{path}: SPZ holds Gaussians up to {LARGEST_COORDINATE:,.0f} units from the origin, "
             f"{(~near).sum():,} of {count:,} are farther away; use --format ply"
         )
     gaussians |= {name: array[near].tobytes() for name, array in arrays.items()} | {"numPoints": int(near.sum())}
-    write_atomically(Path(path), cast(bytes, _checked(path, library.write(gaussians, "spz"))))
+    write_atomically(Path(path), _checked(path, library.write(gaussians, "spz")))
 
 
-def _checked(path: str | os.PathLike[str], answer: Mapping[str, object]) -> object:
+def _checked(path: str | os.PathLike[str], answer: Mapping[str, Any]) -> Any:
     """Return what GaussForge returned, unless that is an error."""
     if "error" in answer:
         raise FormatError(f"{path}: GaussForge could not write it ({one_line(answer['error'])})")

@@ -14,8 +14,10 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import FormatError, MissingError, check_range
-from nexwarp.export.splats import Pieces, split_large
-from nexwarp.io.files import one_line, written_aside
+from nexwarp.export.bake.observe import axes
+from nexwarp.export.splats import split_large
+from nexwarp.io.files import one_line
+from nexwarp.io.ply import write_elements
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.surfels import Surfels
 
@@ -28,6 +30,8 @@ THINNESS = 1e-3
 # Viewers expect the coefficients of SH degree 3.
 SPLAT_DEGREE = 3
 SPLAT_COEFFICIENTS = (SPLAT_DEGREE + 1) ** 2
+
+POSITION, NORMAL = ["x", "y", "z"], ["nx", "ny", "nz"]
 
 TYPES = {"float": np.dtype("<f4"), "float32": np.dtype("<f4"), "double": np.dtype("<f8"), "float64": np.dtype("<f8")}
 
@@ -48,14 +52,15 @@ def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
     """
     raw = surfels.state_dict()
     columns = {
-        **_geometry(surfels),
-        **_harmonics(raw["sh0"], raw["shN"]),
-        "opacity": raw["logit_opacities"],
-        **_columns("scale", raw["log_scales"]),
-        **_columns("rot", raw["raw_quats"]),
-        **_columns("gamma", raw["raw_gammas"]),
+        **_columns(POSITION + NORMAL, torch.cat([raw["means"], surfels.normals.detach()], dim=1)),
+        **_columns(_names("f_dc", 3), raw["sh0"][:, 0]),
+        **_columns(_names("f_rest", 3 * raw["shN"].shape[1]), raw["shN"].mT.flatten(1)),
+        "opacity": raw["logit_opacities"].cpu().numpy(),
+        **_columns(_names("scale", 2), raw["log_scales"]),
+        **_columns(_names("rot", 4), raw["raw_quats"]),
+        **_columns(_names("gamma", 2), raw["raw_gammas"]),
     }
-    _write(path, columns, SURFELS)
+    write_elements(path, {"vertex": columns}, SURFELS)
 
 
 def save_splats_ply(
@@ -91,33 +96,30 @@ def save_splats_ply(
     if not max_extent > 0:
         raise ValueError(f"max_extent: expected more than 0, got {max_extent}")
     raw = surfels.state_dict()
-    kept = raw["shN"][:, : (sh_degree + 1) ** 2 - 1].float()
-    rest = kept.new_zeros(len(surfels), SPLAT_COEFFICIENTS - 1, 3)
-    rest[:, : kept.shape[1]] = kept
     pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
-    ids, count = pieces.ids, pieces.whole
-    geometry = {name: x[ids] for name, x in _geometry(surfels).items()}
-    for name, x in zip("xyz", _moved(surfels, pieces).unbind(1), strict=True):
-        geometry[name][count:] = x
-    scales = torch.cat([raw["log_scales"][ids[:count]], pieces.scales[count:].log()])
+    ids, whole = pieces.ids, pieces.whole
+    means = raw["means"][ids]
+    means[whole:] += sum(
+        offset[whole:, None] * axis[ids[whole:]]
+        for offset, axis in zip(pieces.offsets.unbind(1), axes(surfels), strict=True)
+    )
+    rest = raw["shN"].new_zeros(len(surfels), SPLAT_COEFFICIENTS - 1, 3)
+    kept = raw["shN"][:, : (sh_degree + 1) ** 2 - 1]
+    rest[:, : kept.shape[1]] = kept
+    scales = torch.cat([raw["log_scales"][ids[:whole]], pieces.scales[whole:].log()])
     thin = scales.amin(dim=1, keepdim=True) + float(np.log(THINNESS))
     columns = {
-        **geometry,
-        **_harmonics(raw["sh0"][ids], rest[ids]),
-        "opacity": torch.cat([raw["logit_opacities"][ids[:count]], torch.logit(pieces.opacities[count:])]),
-        **_columns("scale", torch.cat([scales, thin], dim=1)),
-        **_columns("rot", surfels.quats.detach()[ids]),
+        **_columns(POSITION + NORMAL, torch.cat([means, surfels.normals.detach()[ids]], dim=1).float()),
+        **_columns(_names("f_dc", 3), raw["sh0"][ids, 0].float()),
+        **_columns(_names("f_rest", 3 * rest.shape[1]), rest[ids].mT.flatten(1).float()),
+        "opacity": torch.cat([raw["logit_opacities"][ids[:whole]], pieces.opacities[whole:].logit()])
+        .float()
+        .cpu()
+        .numpy(),
+        **_columns(_names("scale", 3), torch.cat([scales, thin], dim=1).float()),
+        **_columns(_names("rot", 4), surfels.quats.detach()[ids].float()),
     }
-    _write(path, {name: x.float() for name, x in columns.items()}, SPLATS)
-
-
-def _moved(surfels: Surfels, pieces: Pieces) -> torch.Tensor:
-    """Return the centres of the pieces of split surfels, world frame."""
-    ids, (along_x, along_y) = pieces.ids[pieces.whole :], pieces.offsets[pieces.whole :, :, None].unbind(1)
-    w, x, y, z = surfels.quats.detach()[ids].unbind(-1)
-    axis_x = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
-    axis_y = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
-    return surfels.means.detach()[ids] + along_x * axis_x + along_y * axis_y
+    write_elements(path, {"vertex": columns}, SPLATS)
 
 
 def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
@@ -139,8 +141,8 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         vertices = np.fromfile(file, dtype, count)
     names = dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
-    expected = ["x", "y", "z", *_names("f_dc", 3), *_names("f_rest", rest), "opacity", *_names("scale", 2)]
-    expected += [*_names("rot", 4), *_names("gamma", 2)]
+    sizes = {"f_dc": 3, "f_rest": rest, "scale": 2, "rot": 4, "gamma": 2}
+    expected = [*POSITION, "opacity", *(one for name, size in sizes.items() for one in _names(name, size))]
     missing = [name for name in expected if name not in names]
     if missing:
         raise FormatError(f"{path}: expected the properties of nexwarp surfels, found no {missing[0]}")
@@ -150,7 +152,7 @@ def load_surfels_ply(path: str | os.PathLike[str]) -> Surfels:
         return torch.from_numpy(stacked.astype(dtype[0].newbyteorder("=")))
 
     raw = {
-        "means": take(["x", "y", "z"]),
+        "means": take(POSITION),
         "raw_quats": take(_names("rot", 4)),
         "log_scales": take(_names("scale", 2)),
         "logit_opacities": take(["opacity"])[:, 0],
@@ -171,32 +173,9 @@ def _names(name: str, count: int) -> list[str]:
     return [f"{name}_{i}" for i in range(count)]
 
 
-def _columns(name: str, values: torch.Tensor) -> dict[str, torch.Tensor]:
-    return dict(zip(_names(name, values.shape[1]), values.unbind(1), strict=True))
-
-
-def _geometry(surfels: Surfels) -> dict[str, torch.Tensor]:
-    normals = surfels.normals.detach()
-    return dict(
-        zip(("x", "y", "z", "nx", "ny", "nz"), (*surfels.means.detach().unbind(1), *normals.unbind(1)), strict=True)
-    )
-
-
-def _harmonics(sh0: torch.Tensor, shN: torch.Tensor) -> dict[str, torch.Tensor]:
-    return {**_columns("f_dc", sh0[:, 0]), **_columns("f_rest", shN.mT.flatten(1))}
-
-
-def _write(path: str | os.PathLike[str], columns: dict[str, torch.Tensor], comment: str) -> None:
-    count = len(next(iter(columns.values())))
-    kind = "double" if columns["x"].dtype == torch.float64 else "float"
-    vertices = np.empty(count, np.dtype([(name, TYPES[kind]) for name in columns]))
-    for name, values in columns.items():
-        vertices[name] = values.cpu().numpy()
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {count}"]
-    lines += [*(f"property {kind} {name}" for name in columns), "end_header", ""]
-    with written_aside(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(lines).encode())
-        file.write(vertices.tobytes())
+def _columns(names: list[str], values: torch.Tensor) -> dict[str, np.ndarray]:
+    """Return the columns of (N, C) values by name."""
+    return dict(zip(names, values.cpu().numpy().T, strict=True))
 
 
 def _header(path: Path, data: bytes) -> tuple[int, np.dtype, int]:
