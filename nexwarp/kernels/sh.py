@@ -1,14 +1,13 @@
-"""Spherical harmonics colours: plain ones of degree 0 to 6, textured ones of degree 0 to 3 (paper Sec. 4.1).
+"""Spherical harmonics colours of degree 0 to 3: plain ones of surfels, textured ones of points (paper Sec. 4.1).
 
 A thread is a surfel (plain) or a point (textured). Read: coefficients and directions. Written: colours; backward, the
 gradients of coefficients and directions, which `wp.grad` of the basis gives. Nothing is added up. A colour that was
-clamped to 0 has no gradient. Constants and signs are the field's. Degrees above 3 are not in the paper; recurrences
-give them, with the same signs.
+clamped to 0 has no gradient. Constants and signs are the field's.
 """
 
 import functools
-import math
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -18,30 +17,32 @@ BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
 BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+TINY = wp.constant(wp.float64(1e-12))
 
 
-def first_factor(m: int) -> float:
-    """Return the normalised associated Legendre function of degree and order m, divided by (1 - z^2)^(m / 2)."""
-    product = math.prod((2 * j + 1) / (2 * j) for j in range(1, m + 1))
-    return (-1) ** m * math.sqrt(product * (2 if m else 1) / (4 * math.pi))
+@wp.func
+def direction_of(ray: Any):
+    """Unit vector along a ray; the forward one, as a constant, for a surfel at the camera's very centre."""
+    length = wp.length(ray)
+    direction = type(ray)(type(length)(0.0), type(length)(0.0), type(length)(1.0))
+    if length > type(length)(TINY):
+        direction = ray / length
+    return direction
 
 
-def recurrence(degree: int, m: int) -> tuple[float, float]:
-    """Return a and b of P(degree) = a (z P(degree - 1) - b P(degree - 2)), of order m < degree, normalised."""
-    a = math.sqrt((4 * degree**2 - 1) / (degree**2 - m**2))
-    b = math.sqrt(((degree - 1) ** 2 - m**2) / (4 * (degree - 1) ** 2 - 1))
-    return a, b
+@wp.func
+def unclamped(grad: Any, color: Any):
+    """Gradient of what `color` was before it was clamped to >= 0."""
+    out = type(grad)()
+    for c in range(3):
+        if color[c] > type(color[c])(0.0):
+            out[c] = grad[c]
+    return out
 
 
 @functools.cache
 def basis_function(real: type, degree: int) -> wp.Function:
     """Make the function that evaluates the (degree + 1)^2 basis functions at a unit direction."""
-    return lower_bands(real, degree) if degree < 4 else higher_bands(real, degree, degree)
-
-
-@functools.cache
-def lower_bands(real: type, degree: int) -> wp.Function:
-    """Make the function that evaluates the basis functions of degrees 0 to 3, in a vector for those of `degree`."""
     vec3 = types(real).vec3
     vec = wp.types.vector(length=(degree + 1) ** 2, dtype=real)
     A0, B0 = wp.constant(real(BAND_0)), wp.constant(real(BAND_1))
@@ -82,49 +83,6 @@ def lower_bands(real: type, degree: int) -> wp.Function:
 
 
 @functools.cache
-def higher_bands(real: type, degree: int, m: int) -> wp.Function:
-    """Make the function that evaluates the basis functions of degrees 0 to 3, and of orders -m to m of those above.
-
-    Each order is a function of its own, so that Warp knows all constants when it declares it. Constants that depend on
-    a loop would be in a kernel's key in Warp's cache only if the process had compiled another kernel with them before.
-    """
-    vec3 = types(real).vec3
-    lower = higher_bands(real, degree, m - 1) if m else lower_bands(real, degree)
-    lowest = max(m, 4)  # degree that has this order and is not among the lower bands
-    steps = [recurrence(n, m) for n in range(m + 1, degree + 1)] + [(0.0, 0.0)]
-    factors = wp.types.vector(length=len(steps), dtype=real)
-    A, B = (wp.constant(factors(*each)) for each in zip(*steps, strict=True))
-    FIRST = wp.constant(real(first_factor(m)))
-
-    @wp.func
-    def basis(d: vec3):
-        out = lower(d)
-        cosine = real(1.0)  # times sin^m, of m times the azimuth
-        sine = real(0.0)
-        for _turn in range(wp.static(m)):
-            turned = d[0] * cosine - d[1] * sine
-            sine = d[0] * sine + d[1] * cosine
-            cosine = turned
-        before = real(0.0)
-        value = FIRST
-        for k in range(wp.static(lowest - m)):
-            following = A[k] * (d[2] * value - B[k] * before)
-            before = value
-            value = following
-        for k in range(wp.static(degree + 1 - lowest)):
-            n = k + wp.static(lowest)
-            out[n * n + n + wp.static(m)] = value * cosine
-            if wp.static(m > 0):
-                out[n * n + n - wp.static(m)] = value * sine
-            following = A[k + wp.static(lowest - m)] * (d[2] * value - B[k + wp.static(lowest - m)] * before)
-            before = value
-            value = following
-        return out
-
-    return basis
-
-
-@functools.cache
 def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     """Make the kernels of max(0, 0.5 + SH(direction from the camera's centre to the surfel's)).
 
@@ -136,33 +94,13 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     vec3 = types(real).vec3
     basis = basis_function(real, degree)
     count = (degree + 1) ** 2
-    options = {"max_unroll": max(count, 16)}  # else the basis is in memory, not in registers
     vec = wp.types.vector(length=count, dtype=real)
-    # A surfel at the camera's very centre has no direction; it takes the forward one, without gradient.
-    TINY = wp.constant(real(1e-12))
-
-    @wp.func
-    def basis_along(ray: vec3):
-        length = wp.length(ray)
-        direction = vec3(real(0.0), real(0.0), real(1.0))
-        if length > TINY:
-            direction = ray / length
-        return basis(direction)
 
     @wp.func
     def basis_dot(ray: vec3, w: vec):
-        return wp.dot(basis_along(ray), w)
+        return wp.dot(basis(direction_of(ray)), w)
 
-    @wp.func
-    def unclamped(grad: vec3, color: vec3):
-        """Gradient of what `color` was before it was clamped."""
-        out = vec3()
-        for c in range(3):
-            if color[c] > real(0.0):
-                out[c] = grad[c]
-        return out
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique")
     def plain_colors(
         first: wp.int32,
         sh0: wp.array2d(dtype=vec3),
@@ -173,13 +111,13 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
         colors: wp.array(dtype=vec3),
     ):
         i = first + wp.tid()
-        b = basis_along(means[i] - position[0])
+        b = basis(direction_of(means[i] - position[0]))
         color = vec3(real(0.5), real(0.5), real(0.5)) + sh0[i, 0] * b[0]
         for k in range(1, wp.static(count)):
             color += shN[i, k - 1] * b[k]
         colors[i] = wp.max(color, vec3())
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique")
     def plain_coefficients_backward(
         first: wp.int32,
         sharing: wp.int32,
@@ -194,7 +132,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
         thread = first + wp.tid()
         i = thread // sharing
         grad = unclamped(grad_colors[i], colors[i])
-        b = basis_along(means[i] - position[0])
+        b = basis(direction_of(means[i] - position[0]))
         for k in range(thread - i * sharing, grad_shN.shape[1] + 1, sharing):
             # Not b[k]: an index that the compiler does not know moves the basis from registers to memory.
             value = real(0.0)
@@ -205,7 +143,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
             else:
                 grad_shN[i, k - 1] = grad * value
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique")
     def plain_rays_backward(
         first: wp.int32,
         shN: wp.array2d(dtype=vec3),

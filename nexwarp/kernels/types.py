@@ -24,8 +24,7 @@ LIMIT_MARGIN = 1e-3
 # Floor of u^2, so that log stays finite at a surfel's centre.
 TINY = 1e-20
 MAX_HITS = 8
-MAX_SH_DEGREE = 6  # of the surfels' colours
-MAX_TEXTURE_SH_DEGREE = 3
+MAX_SH_DEGREE = 3
 
 
 @wp.struct

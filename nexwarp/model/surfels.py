@@ -9,7 +9,7 @@ from nexwarp import ops
 from nexwarp.errors import check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 
-COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 6
+COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 3
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
 END = 1e-6
 
@@ -89,7 +89,7 @@ class Surfels(nn.Module):
             scales: (N, 2) > 0, world units along the surfel's x and y axes.
             opacities: (N,) in [0, 1].
             gammas: (N, 2) >= 1; 1 is a Gaussian, large values a hard-edged quad.
-            sh: (N, C, 3) spherical harmonics of the plain colour, DC first; C = (d + 1)^2, d of 0 to 6.
+            sh: (N, C, 3) spherical harmonics of the plain colour, DC first; C = (d + 1)^2, d of 0 to 3.
 
         Raises:
             TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
@@ -170,11 +170,12 @@ class Surfels(nn.Module):
 
 
 def check_coefficients(name: str, count: int) -> None:
-    """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 6."""
+    """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 3."""
     if count not in COEFFICIENTS:
         *most, last = COEFFICIENTS
         told = f"{', '.join(map(str, most))} or {last}"
-        raise ValueError(f"{name}: expected {told} spherical harmonics coefficients, got {count}")
+        removed = "; SH degrees above 3 were removed" if count in (25, 36, 49) else ""
+        raise ValueError(f"{name}: expected {told} spherical harmonics coefficients, got {count}{removed}")
 
 
 def _check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:

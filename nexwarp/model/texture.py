@@ -10,7 +10,7 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.errors import check_range, check_tensors
-from nexwarp.kernels.types import MAX_TEXTURE_SH_DEGREE
+from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.ops import fused_texture
 
 GRID_INIT = 0.01
@@ -262,7 +262,7 @@ def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_
         ("table_size", table_size, 1, 2**30),
         ("width", width, 1, 4096),
         ("hidden_layers", hidden_layers, 0, 64),
-        ("sh_degree", sh_degree, 0, MAX_TEXTURE_SH_DEGREE),
+        ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
     ):
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"{name}: expected an int, got {type(value).__name__}")

@@ -19,7 +19,7 @@ def plain_colors(
             above `degree` are not read and get zero gradients.
         means: (N, 3) world.
         position: (3,) camera centre, world.
-        degree: 0 to 6, degree to evaluate; less when C is less.
+        degree: 0 to 3, degree to evaluate; less when C is less.
 
     Returns:
         (N, 3) colours.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from nexwarp.errors import check_range
-from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE, MAX_TEXTURE_SH_DEGREE
+from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.render import MAX_JITTER
 from nexwarp.model.texture import check_sizes
 from nexwarp.ops.tiles import check_order
@@ -253,7 +253,7 @@ class Config(Recipe):
     def texture_sh_degree(self) -> int:
         """SH degree of the texture's colours."""
         own = self.texture.sh_degree
-        return min(self.sh_degree, MAX_TEXTURE_SH_DEGREE) if own is None else own
+        return self.sh_degree if own is None else own
 
     @property
     def settled(self) -> int:

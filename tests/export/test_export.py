@@ -41,7 +41,7 @@ def numbered(name: str, count: int) -> list[str]:
     return [f"{name}_{i}" for i in range(count)]
 
 
-@pytest.mark.parametrize("sh_degree", [0, 2, 3, 6])
+@pytest.mark.parametrize("sh_degree", [0, 2, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_surfels_read_back_bit_for_bit(
     tmp_path: Path, sh_degree: int, dtype: torch.dtype, device: torch.device

@@ -139,7 +139,7 @@ def test_bad_surfels(argument: str, error: type[Exception], spoil: Callable[[Any
     assert_refused(error, argument, nw.Surfels.from_activated, **spoiled)
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16, 25, 36, 49])
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_surfels_take_any_degree(coefficients: int) -> None:
     scene = random_scene(8, sh_degree=MAX_SH_DEGREE)
     scene["sh"] = scene["sh"][:, :coefficients]

@@ -1,8 +1,5 @@
-"""Real spherical harmonics, in the order and with the signs of 3D Gaussian splatting files, which end at degree 3."""
+"""Real spherical harmonics up to degree 3, in the order and with the signs of 3D Gaussian splatting files."""
 
-import math
-
-import numpy as np
 import torch
 
 
@@ -31,23 +28,7 @@ def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
-    for higher in range(4, degree + 1):
-        values += _band(x, y, z, higher)
     return torch.stack(values, dim=-1)
-
-
-def _band(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, degree: int) -> list[torch.Tensor]:
-    """The functions of one degree: derivatives of Legendre's polynomial, as polynomials of z, times (x + iy)^m."""
-    found = {}
-    cosine, sine = torch.ones_like(x), torch.zeros_like(x)
-    for m in range(degree + 1):
-        polynomial = np.polynomial.legendre.Legendre.basis(degree).deriv(m).convert(kind=np.polynomial.Polynomial)
-        value = sum(coefficient * z**power for power, coefficient in enumerate(polynomial.coef.tolist()))
-        norm = (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m) / math.factorial(degree + m)
-        value = value * (-1) ** m * math.sqrt(norm * (2 if m else 1))
-        found[m], found[-m] = value * cosine, value * sine if m else value
-        cosine, sine = cosine * x - sine * y, cosine * y + sine * x
-    return [found[m] for m in range(-degree, degree + 1)]
 
 
 def evaluate(coefficients: torch.Tensor, directions: torch.Tensor, degree: int) -> torch.Tensor:
