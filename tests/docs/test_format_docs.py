@@ -13,10 +13,10 @@ import pytest
 import torch
 
 import nexwarp as nw
+from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.model.bounds import BOUNDS, MATRIX_BOUNDS
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from tests.docs.test_docs import DOCS, ROOT, SYMBOLS
@@ -29,7 +29,7 @@ def run(tmp_path_factory, one_torch_thread: None) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
     expose_photos(scene)
-    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16", "sh_degree=6")
+    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
     flags = [x for change in changes for x in ("--set", change)]
     flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
     assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
@@ -78,7 +78,7 @@ def test_tensors(run):
     tensors, meta = header(run)
     rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
     shape = meta["texture"]
-    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 48, "3": 3, "1": 1, "2": 2, "4": 4}
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "3": 3, "1": 1, "2": 2, "4": 4}
     sizes |= {
         "V": len(json.loads((run / "cameras.json").read_text())["train"]),
         "L": shape["levels"],
@@ -96,15 +96,6 @@ def test_tensors(run):
     assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
 
 
-def test_bounds() -> None:
-    rows = re.findall(r"^\| `([a-zA-Z0-9_.]+)` \| (-?\d\S*) \| (\d\S*) \|", section("model.safetensors"), re.M)
-    documented = {name: (float(low), float(high)) for name, low, high in rows}
-    matrices = documented.pop("texture.mlp.I.weight")
-    assert matrices == MATRIX_BOUNDS
-    rounded = {name: (low, float(f"{high:.5g}")) for name, (low, high) in BOUNDS.items()}
-    assert documented == rounded
-
-
 def test_metadata(run):
     _, meta = header(run)
     text = section("model.safetensors").split("a JSON object:", 1)[1]
@@ -112,10 +103,7 @@ def test_metadata(run):
 
 
 def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
-    """The document's program, executed: pixels of a test view, to rounding."""
-    (program,) = re.findall(r"```python\n(.*?)```", section("model.safetensors"), re.S)
-    reader: dict[str, Any] = {}
-    exec(program, reader)
+    """The program of examples/, executed: pixels of a test view, to rounding."""
     cameras = json.loads((run / "cameras.json").read_text())["test"]
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
@@ -144,18 +132,18 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         (True, {"exposure": "mean"}),
         (True, {"detail_limits": False}),
         (True, {"order": "distance"}),
-        (True, {"sh_degree": 3}),
+        (True, {"sh_degree": 1}),
         (None, {}),  # without a texture
     ):
         if residual is None:
             model.texture = None
         else:
             texture.residual = texture.config["residual"] = residual
-        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7), sh_degree=6).changed(**changes)
+        model.options = nw.RenderOptions(background=(0.2, 0.5, 0.7)).changed(**changes)
         file = model.save(tmp_path)
         stored = nw.load(file)
-        tensors, meta = reader["read"](file)
-        drawn = np.array([reader["pixel"](tensors, meta, cameras[name], x, y) for x, y in pixels])
+        tensors, meta = read_model.read(file)
+        drawn = np.array([read_model.pixel(tensors, meta, cameras[name], x, y) for x, y in pixels])
         plain = nw.Model(stored.surfels, None, stored.exposures, stored.detail_limits, stored.options)
         with torch.no_grad():
             images = [x.render(camera).image for x in (stored, plain)]

@@ -1,7 +1,6 @@
 """Compact model files: small, close to the model, and refused with one line where they are damaged."""
 
 import math
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from safetensors import safe_open
 
 import nexwarp as nw
+from examples import read_model
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.compact import CODE, DTYPES, LARGEST, REACH, decode, encode
@@ -162,15 +162,9 @@ def test_damage_is_one_clear_line(tmp_path: Path, change: Callable[..., Any], ma
 
 
 def test_the_documented_reader_decodes_a_compact_file(tmp_path: Path) -> None:
-    """The page's programs, run on a compact file, give the numbers that `nexwarp.load` gives."""
-    page = (DOCS / "format.md").read_text(encoding="utf-8")
-    scope: dict[str, Any] = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.S):
-        if "def read(" in code or "def expand(" in code:
-            exec(code, scope)
+    """The program of examples/, run on a compact file, gives the numbers that `nexwarp.load` gives."""
     file = limited_model().save(tmp_path / "x.safetensors", compact=True)
-    tensors, meta = scope["read"](file)
-    tensors = scope["expand"](tensors)
+    tensors, meta = read_model.read(file)
     assert meta["format_version"] == COMPACT_VERSION
     loaded = nw.load(file)
     for name, value in loaded.surfels.state_dict().items():

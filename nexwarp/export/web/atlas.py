@@ -1,4 +1,4 @@
-"""The files of the baked scene, which the page draws where there is no WebGPU; docs/web.md describes them."""
+"""The files of the baked scene, which the page draws where there is no WebGPU; FORMAT.md describes them."""
 
 import io
 from collections.abc import Mapping

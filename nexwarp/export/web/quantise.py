@@ -1,4 +1,4 @@
-"""Quantisation of a scene's arrays for its file; docs/web.md describes it.
+"""Quantisation of a scene's arrays for its file; FORMAT.md describes it.
 
 Surfels are sorted along a Morton curve, and each chunk of 256 neighbours has ranges of its own, so that a surfel far
 away costs the others no precision.

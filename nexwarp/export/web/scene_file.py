@@ -1,4 +1,4 @@
-"""Writer of scene files: one binary file with a JSON header that the web page streams; docs/web.md describes it."""
+"""Writer of scene files: one binary file with a JSON header that the web page streams; FORMAT.md describes it."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""A reader of scene files and baked scenes, written from docs/web.md and independent of the writer and the page."""
+"""A reader of scene files and baked scenes, written from FORMAT.md and independent of the writer and the page."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-// Reader of scene files and baked scenes (docs/web.md): checks what the header says before anything is allocated, and
+// Reader of scene files and baked scenes (FORMAT.md): checks what the header says before anything is allocated, and
 // unpacks section by section while the file arrives.
 
 export class SceneError extends Error {
