@@ -15,19 +15,7 @@ from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats_spz import save_splats_spz
 from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.model.model_file import save_model
-from nexwarp.run.contents import (
-    CAMERA_PATH_FILE,
-    COMPACT_FILE,
-    EXPORT_FOLDER,
-    GLB_FILE,
-    MESH_FILE,
-    SPLATS_FILE,
-    SPZ_FILE,
-    SURFELS_FILE,
-    TRAIN,
-    TRANSFORMS_FILE,
-    WEB_FILE,
-)
+from nexwarp.run import contents
 from nexwarp.run.folder import SceneSource
 from nexwarp.run.opened import OpenedModel
 
@@ -64,30 +52,34 @@ def export_run(
         raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
     if kind not in FORMATS:
         raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
+    out = folder or opened.folder / contents.EXPORT_FOLDER
+    if kind == "mesh":
+        return export_mesh(opened, out, device)
+    if kind == "cameras":
+        return _export_cameras(opened, out)
+    if kind == "compact":
+        return [save_model(out / contents.COMPACT_FILE, opened.model, compact=True)]
+    cameras = _all_cameras(opened)
     if kind == "web":
         from nexwarp.export.web.export import export_web
 
-        out = folder or opened.folder / EXPORT_FOLDER / WEB_FILE
-        title, cameras = run_title(opened), _all_cameras(opened)
-        return export_web(opened.model.to(device), cameras, out, quality=quality, title=title)
-    folder = folder or opened.folder / EXPORT_FOLDER
-    if kind == "mesh":
-        return export_mesh(opened, folder, device)
-    if kind == "cameras":
-        return _export_cameras(opened, folder)
-    if kind == "compact":
-        return [save_model(folder / COMPACT_FILE, opened.model, compact=True)]
+        title = opened.title if opened.source is None else Path(opened.source.path).name or "nexwarp"
+        page = folder or out / contents.WEB_FILE
+        return export_web(opened.model.to(device), cameras, page, quality=quality, title=title)
+    views = list(cameras.values())
     if kind == "glb":
-        return _export_glb(opened, folder, device)
-    views = list(_all_cameras(opened).values())
-    gaussians = (opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE))
+        if not views:
+            raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
+        check_package()
+        save_glb(out / contents.GLB_FILE, bake(opened.model.to(device), views), views)
+        return [out / contents.GLB_FILE]
+    surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
     if kind == "spz":
-        save_splats_spz(folder / SPZ_FILE, *gaussians, cameras=views, max_extent=max_extent)
-        return [folder / SPZ_FILE]
-    files = [folder / SURFELS_FILE, folder / SPLATS_FILE]
-    save_surfels_ply(files[0], opened.model.surfels)
-    save_splats_ply(files[1], *gaussians, cameras=views, max_extent=max_extent)
-    return files
+        save_splats_spz(out / contents.SPZ_FILE, surfels, degree, cameras=views, max_extent=max_extent)
+        return [out / contents.SPZ_FILE]
+    save_surfels_ply(out / contents.SURFELS_FILE, surfels)
+    save_splats_ply(out / contents.SPLATS_FILE, surfels, degree, cameras=views, max_extent=max_extent)
+    return [out / contents.SURFELS_FILE, out / contents.SPLATS_FILE]
 
 
 def export_mesh(
@@ -112,38 +104,27 @@ def export_mesh(
     Raises:
         ValueError, OSError: the message names the option or file.
     """
-    trained = opened.cameras.get(TRAIN, {})
+    trained = opened.cameras.get(contents.TRAIN, {})
     if not trained:
         raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
     mesh = extract_mesh(opened.model.to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
-    save_mesh(folder / MESH_FILE, mesh)
-    return [folder / MESH_FILE]
-
-
-def _export_glb(opened: OpenedModel, folder: Path, device: torch.device | str) -> Sequence[Path]:
-    """Write the baked surfels of a run as a glTF file."""
-    cameras = list(_all_cameras(opened).values())
-    if not cameras:
-        raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
-    check_package()
-    save_glb(folder / GLB_FILE, bake(opened.model.to(device), cameras), cameras)
-    return [folder / GLB_FILE]
+    save_mesh(folder / contents.MESH_FILE, mesh)
+    return [folder / contents.MESH_FILE]
 
 
 def _export_cameras(opened: OpenedModel, folder: Path) -> Sequence[Path]:
     """Write the cameras of a run for nerfstudio."""
-    cameras_file = opened.folder / CAMERAS_FILE
     images = SceneSource.images if opened.source is None else opened.source.images
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
-        group: {f"{images}/{name}": camera for name, camera in members.items()}
+        group: {f"{images}/{name}": camera for name, camera in sorted(members.items())}
         for group, members in opened.cameras.items()
     }
-    cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
+    cameras = dict(sorted({name: camera for members in named.values() for name, camera in members.items()}.items()))
     if not cameras:
-        raise RunError(f"{cameras_file}: expected at least one camera, found none")
-    files = [folder / TRANSFORMS_FILE, folder / CAMERA_PATH_FILE]
-    save_transforms(files[0], cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
+        raise RunError(f"{opened.folder / CAMERAS_FILE}: expected at least one camera, found none")
+    files = [folder / contents.TRANSFORMS_FILE, folder / contents.CAMERA_PATH_FILE]
+    save_transforms(files[0], cameras, train=list(named.get("train", {})), test=list(named.get("test", {})))
     first = next(iter(cameras.values()))
     save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
     return files
@@ -154,8 +135,3 @@ def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:
     if not (opened.folder / CAMERAS_FILE).is_file():
         return {}
     return {name: camera for members in opened.cameras.values() for name, camera in members.items()}
-
-
-def run_title(opened: OpenedModel) -> str:
-    """Return the name of a run's scene, or of a model, as a title."""
-    return opened.title if opened.source is None else Path(opened.source.path).name or "nexwarp"

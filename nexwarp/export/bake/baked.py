@@ -1,6 +1,6 @@
 """The baked scene: surfels, and an image of what the texture adds to their colours."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -44,15 +44,6 @@ class Baked:
         """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
         return sample(self.atlas, self.layout.texels(ids, local))
 
-    def colors_from_mean_direction(self) -> torch.Tensor:
-        """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
-        return mean_colors(self.surfels, self.seen, self.model.options.sh_degree)
-
-    def quantised(self) -> "Baked":
-        """Return the scene with an atlas as an image of 8 bits holds it."""
-        codes, scale = encode_atlas(self.atlas)
-        return replace(self, atlas=decode_atlas(codes, scale))
-
 
 def mean_colors(surfels: Surfels, seen: Observations, sh_degree: int) -> torch.Tensor:
     """Return the plain colours (N, 3) of surfels from the mean directions that the views see them in."""
@@ -60,29 +51,16 @@ def mean_colors(surfels: Surfels, seen: Observations, sh_degree: int) -> torch.T
 
 
 def encode_atlas(atlas: torch.Tensor) -> tuple[torch.Tensor, float]:
-    """Quantise an atlas.
-
-    Returns:
-        uint8 codes of the atlas' shape, 128 for 0; and the value that 127 steps stand for.
-    """
+    """Return uint8 codes of an atlas, 128 for 0, and the value that 127 steps stand for."""
     scale = max(float(atlas.abs().amax().clamp(max=1.0)), 1e-3) if atlas.numel() else 1.0
     return (atlas / scale * 127).round().clamp(-127, 127).add(128).to(torch.uint8), scale
 
 
-def decode_atlas(codes: torch.Tensor, scale: float) -> torch.Tensor:
-    """Return the float32 atlas of codes."""
-    return (codes.float() - 128) * (scale / 127)
-
-
 def sample(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Interpolate the atlas (height, width, C) bilinearly at places (..., 2), column and row; differentiable.
-
-    Returns:
-        (..., C).
-    """
+    """Interpolate an atlas (height, width, C) bilinearly at places (..., 2), column and row; differentiable."""
     size = atlas.new_tensor([atlas.shape[1], atlas.shape[0]])
     grid = (2 * places + 1) / size - 1
-    found = torch.nn.functional.grid_sample(
+    values = torch.nn.functional.grid_sample(
         atlas.permute(2, 0, 1)[None], grid.reshape(1, -1, 1, 2), align_corners=False, padding_mode="border"
     )
-    return found[0, :, :, 0].T.reshape(*places.shape[:-1], atlas.shape[2])
+    return values[0, :, :, 0].T.reshape(*places.shape[:-1], atlas.shape[2])

@@ -1,6 +1,6 @@
 """Baking: evaluate the texture at the texels, then fit texels and SH to the model's own renderings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -9,7 +9,7 @@ from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.bake.baked import Baked, mean_colors, sample
 from nexwarp.export.bake.layout import Layout, lay_out
-from nexwarp.export.bake.observe import Observations, ViewHits, axes, hits_of, observe, untextured
+from nexwarp.export.bake.observe import Observations, axes, hits_of, observe, untextured
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 
@@ -27,7 +27,6 @@ def bake(
     texel: float = 1.0,
     side: int = 4096,
     steps: int | None = None,
-    done: Callable[[], object] = lambda: None,
 ) -> Baked:
     """Bake a model's texture into an atlas.
 
@@ -37,17 +36,16 @@ def bake(
         texel: size of a texel in pixels of the closest view.
         side: largest width and height of the atlas.
         steps: steps of the fit; None derives them from the number of the views' pixels.
-        done: called after each step.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
     seen = observe(model, cameras)
-    layout = lay_out(seen, texel=texel, side=side)
+    layout = lay_out(seen.boxes, seen.boxes[:, 2] > seen.boxes[:, 0], seen.pixels, texel=texel, side=side)
     atlas = evaluate(model, seen, layout)
     if steps is None:
         windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2
         steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS)
-    return fit(Baked(model, model.surfels, seen, layout, atlas), cameras, steps, done)
+    return fit(Baked(model, model.surfels, seen, layout, atlas), cameras, steps)
 
 
 @torch.no_grad()
@@ -57,10 +55,8 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
     What is added to a plain colour is weighted by the fraction of the surfel that is textured.
     """
     atlas = model.surfels.means.new_zeros(layout.height, layout.width, 3)
-    if model.texture is None or model.options.max_hits == 0:
-        return atlas
     places, ids, local = layout.centres()
-    if not len(ids):
+    if model.texture is None or model.options.max_hits == 0 or not len(ids):
         return atlas
     surfels, degree = model.surfels, model.options.sh_degree
     offsets = (local * surfels.scales[ids]).unbind(1)
@@ -77,7 +73,7 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
     return atlas
 
 
-def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], object] = lambda: None) -> Baked:
+def fit(baked: Baked, cameras: Sequence[Camera], steps: int) -> Baked:
     """Fit atlas and SH to the model's renderings by least squares: Adam, a window of one view a step."""
     model, degree = baked.model, baked.model.options.sh_degree
     state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
@@ -96,27 +92,20 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int, done: Callable[[], 
         plain = ops.plain_colors((trained["sh0"], trained["shN"]), state["means"], camera.position.to(target), degree)
         added = sample(trained["atlas"], baked.layout.texels(hits.ids, hits.local))
         colors = (plain.index_select(0, hits.ids) + added).clamp_min(0)
-        loss = (_others(hits) + hits.blended(colors) - target).square().mean()
+        with torch.no_grad():  # further hits in their plain colours, and the background
+            others = hits.rendering.image - hits.blended(hits.plain_colors())
+        loss = (others + hits.blended(colors) - target).square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         schedule.step()
-        done()
     state |= {name: trained[name].detach() for name in ("sh0", "shN")}
     return replace(baked, surfels=Surfels(state), atlas=trained["atlas"].detach())
-
-
-@torch.no_grad()
-def _others(hits: ViewHits) -> torch.Tensor:
-    """Return what a pixel (H, W, 3) shows beside the hits: further ones in their plain colours, and the background."""
-    return hits.rendering.image - hits.blended(hits.plain_colors())
 
 
 def _window(camera: Camera, generator: torch.Generator) -> Camera:
     """Return the camera of a random window of an image."""
     width, height = min(camera.width, WINDOW), min(camera.height, WINDOW)
-    left, top = (
-        int(torch.randint(free + 1, (1,), generator=generator))
-        for free in (camera.width - width, camera.height - height)
-    )
+    left = int(torch.randint(camera.width - width + 1, (1,), generator=generator))
+    top = int(torch.randint(camera.height - height + 1, (1,), generator=generator))
     return camera.crop(left, top, width, height)

@@ -11,8 +11,8 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import FormatError, SettingError
-from nexwarp.export.bake.baked import Baked
-from nexwarp.export.bake.layout import Layout, lay_out_boxes
+from nexwarp.export.bake.baked import Baked, mean_colors
+from nexwarp.export.bake.layout import Layout, lay_out
 from nexwarp.export.bake.observe import axes
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
@@ -97,9 +97,9 @@ def _texture(baked: Baked, side: int) -> tuple[Layout, np.ndarray]:
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     boxes = torch.cat([-reach, reach], dim=1)
-    layout = lay_out_boxes(boxes, visible, baked.seen.pixels, texel=1.0, side=side, fewest=FEWEST)
+    layout = lay_out(boxes, visible, baked.seen.pixels, texel=1.0, side=side, fewest=FEWEST)
     places, ids, local = layout.centres()
-    plain = baked.colors_from_mean_direction()
+    plain = mean_colors(surfels, baked.seen, baked.model.options.sh_degree)
     colors = plain[ids] + baked.added(ids, local)
     exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
     alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)

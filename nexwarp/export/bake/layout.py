@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import torch
 
-from nexwarp.export.bake.observe import Observations
-
 MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
 BISECTIONS = 24
@@ -38,25 +36,18 @@ class Layout:
         return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
 
     def texels(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-        """Return places in the atlas; whole numbers are centres of texels.
+        """Return places (..., 2) in the atlas, column and row; whole numbers are centres of texels.
 
         Args:
             ids: (...) surfels, int64.
             local: (..., 2) coordinates on them, in units of the scales.
-
-        Returns:
-            (..., 2) column and row.
         """
         boxes, rects = self.boxes[ids], self.rects[ids].to(local)
         share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
         return rects[..., :2] + share.clamp(0, 1) * (rects[..., 2:] - 1)
 
     def centres(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return every texel of every textured surfel.
-
-        Returns:
-            Places (M, 2) int64 in the atlas, column and row; surfels (M,) int64; coordinates (M, 2) on them.
-        """
+        """Return the M texels: places (M, 2) int64, column and row; surfels (M,) int64; coordinates (M, 2) on them."""
         textured = self.textured()
         rects, boxes = self.rects[textured].long(), self.boxes[textured]
         counts = rects[:, 2] * rects[:, 3]
@@ -68,18 +59,7 @@ class Layout:
         return rects[owner, :2] + inside, textured[owner], local
 
 
-def lay_out(seen: Observations, *, texel: float, side: int) -> Layout:
-    """Give each textured surfel a rectangle of the size that the views see it at.
-
-    Args:
-        seen: what the views see.
-        texel: size of a texel in pixels of the closest view; it grows until the atlas holds all of them.
-        side: largest width and height of the atlas, texels.
-    """
-    return lay_out_boxes(seen.boxes, seen.boxes[:, 2] > seen.boxes[:, 0], seen.pixels, texel=texel, side=side)
-
-
-def lay_out_boxes(
+def lay_out(
     boxes: torch.Tensor, textured: torch.Tensor, pixels: torch.Tensor, *, texel: float, side: int, fewest: int = 2
 ) -> Layout:
     """Give each textured surfel a rectangle for its box.
@@ -98,26 +78,29 @@ def lay_out_boxes(
     room = FILLED * side * side
     fewest = max(min(fewest, int(math.sqrt(room / max(len(covered), 1)))), 2)
 
-    def sizes(step: float) -> torch.Tensor:
+    def sizes_at(step: float) -> torch.Tensor:
         return ((covered / step).ceil() + 1).clamp(fewest, MAX_SIDE).int()
 
-    low, high = texel, texel
-    while _area(sizes(high)) > room and high < LARGEST_TEXEL:
+    low = high = texel
+    while _area(sizes_at(high)) > room and high < LARGEST_TEXEL:
         high *= 2
     for _ in range(BISECTIONS if high > low else 0):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if _area(sizes(middle)) > room else (low, middle)
+        if _area(sizes_at(middle)) > room:
+            low = middle
+        else:
+            high = middle
     while True:
-        found = sizes(high)
-        width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(_area(found), 1) / FILLED)))))
-        places, height = _pack(found, width)
-        if height <= side and (not len(found) or int(found[:, 0].max()) <= width):
+        sizes = sizes_at(high)
+        width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(_area(sizes), 1) / FILLED)))))
+        places, height = _pack(sizes, width)
+        if height <= side and (not len(sizes) or int(sizes[:, 0].max()) <= width):
             break
         if high > LARGEST_TEXEL:
-            raise ValueError(f"side: expected a larger atlas than {side} for {len(found):,} surfels")
+            raise ValueError(f"side: expected a larger atlas than {side} for {len(sizes):,} surfels")
         high *= GROWTH  # the shelves leave more gaps than FILLED allows for
     rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
-    rects[textured.cpu()] = torch.cat([places, found], dim=1)
+    rects[textured.cpu()] = torch.cat([places, sizes], dim=1)
     return Layout(rects.to(boxes.device), boxes, width, height)
 
 

@@ -78,30 +78,20 @@ def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def untextured(model: Model, surfels: Surfels | None = None) -> Model:
-    """Return a model of the same geometry that keeps 8 hits a pixel, without texture and at the mean exposure.
-
-    Args:
-        model: the model.
-        surfels: surfels with other colours; None takes the model's own.
-    """
+    """Return a model that keeps 8 hits a pixel, without texture, at the mean exposure, with other colours if given."""
     options = model.options.changed(max_hits=MAX_HITS, exposure="mean", clamp_texture=False)
     return Model(surfels or model.surfels, None, None, model.detail_limits, options, model.meta)
 
 
 @torch.no_grad()
 def hits_of(bare: Model, camera: Camera) -> ViewHits:
-    """Render a view of an `untextured` model and locate its hits on their surfels.
-
-    Args:
-        bare: the untextured model.
-        camera: the camera, on any device.
-    """
+    """Render a view of an `untextured` model and locate its hits on their surfels."""
     camera = camera.to(bare.device)
     rendering = bare.render(camera)
     surfels = bare.surfels
-    found = (rendering.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]
-    pixels, ranks = found // MAX_HITS, found % MAX_HITS
-    ids, weights, depths = (x.flatten()[found] for x in (rendering.ids, rendering.weights, rendering.depths))
+    slots = (rendering.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]
+    pixels, ranks = slots // MAX_HITS, slots % MAX_HITS
+    ids, weights, depths = (x.flatten()[slots] for x in (rendering.ids, rendering.weights, rendering.depths))
     ids = ids.long()
     rays = torch.stack(
         [
@@ -119,12 +109,7 @@ def hits_of(bare: Model, camera: Camera) -> ViewHits:
 
 @torch.no_grad()
 def observe(model: Model, cameras: Sequence[Camera]) -> Observations:
-    """Render all views without texture and gather what they see of each surfel.
-
-    Args:
-        model: the model; its K decides which hits are textured.
-        cameras: cameras of the views.
-    """
+    """Render all views without texture and gather what they see of each surfel; K decides which hits are textured."""
     bare, kept = untextured(model), model.options.max_hits
     count, means = len(model.surfels), model.surfels.means.detach()
     boxes = torch.cat([means.new_full((count, 2), NOWHERE), means.new_full((count, 2), -NOWHERE)], dim=1)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nexwarp.export.bake.baked import Baked, decode_atlas
+from nexwarp.export.bake.baked import Baked
 from nexwarp.export.web.atlas import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.model.detail_limits import NEVER
@@ -81,6 +81,11 @@ def decode_harmonics(codes: np.ndarray, ranges: list[float]) -> np.ndarray:
     steps = codes.astype(np.float32) - 128
     degrees = np.floor(np.sqrt(np.arange(codes.shape[1]) + 1)).astype(int)
     return (np.sign(steps) * (steps / 127) ** 2 * np.array(ranges, np.float32)[degrees - 1][:, None]).astype(np.float32)
+
+
+def decode_atlas(codes: torch.Tensor, scale: float) -> torch.Tensor:
+    """The float32 atlas of codes."""
+    return (codes.float() - 128) * (scale / 127)
 
 
 def as_stored(baked: Baked) -> Baked:
