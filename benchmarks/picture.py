@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, help="height of the file in pixels; default: that of the photo")
     parser.add_argument("--out", type=Path, required=True, help="JPEG file to write")
     options = parser.parse_args()
-    views = {view.name: view for view in read_run(options.run)[0].load().test}
+    views = {view.name: view for view in read_run(options.run).source.load().test}
     row = draw_row(open_model(options.run).model, views[options.view or next(iter(views))])
     image = Image.fromarray(row.numpy())
     if options.height is not None:

@@ -1,16 +1,4 @@
-"""Errors of user input, files and resources. Each is a NexwarpError and also the built-in error named here.
-
-    NexwarpError
-      SettingError      (ValueError)         an option or setting that is out of range or conflicts with another one
-      SceneError        (ValueError)         a scene that cannot be used
-      FormatError       (ValueError)         a file that is damaged or has another format or version
-        CheckpointError                      a checkpoint that is damaged or belongs to another run
-      RunError          (ValueError)         a run folder in a state that the command cannot use
-      MissingError      (FileNotFoundError)  a file or folder that does not exist
-      StorageError      (OSError)            a disk that is full, read-only or failing
-      DivergedError     (RuntimeError)       a training whose numbers are no longer finite
-      RankError         (RuntimeError)       ranks of a training that are missing, differ or have ended
-      OutOfMemoryError  (MemoryError)        a GPU or computer with too little memory for the task
+"""Errors of user input, files and resources. Each is a NexwarpError, and the built-in error that callers expect.
 
 Arguments of Python functions that are out of range or of another type raise plain ValueError and TypeError.
 """
@@ -122,12 +110,10 @@ def check_tensors(
     for name, (tensor, shape) in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
-        if dtype is None:
-            if not tensor.is_floating_point():
-                raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
-            dtype = tensor.dtype
-        if device is None:
-            device = tensor.device
+        if dtype is None and not tensor.is_floating_point():
+            raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
+        dtype = dtype or tensor.dtype
+        device = device or tensor.device
         if tensor.dtype != dtype:
             raise TypeError(f"{name}: expected dtype {dtype}, got {tensor.dtype}")
         if tensor.device != device:
@@ -137,10 +123,8 @@ def check_tensors(
             expected = sizes.setdefault(want, size) if isinstance(want, str) else want
             fits &= size == expected
         if not fits:
-            text = ", ".join(
-                f"{want}={sizes[want]}" if isinstance(want, str) and want in sizes else str(want) for want in shape
-            )
-            raise ValueError(f"{name}: expected shape ({text}), got {tuple(tensor.shape)}")
+            wanted = ", ".join(f"{size}={sizes[size]}" if size in sizes else f"{size}" for size in map(str, shape))
+            raise ValueError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}")
     return sizes
 
 

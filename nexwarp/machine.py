@@ -1,4 +1,4 @@
-"""The machine's memory, and what makes runs repeatable on it."""
+"""The machine: its memory, its threads, and repeatable results on it."""
 
 import ctypes
 import functools
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,14 +19,12 @@ from nexwarp.errors import UNKNOWN, OutOfMemoryError
 
 ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
 
-# Of CUDA's own calls, and of its libraries, which do not say how much they wanted.
+# Errors of CUDA and its libraries, which do not say how much memory they wanted.
 EXHAUSTED = re.compile(
     r"CUDA (driver )?error:? .*out of memory|_ALLOC_FAILED|cudaErrorMemoryAllocation|bad_alloc", re.I
 )
-
-
-# Parameters of glibc's mallopt.
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
+# Parameters of glibc's mallopt: M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD.
+KEEP_FREED = {-4: 0, -1: 2**31 - 1, -2: 64 * 2**20}
 
 
 @functools.cache
@@ -43,7 +41,7 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
     except (OSError, AttributeError):
         return
-    for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 64 * 2**20)):
+    for parameter, value in KEEP_FREED.items():
         mallopt(parameter, value)
 
 
@@ -70,25 +68,13 @@ def needed_memory(error: BaseException) -> str | None:
         return None
     if isinstance(error, OutOfMemoryError):
         return error.needed
-    match = ALLOCATION.search(str(error))
-    if match is not None:
-        return _readable(match[1])
-    exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
-    return UNKNOWN if exhausted else None
-
-
-def _readable(amount: str) -> str:
-    match = re.fullmatch(r"(\d+) ?bytes", amount, re.I)
-    if match is None:
-        return amount
-    size = int(match[1])
+    if (match := ALLOCATION.search(str(error))) is None:
+        exhausted = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or EXHAUSTED.search(str(error))
+        return UNKNOWN if exhausted else None
+    if (digits := re.fullmatch(r"(\d+) ?bytes", match[1], re.I)) is None:
+        return match[1]
+    size = int(digits[1])
     return f"{size / 2**30:.2f} GiB" if size >= 2**30 else f"{size / 2**20:.2f} MiB"
-
-
-class _DeterministicModule(Protocol):
-    """The part of `torch.utils.deterministic` that is used here."""
-
-    fill_uninitialized_memory: bool
 
 
 @contextmanager
@@ -114,16 +100,11 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def deterministic(wanted: bool) -> Iterator[None]:
-    """Make the results of torch's operations and of nexwarp's kernels independent of the order of threads.
-
-    Args:
-        wanted: False changes nothing.
-    """
+    """Make results of torch and of nexwarp's kernels independent of the order of threads; False changes nothing."""
     if not wanted or torch.are_deterministic_algorithms_enabled():
         yield
         return
-    # The module replaces its own class to make this a property, which torch's stubs do not declare.
-    memory = cast(_DeterministicModule, torch.utils.deterministic)
+    memory: Any = torch.utils.deterministic  # its properties are not in torch's stubs
     fill = memory.fill_uninitialized_memory
     torch.use_deterministic_algorithms(True)
     memory.fill_uninitialized_memory = False  # every buffer is written before it is read

@@ -30,7 +30,7 @@ def stopped_by_signals() -> Iterator[None]:
     def handle(number: int, _frame: FrameType | None) -> None:
         raise Stopped(number)
 
-    with _handled(handle, *_endings()):
+    with _handled(handle):
         yield
 
 
@@ -48,21 +48,18 @@ def deferred_stop() -> Iterator[Callable[[], int | None]]:
         if len(received) > 1:
             raise Stopped(number)
 
-    with _handled(handle, signal.SIGINT, *_endings()):
+    with _handled(handle, signal.SIGINT):
         yield lambda: received[0] if received else None
 
 
-def _endings() -> list[int]:
-    """Return SIGTERM and SIGHUP, without those that the system does not have or that are ignored."""
-    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    return [number for number in known if signal.getsignal(number) != signal.SIG_IGN]
-
-
 @contextmanager
-def _handled(handle: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
+def _handled(handle: Callable[[int, FrameType | None], None], *more: int) -> Iterator[None]:
+    """Handle SIGTERM and SIGHUP, where the system has them and does not ignore them, and more signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [*more, *(number for number in known if signal.getsignal(number) != signal.SIG_IGN)]
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield

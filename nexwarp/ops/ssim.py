@@ -26,11 +26,14 @@ def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.
         raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
     if image.is_cuda and image.dtype == torch.float32:
         return _KernelDSSIM.apply(image.contiguous(), target.contiguous(), factor)
-    return factor * _dssim(image, target)
+    return factor * (1.0 - ssim_map(image, target).mean())
 
 
-def _dssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """The formula of `nexwarp.kernels.ssim`."""
+def ssim_map(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Return the structural similarity (H, W, C) about each pixel of two images, by torch.
+
+    The formula is that of `nexwarp.kernels.ssim`: an 11 x 11 Gaussian window of sigma 1.5, zeros outside.
+    """
     blurred = _blur(torch.cat([x, y, 0.5 * (x * x + y * y), x * y], dim=-1))
     mean_x, mean_y, squares, products = blurred.split(3, dim=-1)
     product = mean_x * mean_y
@@ -39,7 +42,7 @@ def _dssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     variance = variance + (-variance).clamp_min(0.0).detach()  # rounding can take it below zero
     luminance = (product + C1 / 2) / (square + C1 / 2)
     structure = (products - product + C2 / 2) / (variance + C2 / 2)
-    return 1.0 - (luminance * structure).mean()
+    return luminance * structure
 
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:

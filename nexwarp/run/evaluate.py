@@ -11,8 +11,10 @@ from nexwarp.data import View
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.run.contents import COMPARE, TEST, picture_name
-from nexwarp.run.metrics import CONVENTION, check_available, flip, lpips_vgg, psnr, ssim
+from nexwarp.run.metrics import CONVENTION, METRICS, psnr
 from nexwarp.train.ranks.ranks import Ranks
+
+Values = dict[str, float | None]  # of a view, by metric
 
 
 class Evaluation(TypedDict, total=False):
@@ -31,7 +33,7 @@ class Evaluation(TypedDict, total=False):
     ssim: float
     flip: float | None
     lpips: float | None
-    views: dict[str, dict[str, float | None]]
+    views: dict[str, Values]
     convention: str
 
 
@@ -65,37 +67,24 @@ def evaluate(
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")
-    _check_names(metrics)
+    if unknown := [name for name in metrics if name not in METRICS]:
+        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
     ranks = Ranks.alone(model.device) if ranks is None else ranks
-    results: dict[str, dict[str, float | None]] = {}
+    results: dict[str, Values] = {}
     for begin in range(0, len(views), ranks.size):
-        some = views[begin : begin + ranks.size]
-        mine = _judge(model, some[ranks.rank], mask_mode, metrics) if ranks.rank < len(some) else None
-        for view, (picture, values) in zip(some, _gathered(mine, some, ranks), strict=True):
+        group = views[begin : begin + ranks.size]
+        mine = _judge(model, group[ranks.rank], mask_mode, metrics) if ranks.rank < len(group) else None
+        for view, (picture, values) in zip(group, _gathered(mine, group, ranks), strict=True):
             results[view.name] = values
             if renders is not None and ranks.first:
                 _write(renders, view, picture, *_compared(model, view, mask_mode))
             if progress is not None:
                 progress(view.name)
-    means = {name: _mean([r[name] for r in results.values()]) for name in metrics}
+    means = {name: _mean([values[name] for values in results.values()]) for name in metrics}
     return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
 
 
-def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
-    """Raise ValueError unless all metrics are known and can be computed on the device."""
-    _check_names(metrics)
-    for name in metrics:
-        check_available(name, device)
-
-
-def _check_names(metrics: Sequence[str]) -> None:
-    if unknown := [name for name in metrics if name not in METRICS]:
-        raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
-
-
-def _judge(
-    model: Model, view: View, mask_mode: str, metrics: Sequence[str]
-) -> tuple[torch.Tensor, dict[str, float | None]]:
+def _judge(model: Model, view: View, mask_mode: str, metrics: Sequence[str]) -> tuple[torch.Tensor, Values]:
     """Render a view; return the picture, (H, W, 3) uint8 on the CPU, and its metrics."""
     picture = to_uint8(model.render_image(view.camera)).cpu()
     photo, mask = _compared(model, view, mask_mode)
@@ -104,16 +93,16 @@ def _judge(
 
 def _compared(model: Model, view: View, mask_mode: str) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Return the photo that a rendering is compared with, (H, W, 3) uint8, and the mask of what counts."""
-    photo, mask = to_uint8(view.image), view.mask
-    if mask is None or mask_mode != "background":
-        return photo, mask
+    photo = to_uint8(view.image)
+    if view.mask is None or mask_mode != "background":
+        return photo, view.mask
     background = to_uint8(torch.as_tensor(model.options.background, dtype=torch.float32))
-    return torch.where(mask[..., None], photo, background), None
+    return torch.where(view.mask[..., None], photo, background), None
 
 
 def _gathered(
-    mine: tuple[torch.Tensor, dict[str, float | None]] | None, views: Sequence[View], ranks: Ranks
-) -> list[tuple[torch.Tensor, dict[str, float | None]]]:
+    mine: tuple[torch.Tensor, Values] | None, views: Sequence[View], ranks: Ranks
+) -> list[tuple[torch.Tensor, Values]]:
     """Return what each rank has made of its view; None is a rank without one."""
     if ranks.size == 1:
         assert mine is not None
@@ -122,7 +111,7 @@ def _gathered(
     pictures = ranks.gather_bytes(b"" if mine is None else mine[0].contiguous().numpy().tobytes())
     shapes = [(view.camera.height, view.camera.width, 3) for view in views]
     return [
-        (torch.frombuffer(bytearray(pixels), dtype=torch.uint8).view(shape), cast(dict[str, float | None], value))
+        (torch.frombuffer(bytearray(pixels), dtype=torch.uint8).view(shape), cast(Values, value))
         for pixels, shape, value in zip(pictures, shapes, values, strict=False)
     ]
 
@@ -140,15 +129,3 @@ def _write(renders: Path, view: View, picture: torch.Tensor, photo: torch.Tensor
 def _mean(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return fmean(known) if len(known) == len(values) else None
-
-
-def _whole(metric: Callable[..., float | None]) -> Callable[..., float | None]:
-    """Return a metric of whole images that takes a mask: excluded pixels are copied from the photo."""
-
-    def masked_metric(picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> float | None:
-        return metric(picture if mask is None else torch.where(mask[..., None], picture, photo), photo)
-
-    return masked_metric
-
-
-METRICS = {"psnr": psnr, "ssim": ssim, "flip": _whole(flip), "lpips": _whole(lpips_vgg)}

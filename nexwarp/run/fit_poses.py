@@ -21,6 +21,8 @@ STEPS = 80  # of each view; the first half sees the photo at half its size
 RATE = 5e-3  # Adam's first learning rate: radians, and shifts in scene scales
 LAST_RATE = 0.02  # the last rate, relative to the first
 
+Aim = tuple[Camera, torch.Tensor, torch.Tensor]  # camera; photo (H, W, 3); what counts of it (H, W), 0 or 1
+
 
 def fit_poses(
     model: Model,
@@ -49,8 +51,8 @@ def fit_poses(
             fitted.append(dataclasses.replace(view, camera=_fit(model, view, unit, steps)))
             if progress is not None:
                 progress(view.name)
-    poses = [torch.stack([view.camera.viewmat for view in group]) for group in (views, fitted)]
-    angles, shifts = pose_differences(*poses)
+    before, after = (torch.stack([view.camera.viewmat for view in group]) for group in (views, fitted))
+    angles, shifts = pose_differences(before, after)
     facts: dict[str, float] = {
         "steps": steps,
         "mean_rotation_degrees": angles.mean().item(),
@@ -63,62 +65,61 @@ def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
     """Return a view's camera on the CPU, at the pose of the smallest L1 error that the descent has met."""
     given = view.camera.to(model.device)
     photo = view.image.to(model.device).float() / 255
-    counts = torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo)
+    whole = (given, photo, torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo))
+    half = _halved(*whole) if min(given.width, given.height) > 1 else whole
     twist = torch.zeros(6, device=model.device, requires_grad=True)
     units = torch.tensor([1.0] * 3 + [unit] * 3, device=model.device)
     optimizer = torch.optim.Adam([twist], lr=RATE)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / steps))
     pivot = _middle_depth(model, given, unit)
-    small = _halved(given, photo, counts)
-    best, least = given.viewmat, float("inf")
+    best, least = given, float("inf")
     for step in range(steps + 1):
-        coarse = small is not None and 0 < step < steps // 2  # the given pose is judged at full size
-        camera, target, mask = small if coarse and small is not None else (given, photo, counts)
-        viewmat = corrected(given.viewmat, units * twist, pivot)
-        moved = dataclasses.replace(camera, viewmat=viewmat, checked=(camera.fx, camera.fy, camera.cx, camera.cy))
-        error = ((model.render(moved).image.clamp(0, 1) - target).abs().mean(-1) * mask).sum() / mask.sum().clamp(min=1)
-        if not coarse and error.item() < least:
-            best, least = viewmat.detach(), error.item()
+        aim = half if 0 < step < steps // 2 else whole  # the given pose is judged at full size
+        camera, target, counts = aim
+        moved = _at(camera, corrected(given.viewmat, units * twist, pivot))
+        errors = (model.render(moved).image.clamp(0, 1) - target).abs().mean(-1)
+        error = (errors * counts).sum() / counts.sum().clamp(min=1)
+        if aim is whole and error.item() < least:
+            best = _at(given, moved.viewmat.detach())
+            least = error.item()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
         schedule.step()
-    return dataclasses.replace(given, viewmat=best, checked=(given.fx, given.fy, given.cx, given.cy)).to("cpu")
+    return best.to("cpu")
+
+
+def _at(camera: Camera, viewmat: torch.Tensor) -> Camera:
+    """Return a camera at another pose; its numbers need no check, which would wait for the device."""
+    return dataclasses.replace(camera, viewmat=viewmat, checked=(camera.fx, camera.fy, camera.cx, camera.cy))
 
 
 @torch.no_grad()
 def _middle_depth(model: Model, camera: Camera, unit: float) -> torch.Tensor:
     """Return the median z-depth of a rendering, (), world units; where nothing is hit, `unit`."""
     depths = model.render(camera).median_depth
-    seen = depths[depths > 0]
-    return seen.median() if len(seen) else depths.new_tensor(unit)
+    hit = depths[depths > 0]
+    return hit.median() if len(hit) else depths.new_tensor(unit)
 
 
-def _halved(
-    camera: Camera, photo: torch.Tensor, counts: torch.Tensor
-) -> tuple[Camera, torch.Tensor, torch.Tensor] | None:
-    """Return camera, photo and mask at half the size; None where that is less than a pixel."""
-    if min(camera.width, camera.height) < 2:
-        return None
+def _halved(camera: Camera, photo: torch.Tensor, counts: torch.Tensor) -> Aim:
+    """Return camera, photo and mask at half the size."""
     layers = torch.cat([photo, counts[..., None]], -1).permute(2, 0, 1)
     layers = torch.nn.functional.avg_pool2d(layers, 2).permute(1, 2, 0)
     K = camera.K.clone()
     K[:2] /= 2
-    return (
-        Camera(camera.viewmat, K, camera.width // 2, camera.height // 2, camera.near),
-        layers[..., :3].contiguous(),
-        (layers[..., 3] == 1).to(photo),
-    )
+    small = Camera(camera.viewmat, K, camera.width // 2, camera.height // 2, camera.near)
+    return small, layers[..., :3].contiguous(), (layers[..., 3] == 1).to(photo)
 
 
 @contextmanager
 def _frozen(model: Model) -> Iterator[None]:
     """Let no parameter of a model take gradients."""
-    taken = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
+    learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
     try:
-        for parameter, _ in taken:
+        for parameter in learned:
             parameter.requires_grad_(False)
         yield
     finally:
-        for parameter, before in taken:
-            parameter.requires_grad_(before)
+        for parameter in learned:
+            parameter.requires_grad_(True)

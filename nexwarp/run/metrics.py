@@ -2,16 +2,18 @@
 
 import importlib.util
 import warnings
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
-import torch.nn.functional as F
 
 from nexwarp.errors import SettingError
 from nexwarp.io.files import one_line
 from nexwarp.io.pictures import to_uint8
+from nexwarp.ops.ssim import ssim_map
 
 PIXELS_PER_DEGREE = 67.02064514160156  # FLIP's default: a display 0.7 m and 3840 pixels wide, from 0.7 m
+PACKAGES = {"flip": ("flip_evaluator", "flip-evaluator"), "lpips": ("lpips", "lpips")}  # module and package
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
@@ -39,28 +41,17 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 
     `mask` is that of `psnr`. Excluded pixels take the target's values, as windows of included pixels may cover them.
     """
-    if mask is not None:
-        image, target = _unit_images(image, target)
-        image = torch.where(_check_mask(mask, image)[..., None], image, target)
+    image, target = _unit_images(image, target, mask)
     return _included(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
 
 
-def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return the (H, W, 3) float32 map whose mean is `ssim`."""
-    x, y = (picture.permute(2, 0, 1) for picture in _unit_images(image, target))
-    mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
-    c1, c2 = 0.01**2, 0.03**2
-    luminance = (2.0 * mx * my + c1) / (mx * mx + my * my + c1)
-    structure = (2.0 * (xy - mx * my) + c2) / ((xx - mx * mx) + (yy - my * my) + c2)
-    return (luminance * structure).permute(1, 2, 0)
-
-
-def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
+def lpips_vgg(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
     """LPIPS (VGG, v0.1) of two (H, W, 3) images; None, with one warning, if it is not available.
 
-    It needs the `lpips` package (`pip install nexwarp[lpips]`), which downloads the VGG weights on first use.
+    It needs the `lpips` package (`pip install nexwarp[lpips]`), which downloads the VGG weights on first use. `mask` is
+    that of `psnr`; excluded pixels take the target's values.
     """
-    x, y = _unit_images(image, target)
+    x, y = _unit_images(image, target, mask)
     network = _lpips_network(x.device)
     if network is None:
         return None
@@ -68,12 +59,12 @@ def lpips_vgg(image: torch.Tensor, target: torch.Tensor) -> float | None:
         return network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False).item()
 
 
-def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
+def flip(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
     """Mean LDR-FLIP error in [0, 1] of two (H, W, 3) sRGB images at 67 pixels per degree; None if not available.
 
-    It needs the `flip-evaluator` package (`pip install nexwarp[flip]`).
+    It needs the `flip-evaluator` package (`pip install nexwarp[flip]`). `mask` is that of `lpips_vgg`.
     """
-    test, reference = _unit_images(image, target)
+    test, reference = _unit_images(image, target, mask)
     try:
         from flip_evaluator import evaluate
     except ImportError as missing:
@@ -84,15 +75,20 @@ def flip(image: torch.Tensor, target: torch.Tensor) -> float | None:
     return float(error)
 
 
-def check_available(metric: str, device: torch.device) -> None:
-    """Raise SettingError if a metric needs a package that is not installed, or weights that cannot be downloaded."""
-    packages = {"flip": ("flip_evaluator", "flip-evaluator"), "lpips": ("lpips", "lpips")}
-    module, package = packages.get(metric, ("", ""))
-    if module and importlib.util.find_spec(module) is None:
-        raise SettingError(
-            f"--metrics: {metric} needs the package {package}, which is not installed: pip install 'nexwarp[{metric}]'"
-        )
-    if metric == "lpips":
+METRICS = {"psnr": psnr, "ssim": ssim, "flip": flip, "lpips": lpips_vgg}
+
+
+def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
+    """Raise SettingError unless metrics are known, and their packages and weights are there."""
+    for name in metrics:
+        if name not in METRICS:
+            raise SettingError(f"metrics: expected some of {', '.join(METRICS)}, got {name!r}")
+        module, package = PACKAGES.get(name, ("", ""))
+        if module and importlib.util.find_spec(module) is None:
+            raise SettingError(
+                f"--metrics: {name} needs the package {package}, which is not installed: pip install 'nexwarp[{name}]'"
+            )
+    if "lpips" in metrics:
         try:
             _load_lpips(device)
         except (ImportError, OSError, RuntimeError) as error:
@@ -116,8 +112,10 @@ def _lpips_network(device: torch.device) -> torch.nn.Module | None:
         return None
 
 
-def _unit_images(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Check two images and return them as float32 multiples of 1/255."""
+def _unit_images(
+    image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Check two images and return them as float32 multiples of 1/255; excluded pixels take the target's values."""
     for name, tensor in (("image", image), ("target", target)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
@@ -127,7 +125,8 @@ def _unit_images(image: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tenso
         raise ValueError(f"target: expected shape {tuple(image.shape)}, got {tuple(target.shape)}")
     if target.device != image.device:
         raise ValueError(f"target: expected a tensor on {image.device}, got one on {target.device}")
-    return to_uint8(image).float() / 255.0, to_uint8(target).float() / 255.0
+    image, target = (to_uint8(picture).float() / 255.0 for picture in (image, target))
+    return image if mask is None else torch.where(_check_mask(mask, image)[..., None], image, target), target
 
 
 def _check_mask(mask: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
@@ -142,13 +141,3 @@ def _check_mask(mask: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
 def _included(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
     """Return the values (P, C) of the P included pixels of (H, W, C) values; all of them without a mask."""
     return values if mask is None else values[_check_mask(mask, values)]
-
-
-def _blur(planes: torch.Tensor) -> torch.Tensor:
-    """Blur (C, H, W) planes with an 11 x 11 Gaussian of sigma 1.5, zeros outside."""
-    offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
-    window = torch.exp(-(offset**2) / (2.0 * 1.5**2))
-    count = len(planes)
-    row = (window / window.sum()).to(planes).expand(count, 1, 1, 11)
-    planes = F.conv2d(planes[None], row, padding=(0, 5), groups=count)
-    return F.conv2d(planes, row.transpose(2, 3), padding=(5, 0), groups=count)[0]
