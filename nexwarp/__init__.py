@@ -14,7 +14,7 @@ if "RANK" in os.environ:
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cameras.ray_camera import RayCamera
-from nexwarp.cli.version import __version__ as __version__
+from nexwarp.cli import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures

@@ -1,1 +1,3 @@
-"""The command line."""
+"""What a person types and sees."""
+
+__version__ = "0.2.0"

@@ -15,13 +15,14 @@ from nexwarp.train.ranks.ranks import Ranks
 
 def pick_device(name: str | None) -> torch.device:
     """Return the device of this name; None selects CUDA if available, else the CPU. SettingError if there is none."""
-    if name is None:
-        return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
-    if name not in ("cuda", "cpu"):
+    if name not in (None, "cuda", "cpu"):
         raise SettingError(f"--device: expected cuda or cpu, got {name!r}")
-    if name == "cuda" and not torch.cuda.is_available():
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
         raise SettingError("--device: expected a CUDA device, but torch finds no CUDA device; use --device cpu")
-    return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
+    if name == "cpu" or not available:
+        return torch.device("cpu")
+    return torch.device("cuda", torch.cuda.current_device())
 
 
 @contextmanager
@@ -48,9 +49,10 @@ def joined_ranks(name: str | None, gpus: int | None) -> Iterator[Ranks]:
     if gpus not in (None, place.size):
         raise SettingError(f"--gpus: expected {place.size}, as many as torchrun has started, got {gpus}")
     facts = {"code of nexwarp": code_digest(), "version of torch": torch.__version__, "version of Warp": wp.__version__}
-    device, fault = pick_device(name), None
-    if device.type == "cuda" and place.local_rank >= (found := torch.cuda.device_count()):
-        fault = f"rank {place.rank}: expected a GPU of its own, but {found} are there for {place.local_size} ranks"
+    device = pick_device(name)
+    fault = None
+    if device.type == "cuda" and place.local_rank >= (count := torch.cuda.device_count()):
+        fault = f"rank {place.rank}: expected a GPU of its own, but {count} are there for {place.local_size} ranks"
     elif device.type == "cuda":
         torch.cuda.set_device(place.local_rank)
         wp.set_device(f"cuda:{place.local_rank}")

@@ -11,6 +11,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -24,7 +25,10 @@ from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
-SKIPPED_STEPS, TIMED_STEPS, TIMED_SECONDS = 3, 5, 2.0  # at the start of a training on a CPU
+# At the start of a training on a CPU.
+SKIPPED_STEPS = 3
+TIMED_STEPS = 5
+TIMED_SECONDS = 2.0
 LONG_SECONDS = 600.0  # from which a training on a CPU is announced
 
 
@@ -33,7 +37,8 @@ def describe_exposures(model: Model) -> str:
     exposures = model.exposures
     if exposures is None:
         return "one for all photos"
-    gains, edge = exposures.log_gains.exp(), exposures.falloff[:2].sum().exp()
+    gains = exposures.log_gains.exp()
+    edge = exposures.falloff[:2].sum().exp()
     text = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean"
     return f"{text}; light at the edge: {edge:.0%}"
 
@@ -65,13 +70,15 @@ class CpuEstimate:
 
     def __init__(self, total: int, clock: Callable[[], float] = time.perf_counter) -> None:
         """Prepare the estimate of a training of `total` iterations; `clock` returns seconds."""
-        self.total, self.clock = total, clock
+        self.total = total
+        self.clock = clock
         self.begin: tuple[int, float] | None = None
-        self.seen, self.told = 0, False
+        self.seen = 0
+        self.known = False
 
     def __call__(self, iteration: int) -> str | None:
         """Take note of a finished iteration; return the text once it is known and the training is long."""
-        if self.told:
+        if self.known:
             return None
         now = self.clock()
         self.seen += 1
@@ -79,8 +86,9 @@ class CpuEstimate:
             self.begin = (iteration, now)
         if self.begin is None or self.seen < SKIPPED_STEPS + TIMED_STEPS or now - self.begin[1] < TIMED_SECONDS:
             return None
-        self.told = True
-        steps, seconds = iteration - self.begin[0], now - self.begin[1]
+        self.known = True
+        steps = iteration - self.begin[0]
+        seconds = now - self.begin[1]
         left = (self.total - iteration) * seconds / steps
         if left < LONG_SECONDS:
             return None
@@ -111,7 +119,10 @@ class TrainingDisplay:
             device: device of the training, whose memory is shown.
             name: what the display calls the training.
         """
-        self.console, self.total, self.done, self.device = console, total, done, device
+        self.console = console
+        self.total = total
+        self.done = done
+        self.device = device
         self.start = self.shown = time.perf_counter()
         self.estimate = CpuEstimate(total) if device.type == "cpu" else None
         self.progress = Progress(
@@ -162,13 +173,26 @@ def memory(device: torch.device) -> str:
     return "" if used is None else f"{used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
 
 
+def _bars(console: Console, *last: ProgressColumn) -> Progress:
+    """Return bars that vanish at their end, shown in a terminal only."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *last)
+    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+
+
 @contextmanager
 def counting(console: Console, title: str, total: int) -> Iterator[Callable[..., None]]:
     """Show a progress bar; yield a function to call after each item."""
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+    with _bars(console, TimeRemainingColumn()) as progress:
         task = progress.add_task(title, total=total)
         yield lambda _name=None: progress.advance(task)
+
+
+@contextmanager
+def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar; yield a function to call with the number of photos read and their total."""
+    with _bars(console, TimeRemainingColumn()) as progress:
+        task = progress.add_task("reading photos", total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 @contextmanager
@@ -178,9 +202,8 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     Yields:
         A function to call with a stage's name, the number of items done and their total.
     """
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+    with _bars(console, TimeElapsedColumn()) as progress:
 
         def observe(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
@@ -190,15 +213,6 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[stage], completed=done)
 
         yield observe
-
-
-@contextmanager
-def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar; yield a function to call with the number of photos read and their total."""
-    columns = (TextColumn("reading photos"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task("reading photos", total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 def results_table(rows: dict[str, str], title: str) -> Table:

@@ -11,16 +11,17 @@ from rich.console import Console
 
 from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
-from nexwarp.cli.options import Device_, Run_, option
+from nexwarp.cli.options import Device_, Flag_, Run_, option
 from nexwarp.data import Scene
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
 from nexwarp.run.contents import METRICS_FILE, RENDERS_FOLDER
-from nexwarp.run.evaluate import check_metrics, evaluate
+from nexwarp.run.evaluate import evaluate
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.run.folder import SceneSource, read_metrics
-from nexwarp.run.lock import locked_run
+from nexwarp.run.folder import locked_run, read_metrics
+from nexwarp.run.metrics import check_metrics
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import MASK_MODES
@@ -36,7 +37,7 @@ class Eval:
     """Folder of the scene, if it has moved; required for a model alone."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
     """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
-    refine_poses: bool = False
+    refine_poses: Flag_ = False
     """Fit each test pose to its photo before it is judged, the model fixed; metrics.json says so."""
     device: Device_ = None
     """Device to render on."""

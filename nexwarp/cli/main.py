@@ -14,13 +14,12 @@ from typing import NoReturn
 import tyro
 from rich.console import Console
 
-from nexwarp.cli import display
+from nexwarp.cli import __version__, display
 from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
 from nexwarp.cli.process import Process
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
-from nexwarp.cli.version import __version__
 from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError
 from nexwarp.machine import needed_memory
@@ -28,6 +27,7 @@ from nexwarp.train.ranks.launch import launch
 from nexwarp.train.ranks.liveness import end_process, may_speak
 
 PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
+CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have
 COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
     "eval": Eval,
@@ -39,9 +39,6 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "sfm": Sfm,
     "warmup": Warmup,
 }
-
-
-CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have
 
 
 class OutputConsole(Console):
@@ -96,13 +93,14 @@ def _unboxed(text: str, command: str) -> str:
         fault,
     )
     if value is not None:
-        option, *kinds, given = value.groups()
+        option, *kinds, text = value.groups()
         kind = "an integer" if "int" in [(k or "").lower() for k in kinds] else "a number"
-        return f"{option}: expected {kind}, got {given!r}"
+        return f"{option}: expected {kind}, got {text!r}"
     meant = next((part for part in parts if part.startswith("Perhaps you meant:")), None)
     if meant is None:
         return fault
-    option, owners = meant.split("\n")[1], re.findall(r"^in (nexwarp \w+) --help$", meant, re.M)
+    option = meant.split("\n")[1]
+    owners = re.findall(r"^in (nexwarp \w+) --help$", meant, re.M)
     return f"{fault}; perhaps you meant {option if command in owners or not owners else f'{owners[0]} {option}'}"
 
 
@@ -120,18 +118,18 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Hide Warp's warnings, which users cannot act on.
     wp.config.log_level = wp.LOG_ERROR
-    given = sys.argv[1:] if arguments is None else arguments
     try:
-        return _run(given)
+        return _run(sys.argv[1:] if arguments is None else arguments)
     except BrokenPipeError:
         # Otherwise Python would try to write the rest when it ends, and report that it cannot.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE
 
 
-def _run(given: list[str]) -> int:
+def _run(words: list[str]) -> int:
     """Run a command and return its exit code; BrokenPipeError if nobody reads its output any more."""
-    debug, arguments = "--debug" in given, [argument for argument in given if argument != "--debug"]
+    debug = "--debug" in words
+    arguments = [word for word in words if word != "--debug"]
     if arguments == ["--version"]:
         print(f"nexwarp {__version__}", flush=True)
         return 0
@@ -143,7 +141,7 @@ def _run(given: list[str]) -> int:
     console = OutputConsole()
     try:
         if isinstance(command, Train) and (count := command.starts()):
-            return launch(count, [*PROGRAM, *given])
+            return launch(count, [*PROGRAM, *words])
         with stopped_by_signals(), display.plain_warnings(console):
             command(console)
         sys.stdout.flush()

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.options import option
+from nexwarp.cli.options import Flag_, option
 from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS
 from nexwarp.data.sfm.pipeline import REPORT_FILE
@@ -17,15 +17,12 @@ from nexwarp.data.sfm.process import FRAMES, video_identity
 from nexwarp.errors import RunError
 from nexwarp.io.json_files import READ_ERRORS, read_object
 
-SCENES = Path("scenes")
-
 
 @dataclass
 class Process:
     """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras as `sfm` does.
 
-    Blurred frames and frames that repeat the one before are left out of a video, and named among photos. Frames in
-    which things move are named.
+    Blurred and repeated frames of a video are left out; among photos, they are named.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
@@ -35,7 +32,7 @@ class Process:
     frames: Annotated[int, option("N")] = FRAMES
     """Number of equal parts of a video, of which each gives its sharpest frame."""
     settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
-    overwrite: bool = False
+    overwrite: Flag_ = False
     """Replace SCENE if nexwarp process or sfm created it."""
 
     def __call__(self, console: Console) -> None:
@@ -60,15 +57,16 @@ def is_video(path: str) -> bool:
     return Path(path).suffix.lower() in FILMS and not Path(path).is_dir()
 
 
-def scene_of_video(video: Path, console: Console) -> Path:
-    """Return the scene of a video, scenes/NAME, which is made of it unless that was done before.
+def scene_folder_of(video: Path) -> Path:
+    """Return the folder of the scene that `nexwarp train` makes of a video."""
+    return Path("scenes") / video.stem
 
-    Raises:
-        RunError: the folder holds something else.
-    """
+
+def scene_of_video(video: Path, console: Console) -> None:
+    """Make the scene of a video, unless that was done before; RunError if its folder holds something else."""
     if not video.is_file():
         raise FileNotFoundError(f"{video}: no such file, expected a video")
-    scene = SCENES / video.stem
+    scene = scene_folder_of(video)
     if (scene / REPORT_FILE).is_file():
         try:
             made_of = read_object(scene / REPORT_FILE).get("video")
@@ -76,11 +74,10 @@ def scene_of_video(video: Path, console: Console) -> Path:
             made_of = None
         if made_of == video_identity(video):
             console.print(f"{video}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
-            return scene
+            return
     if scene.exists():
         raise RunError(
             f"{scene}: expected no folder of that name, or a scene made of {video}; "
             f"make a scene with nexwarp process {video} SCENE, and train that"
         )
     make_scene(Process(video, scene), console)
-    return scene

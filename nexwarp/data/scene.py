@@ -46,34 +46,26 @@ ProgressCallback = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene lies and how to read it: the options of `load_scene` and `nexwarp train`, kept by a run folder."""
+    """Where a scene lies, and how to read it: the options of `load_scene`."""
 
     path: Annotated[str, Positional, arg(metavar="SCENE")]
-    """Folder of a COLMAP, nerfstudio or Blender scene, or `demo` for the built-in one (docs/scenes.md)."""
+    """Folder of a COLMAP, nerfstudio or Blender scene, `demo`, or a video (docs/scenes.md)."""
     images: Annotated[str, arg(metavar="FOLDER")] = "images"
-    """Folder of the photos, relative to SCENE, such as images_4."""
+    """Folder of the photos, in SCENE."""
     downscale: Annotated[int, arg(metavar="N")] = 1
-    """Factor by which photos are downscaled, with an area filter."""
-    masks: Annotated[str, arg(metavar="{FOLDER,alpha,none}")] = MASKS
-    """Folder of the masks, relative to SCENE, used if it exists; `alpha` takes the photos' alpha channel as masks."""
-    background: Annotated[
-        str | None,
-        arg(
-            metavar="{white,black,R,G,B,random}",
-            help_behavior_hint="(default: white for Blender scenes, else alpha is ignored)",
-        ),
-    ] = None
-    """Colour behind transparent photos and behind renderings; R,G,B are in [0, 1], `random` changes in each step."""
-    points: Annotated[str | None, arg(metavar="FILE.ply", help_behavior_hint="(default: the scene's own)")] = None
-    """PLY file of the initial points."""
-    format: Annotated[
-        str | None, arg(metavar="{colmap,nerfstudio,blender}", help_behavior_hint="(default: detected)")
-    ] = None
-    """Format of the scene, for a folder that holds several."""
-    follow_links: bool = False
-    """Allow photos that symbolic links lead to outside of SCENE, as with DVC, git-annex and caches of hubs."""
-    skip_missing: bool = False
-    """Go on without photos that do not exist; they are named."""
+    """Factor by which photos are reduced."""
+    masks: Annotated[str, arg(metavar="FOLDER")] = MASKS
+    """Folder of masks, `alpha` or `none`."""
+    background: Annotated[str | None, arg(metavar="COLOUR", help_behavior_hint="(default: scene's)")] = None
+    """white, black, R,G,B or random."""
+    points: Annotated[str | None, arg(metavar="FILE.ply", help_behavior_hint="(default: the scene's)")] = None
+    """Initial points."""
+    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: detected)")] = None
+    """colmap, nerfstudio or blender."""
+    follow_links: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Follow symbolic links out of SCENE."""
+    skip_missing: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Go on without photos that do not exist."""
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "SceneSource":

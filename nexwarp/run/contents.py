@@ -20,41 +20,37 @@ DIVERGED_FILE = "diverged.json"
 LOCK_FILE = "run.lock"
 WANDB_FILE = "wandb.json"  # the id of the run at Weights & Biases
 CAMERA_PATH = "camera_path_{}.json"
+ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
 
+TEACHERS_FOLDER = "teachers"
 TENSORBOARD_FOLDER = "tensorboard"
 EVENTS = "events.out.tfevents."  # the beginning of the names that TensorBoard gives its files
-TEACHERS_FOLDER = "teachers"
 EXPORT_FOLDER = "export"
-SURFELS_FILE, SPLATS_FILE, MESH_FILE = "surfels.ply", "splats.ply", "mesh.ply"
-COMPACT_FILE = "compact.safetensors"
-TRANSFORMS_FILE, CAMERA_PATH_FILE = "transforms.json", "camera_path.json"
-WEB_FILE, GLB_FILE, SPZ_FILE = "scene.html", "scene.glb", "splats.spz"
+# The files of each --format of `nexwarp export`.
+EXPORTS = {
+    "ply": ("surfels.ply", "splats.ply"),
+    "mesh": ("mesh.ply",),
+    "compact": ("compact.safetensors",),
+    "cameras": ("transforms.json", "camera_path.json"),
+    "web": ("scene.html",),
+    "glb": ("scene.glb",),
+    "spz": ("splats.spz",),
+}
 
 RENDERS_FOLDER = "renders"
-TRAIN, TEST, COMPARE = "train", "test", "compare"
+TRAIN = "train"
+TEST = "test"
+COMPARE = "compare"
 FILE_PATH = "path_{}"  # folder of the frames of a path from a file
 PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures of other cameras than pinholes
 
-OLD_TEMPORARY = "checkpoint.tmp"  # of versions up to 0.2.0
-
-ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
-EXPORTS = (
-    SURFELS_FILE,
-    SPLATS_FILE,
-    MESH_FILE,
-    COMPACT_FILE,
-    TRANSFORMS_FILE,
-    CAMERA_PATH_FILE,
-    WEB_FILE,
-    GLB_FILE,
-    SPZ_FILE,
-)
+FOLDERS = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER, RENDERS_FOLDER)
 PATTERN = re.compile(
     "|".join(
         [
             *map(re.escape, ROOT_FILES),
             re.escape(CAMERA_PATH).replace(r"\{\}", r"[1-9]\d*"),
-            *(re.escape(f"{EXPORT_FOLDER}/{name}") for name in EXPORTS),
+            *(re.escape(f"{EXPORT_FOLDER}/{name}") for names in EXPORTS.values() for name in names),
             rf"{RENDERS_FOLDER}/(?:(?:{'|'.join(PROJECTIONS)})/)?"
             rf"(?:{'|'.join(PATHS)}|{FILE_PATH.format('[^/]+')})/\d{{4,}}\.(?:png|exr)",
         ]
@@ -65,11 +61,6 @@ PATTERN = re.compile(
 def picture_name(view: str) -> str:
     """Return the file name of a view's rendering; a photo in a subfolder gives a name with the subfolder."""
     return f"{Path(view).with_suffix('')}.png"
-
-
-def frame_name(index: int) -> str:
-    """Return the file name of a path's frame."""
-    return f"{index:04d}.png"
 
 
 def teacher_folder(run: Path, number: int) -> Path:
@@ -83,8 +74,8 @@ def teacher_folders(run: Path) -> list[Path]:
         count = int(read_json(run / CONFIG_FILE)["own_teachers"]["count"])
     except (*READ_ERRORS, KeyError, TypeError):  # it has none, or the config is damaged
         return []
-    found = [teacher_folder(run, number) for number in range(1, min(count, MOST_TEACHERS) + 1)]
-    return [folder for folder in found if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
+    folders = [teacher_folder(run, number) for number in range(1, min(count, MOST_TEACHERS) + 1)]
+    return [folder for folder in folders if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
 
 
 def list_files(run: Path) -> tuple[list[str], list[str]]:
@@ -92,20 +83,19 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
 
     Names are relative to the folder. A foreign folder counts as one entry, with a slash at its end.
     """
-    views = _view_pictures(run)
     own: list[str] = []
     foreign: list[str] = []
     teachers = teacher_folders(run)
     for folder in teachers:
         prefix = f"{folder.relative_to(run).as_posix()}/"
-        for names, found in zip((own, foreign), list_files(folder), strict=True):
-            names += [prefix + name for name in found]
+        for names, below in zip((own, foreign), list_files(folder), strict=True):
+            names += [prefix + name for name in below]
+    views = _view_pictures(run)
     for name, entry in _entries(run):
-        if entry.is_dir(follow_symlinks=False):
-            if not _may_hold_ours(name) and run / name not in teachers:
-                foreign.append(f"{name}/")
-        else:
+        if not entry.is_dir(follow_symlinks=False):
             (own if _is_ours(name, views) else foreign).append(name)
+        elif not _may_hold_ours(name) and run / name not in teachers:
+            foreign.append(f"{name}/")
     return own, foreign
 
 
@@ -120,8 +110,7 @@ def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
     # The files of a run folder itself go last: until then they tell which pictures are ours.
     runs = [run, *teacher_folders(run)]
     own.sort(key=lambda name: (run / name).parent in runs)
-    parts = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, RENDERS_FOLDER, TEACHERS_FOLDER)
-    folders = {each / name for each in runs for name in parts}
+    folders = {each / name for each in runs for name in FOLDERS}
     for name in own:
         if name not in keep:
             (run / name).unlink()
@@ -136,20 +125,20 @@ def remove_leftovers(run: Path) -> None:
     Nobody else writes the files that need the lock. Pictures, exports and camera paths need none: a temporary file of
     these stays while its process may be at work.
     """
-    removed = set()
+    folders = {folder for folder in run.iterdir() if _is_aside(folder.name)}
     for name in list_files(run)[0]:
         path = Path(name)
         in_checkpoint = len(path.parts) > 1 and _is_aside(path.parts[0])
         if in_checkpoint or (is_temporary(path.name) and (_needs_lock(name) or is_abandoned(run / name))):
             (run / name).unlink(missing_ok=True)
-            removed |= {run / parent for parent in path.parents[:-1]}
-    remove_empty(sorted(removed | {f for f in run.iterdir() if _is_aside(f.name)}, reverse=True))
+            folders |= {run / parent for parent in path.parents[:-1]}
+    remove_empty(sorted(folders, reverse=True))
 
 
 def _entries(folder: Path, prefix: str = "") -> Iterator[tuple[str, os.DirEntry[str]]]:
     """Yield the entries of a folder and of those subfolders that may hold files of ours, with their names."""
-    with os.scandir(folder) as found:
-        entries = sorted(found, key=lambda entry: entry.name)
+    with os.scandir(folder) as scan:
+        entries = sorted(scan, key=lambda entry: entry.name)
     for entry in entries:
         name = prefix + entry.name
         yield name, entry
@@ -159,14 +148,12 @@ def _entries(folder: Path, prefix: str = "") -> Iterator[tuple[str, os.DirEntry[
 
 def _is_aside(folder: str) -> bool:
     """Whether a folder is a checkpoint that is being written."""
-    return folder == OLD_TEMPORARY or (folder.startswith(".checkpoint.") and is_temporary(folder))
+    return folder.startswith(".checkpoint.") and is_temporary(folder)
 
 
 def _may_hold_ours(folder: str) -> bool:
     top, _, rest = folder.partition("/")
-    if top == RENDERS_FOLDER:
-        return True
-    return not rest and (top in (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER) or _is_aside(top))
+    return top == RENDERS_FOLDER or (not rest and (top in FOLDERS or _is_aside(top)))
 
 
 def _is_ours(name: str, views: set[str]) -> bool:
@@ -181,23 +168,23 @@ def _is_ours(name: str, views: set[str]) -> bool:
 def _needs_lock(name: str) -> bool:
     """Whether a temporary file is one of a file that only the holder of the lock writes."""
     folder, _, base = name.rpartition("/")
-    stems = (Path(file).stem for file in ROOT_FILES)
-    return folder in CHECKPOINTS or (not folder and any(base.startswith(f".{stem}.") for stem in stems))
+    return folder in CHECKPOINTS or (not folder and base.startswith(tuple(f".{Path(f).stem}." for f in ROOT_FILES)))
 
 
 def _view_pictures(run: Path) -> set[str]:
     """Return the names that renderings of the run's views have, as far as the run tells its views."""
     views: set[str] = set()
-    for file, take in ((CAMERAS_FILE, lambda data: data.values()), (METRICS_FILE, lambda data: [data["views"]])):
+    for file, keys in ((CAMERAS_FILE, (TRAIN, TEST)), (METRICS_FILE, ("views", ""))):
         try:
-            for group in take(read_json(run / file)):
-                views |= {str(name) for name in group}
+            content = read_json(run / file)
+            views |= {str(name) for key in keys for name in content.get(key, ())}
         except READ_ERRORS:  # there is none yet, or it is damaged
             continue
-    pictures = {Path(picture_name(view)) for view in views if Path(view).name}
+    pictures = [Path(picture_name(view)) for view in views if Path(view).name]
+    groups = (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
     return {
         f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
-        for group in (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
+        for group in groups
         for picture in pictures
         for suffix in (".png", ".exr")
     }

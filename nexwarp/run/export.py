@@ -1,13 +1,17 @@
 """Export of run folders to the formats of other programs."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake.fit import bake
 from nexwarp.export.bake.glb import check_package, save_glb
@@ -15,32 +19,52 @@ from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats_spz import save_splats_spz
 from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.model.model_file import save_model
-from nexwarp.run import contents
-from nexwarp.run.folder import SceneSource
+from nexwarp.run.contents import EXPORT_FOLDER, EXPORTS, TRAIN
 from nexwarp.run.opened import OpenedModel
 
-FORMATS = ("ply", "mesh", "compact", "cameras", "web", "glb", "spz")
+
+@dataclass(frozen=True)
+class ExportOrder:
+    """What `nexwarp export` writes."""
+
+    format: Annotated[str, arg(metavar="{ply,mesh,compact,cameras,web,glb,spz}")] = "ply"
+    """Files to write."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/export)")] = None
+    """Output folder; with --format web also NAME.html, for one file with everything."""
+    quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"
+    """Of --format web: quantised files are a fifth to a half as large."""
+    max_extent: Annotated[float, arg(metavar="X")] = MAX_EXTENT
+    """Of splats: split surfels larger than this share of their distance to the nearest camera; inf splits none."""
+    voxel: Annotated[
+        float | None, arg(metavar="LENGTH", help_behavior_hint="(default: 1.5 pixels of the photos at median depth)")
+    ] = None
+    """Resolution of the mesh in world units."""
+    far: Annotated[float | None, arg(metavar="DEPTH", help_behavior_hint="(default: 3 scene scales)")] = None
+    """Largest distance of the mesh from each camera in world units."""
+
+    def check(self) -> None:
+        """Raise SettingError unless the options fit together."""
+        if not self.max_extent > 0:
+            raise SettingError(f"--max-extent: expected more than 0, got {self.max_extent:g}")
+        if self.format not in EXPORTS:
+            raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
+        if self.format != "mesh" and (self.voxel is not None or self.far is not None):
+            raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
 
 
 def export_run(
     opened: OpenedModel,
-    kind: str,
-    folder: Path | None = None,
-    max_extent: float = MAX_EXTENT,
-    quality: str = "quantised",
+    order: ExportOrder,
     device: torch.device | str = "cpu",
+    observe: Progress = lambda *_: None,
 ) -> Sequence[Path]:
     """Export a run or a model to a folder; docs/outputs.md describes the files.
 
     Args:
         opened: the run or model.
-        kind: "ply" (surfels.ply, splats.ply), "mesh" (mesh.ply), "compact" (compact.safetensors), "cameras"
-            (transforms.json, camera_path.json), "web" (a web page), "glb" (scene.glb) or "spz" (splats.spz).
-        folder: output folder, created if it does not exist; None is the run's `export`. Of a web page, a name that ends
-            in .html is one file with everything; None is `export/scene.html`.
-        max_extent: largest Gaussian in splats.ply and splats.spz, see `nexwarp.export.surfels_ply.save_splats_ply`.
-        quality: "quantised" or "full", of a web page.
-        device: renders what the texture is baked from, of "web" and "glb".
+        order: what to write, and where.
+        device: where to render the mesh's depths, or what the texture of "web" and "glb" is baked from.
+        observe: progress of "mesh", see `nexwarp.export.mesh.extract_mesh`.
 
     Returns:
         The files that were written.
@@ -48,86 +72,61 @@ def export_run(
     Raises:
         ValueError, OSError: the message names the option or file.
     """
-    if not max_extent > 0:
-        raise SettingError(f"--max-extent: expected more than 0, got {max_extent:g}")
-    if kind not in FORMATS:
-        raise SettingError(f"--format: expected one of {', '.join(FORMATS)}, got {kind!r}")
-    out = folder or opened.folder / contents.EXPORT_FOLDER
-    if kind == "mesh":
-        return export_mesh(opened, out, device)
-    if kind == "cameras":
-        return _export_cameras(opened, out)
-    if kind == "compact":
-        return [save_model(out / contents.COMPACT_FILE, opened.model, compact=True)]
-    cameras = _all_cameras(opened)
-    if kind == "web":
+    order.check()
+    folder = order.out or opened.folder / EXPORT_FOLDER
+    files = [folder / name for name in EXPORTS[order.format]]
+    views = _all_cameras(opened) if order.format not in ("compact", "mesh", "cameras") else {}
+    if order.format == "web":
         from nexwarp.export.web.export import export_web
 
-        title = opened.title if opened.source is None else Path(opened.source.path).name or "nexwarp"
-        page = folder or out / contents.WEB_FILE
-        return export_web(opened.model.to(device), cameras, page, quality=quality, title=title)
-    views = list(cameras.values())
-    if kind == "glb":
+        model, page = opened.model.to(device), order.out or files[0]
+        return export_web(model, views, page, quality=order.quality, title=opened.title or "nexwarp")
+    if order.format == "cameras":
+        _export_cameras(opened, *files)
+    elif order.format == "mesh":
+        trained = opened.cameras.get(TRAIN, {})
+        if not trained:
+            raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
+        model = opened.model.to(device)
+        save_mesh(files[0], extract_mesh(model, [*trained.values()], voxel=order.voxel, far=order.far, observe=observe))
+    elif order.format == "compact":
+        save_model(files[0], opened.model, compact=True)
+    elif order.format == "glb":
         if not views:
             raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
         check_package()
-        save_glb(out / contents.GLB_FILE, bake(opened.model.to(device), views), views)
-        return [out / contents.GLB_FILE]
-    surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
-    if kind == "spz":
-        save_splats_spz(out / contents.SPZ_FILE, surfels, degree, cameras=views, max_extent=max_extent)
-        return [out / contents.SPZ_FILE]
-    save_surfels_ply(out / contents.SURFELS_FILE, surfels)
-    save_splats_ply(out / contents.SPLATS_FILE, surfels, degree, cameras=views, max_extent=max_extent)
-    return [out / contents.SURFELS_FILE, out / contents.SPLATS_FILE]
+        cameras = list(views.values())
+        save_glb(files[0], bake(opened.model.to(device), cameras), cameras)
+    else:
+        _export_splats(opened, files, list(views.values()), order.max_extent)
+    return files
 
 
-def export_mesh(
-    opened: OpenedModel,
-    folder: Path,
-    device: torch.device | str = "cpu",
-    *,
-    voxel: float | None = None,
-    far: float | None = None,
-    observe: Progress = lambda *_: None,
-) -> Sequence[Path]:
-    """Write the mesh of a run, mesh.ply.
-
-    Args:
-        opened: the run, or a model with training cameras beside it.
-        folder: output folder, created if it does not exist.
-        device: where to render.
-        voxel: resolution of the mesh, see `nexwarp.export.mesh.extract_mesh`.
-        far: farthest depth of the mesh, likewise.
-        observe: progress, likewise.
-
-    Raises:
-        ValueError, OSError: the message names the option or file.
-    """
-    trained = opened.cameras.get(contents.TRAIN, {})
-    if not trained:
-        raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
-    mesh = extract_mesh(opened.model.to(device), [*trained.values()], voxel=voxel, far=far, observe=observe)
-    save_mesh(folder / contents.MESH_FILE, mesh)
-    return [folder / contents.MESH_FILE]
+def _export_splats(opened: OpenedModel, files: list[Path], cameras: list[Camera], max_extent: float) -> None:
+    """Write splats.spz, or surfels.ply and splats.ply."""
+    surfels = opened.model.surfels
+    degree = min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    if files[0].suffix == ".spz":
+        save_splats_spz(files[0], surfels, degree, cameras=cameras, max_extent=max_extent)
+    else:
+        save_surfels_ply(files[0], surfels)
+        save_splats_ply(files[1], surfels, degree, cameras=cameras, max_extent=max_extent)
 
 
-def _export_cameras(opened: OpenedModel, folder: Path) -> Sequence[Path]:
+def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) -> None:
     """Write the cameras of a run for nerfstudio."""
     images = SceneSource.images if opened.source is None else opened.source.images
     # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
     named = {
-        group: {f"{images}/{name}": camera for name, camera in sorted(members.items())}
+        group: {f"{images}/{name}": camera for name, camera in members.items()}
         for group, members in opened.cameras.items()
     }
-    cameras = dict(sorted({name: camera for members in named.values() for name, camera in members.items()}.items()))
+    cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
         raise RunError(f"{opened.folder / CAMERAS_FILE}: expected at least one camera, found none")
-    files = [folder / contents.TRANSFORMS_FILE, folder / contents.CAMERA_PATH_FILE]
-    save_transforms(files[0], cameras, train=list(named.get("train", {})), test=list(named.get("test", {})))
+    save_transforms(transforms, cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
     first = next(iter(cameras.values()))
-    save_camera_path(files[1], [resized(camera, first.width, first.height) for camera in cameras.values()])
-    return files
+    save_camera_path(camera_path, [resized(camera, first.width, first.height) for camera in cameras.values()])
 
 
 def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:

@@ -1,17 +1,20 @@
 """Training logs: lines of JSON at regular iterations and, on request, TensorBoard and Weights & Biases."""
 
+import importlib.util
 import json
 import math
 import os
 import time
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TextIO, TypedDict
+from typing import Protocol, TextIO, TypedDict
 
 import torch
 
-from nexwarp.io.files import written_aside
-from nexwarp.run.contents import LOG_FILE
-from nexwarp.run.log_sinks import Sink, TensorboardSink, WandbSink
+from nexwarp.errors import SettingError
+from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
+from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER, WANDB_FILE
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
@@ -19,6 +22,8 @@ from nexwarp.train.trainer import Trainer
 # Iterations between two lines, fewer in short runs, which get about MIN_LINES lines.
 EVERY = 100
 MIN_LINES = 100
+PACKAGES = ("tensorboard", "wandb")  # options, extras and packages have the same names
+WANDB_PROJECT = "nexwarp"  # unless the variable WANDB_PROJECT names one
 
 # Names in `nexwarp.train.recipe.LearningRates` of the optimizer's parameters.
 RATES = {
@@ -32,19 +37,6 @@ RATES = {
     "shN": "shN",
     "grid": "grid",
 }
-
-
-def peak_memory(device: torch.device) -> int | None:
-    """Return the peak memory in bytes: torch's on a GPU, else this process's; None if the system does not report it."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    try:
-        import resource
-        import sys
-    except ImportError:  # not on Windows
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 class LogLine(TypedDict):
@@ -79,39 +71,31 @@ class TrainingLog:
     """
 
     def __init__(
-        self,
-        run: Path,
-        trainer: Trainer,
-        *,
-        tensorboard: bool = False,
-        wandb: bool = False,
-        settings: Config | None = None,
+        self, run: Path, trainer: Trainer, sinks: Collection[str] = (), settings: Config | None = None
     ) -> None:
         """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
 
         Args:
             run: an existing folder.
             trainer: the trainer to observe.
-            tensorboard: also write the values as scalars to `run/tensorboard`.
-            wandb: also log the values, by the same names, to Weights & Biases.
+            sinks: where else to log, names of `PACKAGES`.
             settings: of the run, for Weights & Biases; None takes the trainer's.
         """
+        self.path = run / LOG_FILE
+        self.trainer = trainer
+        self.sink_names = sinks
         self.settings = trainer.config if settings is None else settings
-        self.run, self.trainer, self.tensorboard, self.wandb = run, trainer, tensorboard, wandb
-        total = trainer.config.iterations
-        self.every = max(min(EVERY, total // MIN_LINES), 1)
-        self.last = trainer.iteration
+        self.every = max(min(EVERY, trainer.config.iterations // MIN_LINES), 1)
         self.file: TextIO | None = None
         self.sinks: list[Sink] = []
 
     def __enter__(self) -> "TrainingLog":
-        keep_lines(self.run / LOG_FILE, self.trainer.iteration)
-        if self.tensorboard:
-            self.sinks.append(TensorboardSink(self.run, self.trainer.iteration))
-        if self.wandb:
-            self.sinks.append(WandbSink(self.run, self.settings.as_dict()))
-        self.file = _open_log(self.run / LOG_FILE)
-        self.written = time.perf_counter()
+        run = self.path.parent
+        if "tensorboard" in self.sink_names:
+            self.sinks.append(TensorboardSink(run, self.trainer.iteration))
+        if "wandb" in self.sink_names:
+            self.sinks.append(WandbSink(run, self.settings.as_dict()))
+        self._open()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -127,9 +111,13 @@ class TrainingLog:
         """Drop the lines after the trainer's iteration; for a trainer that was restored to an earlier one."""
         assert self.file is not None
         self.file.close()
-        keep_lines(self.run / LOG_FILE, self.trainer.iteration)
-        self.file = _open_log(self.run / LOG_FILE)
-        self.last, self.written = self.trainer.iteration, time.perf_counter()
+        self._open()
+
+    def _open(self) -> None:
+        keep_lines(self.path, self.trainer.iteration)
+        self.file = _open_log(self.path)
+        self.last = self.trainer.iteration
+        self.written = time.perf_counter()
 
     def __call__(self, step: StepReport) -> None:
         """Write a line if one is due after this step."""
@@ -140,15 +128,18 @@ class TrainingLog:
         line = self._line(step)
         self.file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
         self.file.flush()
+        scalars = _scalars(line) if self.sinks else {}
         for sink in self.sinks:
-            sink.write(_scalars(line), step.iteration)
+            sink.write(scalars, step.iteration)
 
     def _line(self, step: StepReport) -> LogLine:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
-        psnr, now = step.psnr(), time.perf_counter()
+        psnr = step.psnr()
+        now = time.perf_counter()
         rate = (step.iteration - self.last) / max(now - self.written, 1e-9)
-        self.last, self.written = step.iteration, now
+        self.last = step.iteration
+        self.written = now
         return {
             "iteration": step.iteration,
             "loss": sum(terms),
@@ -160,6 +151,19 @@ class TrainingLog:
             "memory_bytes": peak_memory(self.trainer.device),
             "rates": learning_rates(self.trainer),
         }
+
+
+def peak_memory(device: torch.device) -> int | None:
+    """Return the peak memory in bytes: torch's on a GPU, else this process's; None if the system does not report it."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+        import sys
+    except ImportError:  # not on Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
@@ -210,12 +214,80 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _scalars(line: LogLine) -> list[tuple[str, float]]:
-    """Return a line as names and values for the sinks."""
-    tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
-    tags |= {f"loss/{name}": value for name, value in line["losses"].items()}
-    tags["speed/iterations_per_second"] = line["iterations_per_second"]
+def _scalars(line: LogLine) -> dict[str, float]:
+    """Return a line as the values that the sinks take, by name."""
+    scalars = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
+    scalars |= {f"loss/{name}": value for name, value in line["losses"].items()}
+    scalars["speed/iterations_per_second"] = line["iterations_per_second"]
     if line["memory_bytes"] is not None:
-        tags["memory/GiB"] = line["memory_bytes"] / 2**30
-    tags |= {f"rate/{name}": value for name, value in line["rates"].items()}
-    return list(tags.items())
+        scalars["memory/GiB"] = line["memory_bytes"] / 2**30
+    return scalars | {f"rate/{name}": value for name, value in line["rates"].items()}
+
+
+def check_package(name: str) -> None:
+    """Raise SettingError unless the package of an option is installed."""
+    if importlib.util.find_spec(name) is None:
+        raise SettingError(f"--{name}: expected the package {name}, found none; pip install 'nexwarp[{name}]'")
+
+
+class Sink(Protocol):
+    """Takes the scalars of a log line."""
+
+    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
+        """Take values by name."""
+
+    def close(self) -> None:
+        """Write what is left."""
+
+
+class TensorboardSink:
+    """Writes events to a run's folder `tensorboard`."""
+
+    def __init__(self, run: Path, iteration: int) -> None:
+        """Continue after an iteration; events of later iterations, which are trained again, are hidden."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        purge = iteration + 1 if iteration else None
+        self.writer: SummaryWriter = SummaryWriter(str(run / TENSORBOARD_FOLDER), purge_step=purge)
+        self.close = self.writer.close
+
+    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
+        """Write values by name."""
+        for name, value in scalars.items():
+            self.writer.add_scalar(name, value, iteration)
+        self.writer.flush()
+
+
+class WandbSink:
+    """Logs to Weights & Biases; a run that is resumed goes on there, by the id in its `wandb.json`.
+
+    The variables of wandb count, such as WANDB_MODE=offline, WANDB_PROJECT and WANDB_DIR.
+    """
+
+    def __init__(self, run: Path, config: dict[str, Json]) -> None:
+        """Start or continue; SettingError if wandb cannot, for example without a login."""
+        import wandb
+
+        project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
+        name = run.resolve().name
+        try:
+            self.run: wandb.Run = wandb.init(project=project, name=name, config=config, id=_id(run), resume="allow")
+            # Iterations that are trained again, after a resumption or a divergence, are logged again.
+            self.run.define_metric("*", step_metric="iteration")
+        except (wandb.errors.Error, OSError, ValueError) as error:
+            raise SettingError(f"--wandb: wandb cannot start: {one_line(error)}") from None
+        write_json(run / WANDB_FILE, {"id": self.run.id})
+        self.close = self.run.finish
+
+    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
+        """Log values by name."""
+        self.run.log({"iteration": iteration, **scalars})
+
+
+def _id(run: Path) -> str | None:
+    """Return the id under which wandb knows a run; None if it does not know it."""
+    try:
+        value = read_object(run / WANDB_FILE).get("id")
+    except (FileNotFoundError, *READ_ERRORS):
+        return None
+    return value if isinstance(value, str) else None

@@ -9,12 +9,13 @@ import torch
 from nexwarp.cameras.around import surrounding
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.contents import CONFIG_FILE
-from nexwarp.run.folder import SceneSource, read_run
+from nexwarp.run.folder import read_run
 from nexwarp.train.finish.order import ordered
 from nexwarp.train.recipe import Config
 
@@ -102,8 +103,8 @@ def open_model(path: Path) -> OpenedModel:
         if path.name != MODEL_FILE and ((folder / CONFIG_FILE).is_file() or (folder / MODEL_FILE).is_file()):
             folder = path.with_name(f"{path.name}.results")  # another model's folder is left alone
     if (folder / CONFIG_FILE).is_file() and file == folder / MODEL_FILE:
-        source, config, _ = read_run(folder)
-        return OpenedModel(path, folder, file, source, config)
+        record = read_run(folder)
+        return OpenedModel(path, folder, file, record.source, record.config)
     if not file.is_file():
         raise MissingError(
             f"{path}: expected a run folder or a model, found no {CONFIG_FILE} and no {MODEL_FILE} there"

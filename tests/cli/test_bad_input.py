@@ -119,7 +119,7 @@ def test_nothing_to_resume(scene, refuses, tmp_path):
     refuses(scene, ["--resume"], str(tmp_path / "runs" / "new"), "expected a run to resume")
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"scene": {}}', '{"scene": {"path": "x"}, "config": {"a": 1}}', "\x00"])
+@pytest.mark.parametrize("content", ["", "[]", '{"scene": {}}', '{"scene": {"path": 3}, "config": {}}', "\x00"])
 @pytest.mark.parametrize("command", ["eval", "info"])
 def test_damaged_config(command, content, finished, capsys):
     (finished / "config.json").write_text(content)

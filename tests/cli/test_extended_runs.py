@@ -25,7 +25,7 @@ def extended(trained: Path, scene: Path, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_a_finished_run_goes_on(extended: Path, scene: Path) -> None:
-    assert read_run(extended)[1].iterations == 30
+    assert read_run(extended).config.iterations == 30
     assert read(extended, "metrics.json")["iterations"] == 30
     logged = [json.loads(line)["iteration"] for line in (extended / "metrics.jsonl").read_text().splitlines()]
     assert logged == list(range(1, 31))
@@ -53,7 +53,7 @@ def test_it_is_said_and_an_interruption_changes_nothing(
 
 
 def test_its_schedules_are_those_of_the_longer_run(trained: Path, scene: Path) -> None:
-    config = read_run(trained)[1]
+    config = read_run(trained).config
     longer = type(config)(**{**vars(config), "iterations": 30})
     trainer = Trainer(load_scene(scene), longer, "cpu")
     with pytest.raises(ValueError, match="its settings are others"):

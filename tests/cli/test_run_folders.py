@@ -11,8 +11,7 @@ from nexwarp.cli import main as cli
 from nexwarp.cli import train
 from nexwarp.errors import RunError
 from nexwarp.run.contents import delete_files, list_files
-from nexwarp.run.folder import keep_camera_path
-from nexwarp.run.lock import locked_run
+from nexwarp.run.folder import keep_camera_path, locked_run
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
 pytestmark = pytest.mark.usefixtures("small_preset")

@@ -214,12 +214,7 @@ def test_other_cameras_render_beside_the_photos(finished, capsys):
     assert cli.main(["render", str(finished), *options, "--camera", "fisheye", "--scale", "0.5"]) == 0
     with Image.open(finished / "renders" / "fisheye" / "ellipse" / "0001.png") as picture:
         assert picture.size == (18, 18)
-    assert cli.main(["render", str(finished), *options, "--aperture", "0.1", "--shutter", "0.5", "--samples", "2"]) == 0
     assert list_files(finished)[1] == []
     capsys.readouterr()
-    for wrong, message in (
-        (["--camera", "panorama", "--buffers"], "--buffers: expected without --camera"),
-        (["--set", "test", "--shutter", "0.5"], "--shutter: expected together with a path"),
-    ):
-        assert cli.main(["render", str(finished), *wrong]) == 2
-        assert message in capsys.readouterr().err
+    assert cli.main(["render", str(finished), "--camera", "panorama", "--buffers"]) == 2
+    assert "--buffers: expected together with --camera pinhole" in capsys.readouterr().err

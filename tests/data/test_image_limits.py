@@ -12,13 +12,14 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import main as cli
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import NexwarpError, OutOfMemoryError
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.types import types
 from nexwarp.model.buffers import render_buffers
 from nexwarp.model.model_file import save_model
 from nexwarp.ops import _interop, memory, tiles
-from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.trainer_support import small
@@ -210,7 +211,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder that can be rendered, as far as the command looks."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     surfels, texture, camera = parts()
-    create_run(folder, SceneSource("scene"), small(), "cpu")
+    create_run(folder, RunRecord(SceneSource("scene"), small()))
     save_model(folder, nw.Model(surfels, texture))
     save_cameras(folder / "cameras.json", {"train": {"a.png": camera}, "test": {"b.png": camera}})
     return folder

@@ -22,10 +22,12 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
+import torch
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import PRESETS, USER_SETTINGS, Config, preset
 from nexwarp.train.settings import setting, setting_names, with_settings
 
@@ -94,23 +96,23 @@ def field_docs(owner: type) -> dict[str, str]:
 def options(command: Any) -> Iterator[tuple[str, str, str]]:
     """What a command takes: how it is written, its default, what it means."""
     docs, hints = field_docs(command), get_type_hints(command, include_extras=True)
-    for f in dataclasses.fields(command):
-        extras = getattr(hints[f.name], "__metadata__", ())
-        parts = [p for p in (f.type, getattr(hints[f.name], "__origin__", None)) if dataclasses.is_dataclass(p)]
-        if parts:
-            assert isinstance(parts[0], type)
-            yield from options(parts[0])
+    for field in dataclasses.fields(command):
+        kind = getattr(hints[field.name], "__origin__", None)
+        if dataclasses.is_dataclass(kind):
+            assert isinstance(kind, type)
+            yield from options(kind)
             continue
-        (shown,) = [e for e in extras if hasattr(e, "metavar")] or [None]
-        name = f"--{((shown and shown.name) or f.name).replace('_', '-')}"
-        choices = getattr(hints[f.name], "__args__", ()) if shown is None else ()
-        metavar = shown.metavar if shown else "{" + ",".join(choices) + "}" if choices else ""
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            yield metavar, "required", docs[f.name]
+        extras = getattr(hints[field.name], "__metadata__", ())
+        shown = next((extra for extra in extras if hasattr(extra, "metavar")), None)
+        name = f"--{((shown and shown.name) or field.name).replace('_', '-')}"
+        choices = getattr(hints[field.name], "__args__", ()) if shown is None else ()
+        metavar = (shown and shown.metavar) or ("{" + ",".join(choices) + "}" if choices else "")
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            yield metavar, "required", docs[field.name]
             continue
         hint = shown.help_behavior_hint if shown else None
-        default = hint.removeprefix("(default: ").strip("()") if hint else "off" if f.default is False else f.default
-        yield f"{name} {metavar}".strip(), str(default), docs[f.name]
+        default = hint.removeprefix("(default: ").strip("()") if hint else field.default
+        yield f"{name} {metavar}".strip(), "off" if default is False else str(default), docs[field.name]
 
 
 def described_settings() -> Iterator[tuple[str, str]]:
@@ -207,7 +209,7 @@ def test_the_options_page_says_what_help_says(name, capsys, monkeypatch):
     found = set(re.findall(r"^[ │]+(--[a-z][a-z-]*)", out, re.M))
     assert found == {option.split()[0] for option, _, _ in rows if option.startswith("--")}
     for option, default, text in rows:
-        ending = {"required": " (required)", "off": " (default: False)", "repeatable": " (repeatable)"}
+        ending = {"required": " (required)", "off": "", "repeatable": " (repeatable)"}
         assert f"{option} {text}{ending.get(default, f' (default: {default})')}" in shown, option
     assert "{None}" not in out
 
@@ -242,8 +244,8 @@ def test_commands_can_be_typed(page, monkeypatch):
         assert cli.main(arguments) == 0, arguments
         command = understood.pop()
         if isinstance(command, Train):
-            config = dataclasses.replace(command, resume=False)._config(Path("nowhere"))
-            assert config.preset == command.preset
+            record = command._record(Path("nowhere"), False, Ranks.alone(torch.device("cpu")))
+            assert record.config.preset == command.preset
 
 
 def test_the_paper_page_has_commands_for_all_scenes():

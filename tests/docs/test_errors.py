@@ -14,6 +14,7 @@ from nexwarp import errors
 from nexwarp.cli import main as cli
 from nexwarp.cli.commands import Info
 from nexwarp.cli.device import pick_device
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import (
     CheckpointError,
     DivergedError,
@@ -28,8 +29,8 @@ from nexwarp.errors import (
     StorageError,
 )
 from nexwarp.io.files import write_atomically
-from nexwarp.run.folder import SceneSource, prepare_run, read_run
-from nexwarp.run.render_job import RenderOrder
+from nexwarp.run.folder import prepare_run, read_run
+from nexwarp.run.render import RenderOrder
 from nexwarp.train.checkpoint import load_checkpoint
 from tests.subprocesses import python_path
 
@@ -52,7 +53,6 @@ def test_the_family_is_whole():
     assert family == {NexwarpError, *KIN}
     for kind, kin in KIN.items():
         assert issubclass(kind, NexwarpError) and issubclass(kind, kin)
-        assert kind.__name__ in errors.__doc__
         with pytest.raises(kin, match=r"^what, where$"):
             raise kind("what, where")
 
@@ -75,7 +75,7 @@ def test_boundaries_raise_the_family(tmp_path, monkeypatch):
         (FormatError, lambda: read_run(tmp_path / "run")),
         (MissingError, lambda: load_checkpoint(tmp_path / "run")),
         (SettingError, lambda: pick_device("tpu")),
-        (SettingError, lambda: RenderOrder(path="circle")),
+        (SettingError, lambda: RenderOrder(path="circle").check()),
         (RunError, lambda: prepare_run(tmp_path / "run", source, resume=False, overwrite=False)),
         (SettingError, lambda: prepare_run(tmp_path / "run", source, resume=True, overwrite=True)),
     ):

@@ -14,13 +14,14 @@ from nexwarp import ops
 from nexwarp.cameras.camera import resized
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.cli import main as cli
+from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers, render_buffers
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.model.render import draw
-from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_finite
@@ -79,7 +80,7 @@ def picture(file: Path) -> torch.Tensor:
 def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
     """To the bit, with exposures, vignetting and detail limits, and the buffers too; by default as the model says."""
     run, cameras = tmp_path / "run", cameras_of()
-    create_run(run, SceneSource(str(tmp_path / "scene")), Config(), "cpu")
+    create_run(run, RunRecord(SceneSource(str(tmp_path / "scene")), Config()))
     full = full_model()
     full.options = full.options.changed(exposure=saved)
     full.save(run)

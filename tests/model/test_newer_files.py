@@ -16,9 +16,10 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import Scene
+from nexwarp.data.scene import SceneSource
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
-from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
+from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.recipe import Config
 from nexwarp.train.trainer import Trainer
@@ -62,16 +63,16 @@ def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) ->
 
 
 def test_a_run_with_unknown_keys_reads_the_same(tmp_path: Path) -> None:
-    create_run(tmp_path, SceneSource("demo", downscale=2), Config(seed=3), "cpu")
-    source, config, _ = read_run(tmp_path)
+    create_run(tmp_path, RunRecord(SceneSource("demo", downscale=2), Config(seed=3)))
+    record = read_run(tmp_path)
 
     def extend(data: Any) -> None:
         for part in (data, data["scene"], data["config"], *(data["config"][x] for x in ("losses", "texture"))):
             part |= ANYTHING
 
     change_json(tmp_path / "config.json", extend)
-    assert read_run(tmp_path)[:2] == (source, config)
-    assert config.seed == 3 and source.downscale == 2
+    assert read_run(tmp_path) == record
+    assert record.config.seed == 3 and record.source.downscale == 2
     write_json(tmp_path / "metrics.json", {"psnr": 20.0, **ANYTHING})
     assert read_metrics(tmp_path)["psnr"] == 20.0
 
@@ -114,7 +115,7 @@ def model_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], o
 
 
 def config_version(tmp_path: Path, version: object) -> tuple[Path, Callable[[], object]]:
-    create_run(tmp_path, SceneSource("demo"), Config(), "cpu")
+    create_run(tmp_path, RunRecord(SceneSource("demo"), Config()))
     change_json(tmp_path / "config.json", lambda data: data.update(format_version=version))
     return tmp_path / "config.json", lambda: read_run(tmp_path)
 

@@ -76,7 +76,7 @@ def test_old_models_render_the_picture_stored_with_them(run: Path) -> None:
 
 @EVERY_RUN
 def test_old_runs_serve_every_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert read_run(run)[1].max_surfels == 24
+    assert read_run(run).config.max_surfels == 24
     before = read_metrics(run)
     assert before == json.loads((run / "metrics.json").read_text())
     assert cli.main(["export", str(run), "--format", "cameras"]) == 0

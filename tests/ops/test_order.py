@@ -13,8 +13,7 @@ from nexwarp.export.web.scene_data import SceneData
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
-from nexwarp.run.optics import Optics
-from nexwarp.run.render_job import PictureJob, RenderJob, RenderOrder
+from nexwarp.run.render import PictureJob, RenderJob, RenderOrder
 from nexwarp.train.settings import with_settings
 from tests import scenes
 from tests.panorama_support import turned
@@ -121,12 +120,12 @@ def test_the_command_renders_by_the_order_asked_for(tmp_path):
     camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
     for order in ORDERS:
         file = tmp_path / f"{order}.png"
-        RenderJob([PictureJob(file, camera, False, False)], None, 30.0, order=order).render(model)
+        RenderJob([PictureJob(file, camera)], RenderOrder(set="test", order=order)).render(model)
         expected = to_uint8(model.render(camera, order=order).image.detach())
         assert (np.asarray(Image.open(file)) == expected.numpy()).all()
     with pytest.raises(SettingError, match="--order: expected depth or distance, got 'near'"):
-        RenderOrder(None, views="test", order="near")
+        RenderOrder(set="test", order="near").check()
     with pytest.raises(SettingError, match="--order: expected together with --camera pinhole, got --camera panorama"):
-        RenderOrder(None, views="test", order="distance", optics=Optics(kind="panorama"))
+        RenderOrder(set="test", order="distance", camera="panorama").check()
     with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
         with_settings(nw.Config(), {"order": "near"})

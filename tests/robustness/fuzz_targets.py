@@ -21,6 +21,7 @@ from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply, write_ply
+from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.export.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.io.json_files import read_object, write_json
@@ -28,7 +29,7 @@ from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.run.folder import SceneSource, create_run, read_metrics, read_run
+from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.run.log import keep_lines
 from nexwarp.train.recipe import Config
 from nexwarp.train.settings import parse_settings, with_settings
@@ -298,7 +299,7 @@ def _read_camera_path(folder: Path) -> None:
 
 
 def _config(folder: Path) -> list[Files]:
-    create_run(folder, SceneSource("demo"), Config(), "cpu")
+    create_run(folder, RunRecord(SceneSource("demo"), Config()))
     return [_files(folder)]
 
 

@@ -17,13 +17,14 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras, save_cameras
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, NexwarpError
 from nexwarp.io import files
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run import folder
 from nexwarp.run.contents import CONFIG_FILE, LOG_FILE, METRICS_FILE, remove_leftovers
-from nexwarp.run.folder import SceneSource, claimed_run, create_run, read_metrics, read_run
+from nexwarp.run.folder import RunRecord, claimed_run, create_run, read_metrics, read_run
 from nexwarp.run.log import _open_log, keep_lines
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
@@ -90,12 +91,12 @@ def live(root: Path, number: int, mark: Callable[[str, int], None], chance: rand
     with claimed_run(run, DEMO, resume=known and not overwrite, overwrite=overwrite) as resumed:
         first = 0
         if resumed:
-            number = read_run(run)[1].seed
+            number = read_run(run).config.seed
             remove_leftovers(run)
             first = load_checkpoint(run)[1]["iteration"] if has_checkpoint(run) else 0
         else:
             mark("create", number)
-            create_run(run, DEMO, Config(seed=number), "cpu")
+            create_run(run, RunRecord(DEMO, Config(seed=number)))
             mark("created", number)
         keep_lines(run / LOG_FILE, first)
         with _open_log(run / LOG_FILE) as log:
@@ -118,7 +119,7 @@ def check(root: Path, promise: Promise) -> None:
     """Fail unless a folder keeps what was promised; reading it never fails otherwise than with an error of ours."""
     run = root / RUN
     try:
-        number: int | None = read_run(run)[1].seed
+        number: int | None = read_run(run).config.seed
     except MissingError:
         number = None
     assert number in promise.runs
@@ -176,7 +177,7 @@ def found_in(root: Path) -> Promise:
     """Return what a folder promises that nothing is being written to."""
     run, found = root / RUN, Promise()
     if (run / CONFIG_FILE).exists():
-        found.run = read_run(run)[1].seed
+        found.run = read_run(run).config.seed
         found.runs = {found.run}
     try:
         found.least = found.most = load_checkpoint(run)[1]["iteration"]

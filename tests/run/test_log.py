@@ -198,7 +198,7 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
     """The same values under the same steps, also after a run was resumed from an earlier iteration."""
     pytest.importorskip("tensorboard", reason="tensorboard is not installed (pip install 'nexwarp[tensorboard]')")
     trainer = Trainer(scene, CONFIG, "cpu")
-    with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
+    with TrainingLog(tmp_path, trainer, ("tensorboard",)) as log:
         for _ in range(8):
             log(trainer.step())
             if trainer.iteration == 5:
@@ -206,7 +206,7 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
     assert max(events(tmp_path)["loss/total"]) == 8
     trainer = Trainer(scene, CONFIG, "cpu")
     trainer.restore(tmp_path)
-    with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
+    with TrainingLog(tmp_path, trainer, ("tensorboard",)) as log:
         trainer.run(log)
     shown, written = events(tmp_path), lines(tmp_path)
     steps = {line["iteration"]: line for line in written}
@@ -272,7 +272,7 @@ def test_wandb_gets_the_names_and_values_of_tensorboard(scene, tmp_path, monkeyp
     stub = WandbStub()
     monkeypatch.setitem(sys.modules, "wandb", stub)
     for _ in range(2):  # the second time as a resumed run
-        with TrainingLog(tmp_path, trainer := Trainer(scene, CONFIG, "cpu"), tensorboard=True, wandb=True) as log:
+        with TrainingLog(tmp_path, trainer := Trainer(scene, CONFIG, "cpu"), ("tensorboard", "wandb")) as log:
             log(trainer.step())
     shown, (values, again) = events(tmp_path), stub.logged
     assert values.keys() == again.keys() == shown.keys() | {"iteration"}
@@ -282,4 +282,4 @@ def test_wandb_gets_the_names_and_values_of_tensorboard(scene, tmp_path, monkeyp
     assert stub.started[0]["config"] == CONFIG.as_dict() and stub.started[0]["name"] == tmp_path.name
     monkeypatch.setattr(stub, "init", lambda **_: (_ for _ in ()).throw(RuntimeError("no login")))
     with pytest.raises(ValueError, match="--wandb: wandb cannot start: no login"):
-        TrainingLog(tmp_path, trainer, wandb=True).__enter__()
+        TrainingLog(tmp_path, trainer, ("wandb",)).__enter__()

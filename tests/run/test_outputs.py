@@ -16,6 +16,7 @@ from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path
 from nexwarp.cameras.paths import ellipse, interpolate, spiral
 from nexwarp.cli import main as cli
+from nexwarp.data.scene import SceneSource
 from nexwarp.export.surfels_ply import load_surfels_ply
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers
@@ -23,9 +24,9 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.run.folder import SceneSource, create_run
+from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.run.opened import open_model
-from nexwarp.run.render_job import RenderOrder
+from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring, row
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -41,7 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     scene = random_scene(40)
     scene["means"] = scene["means"] - scene["means"].mean(0) + torch.tensor([1.0, -2.0, 0.3])
-    create_run(run, SceneSource(str(run.parent / "scene"), "images_2"), Config(), "cpu")
+    create_run(run, RunRecord(SceneSource(str(run.parent / "scene"), "images_2"), Config()))
     save_model(run, Model(make_surfels(scene), make_texture(), options=OPTIONS))
     cameras = [each.to(torch.float32) for each in ring(6)]
     sets = {"train": dict(zip(TRAIN, cameras[1:5], strict=True)), "test": dict(zip(TEST, cameras[::5], strict=True))}
@@ -112,7 +113,7 @@ def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.Ca
     for name in ("image", "plain", "textured", "colors", "background"):
         torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
     # The model of the caller is as it was.
-    order = RenderOrder(path=None, views="test", exposure="mean")
+    order = RenderOrder(set="test", exposure="mean")
     order.prepare(open_model(run)).render(model)
     assert model.exposures is not None
     assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))

@@ -2,13 +2,11 @@
 
 import errno
 import fcntl
-import importlib.util
 import os
 import re
 import signal
 import subprocess
 import sys
-import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,8 +14,7 @@ import pytest
 
 from nexwarp.cli import main as cli
 from nexwarp.errors import RunError, StorageError
-from nexwarp.run import lock
-from nexwarp.run.lock import locked_run
+from nexwarp.run.folder import locked_run
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 HOLD = """
 import os, sys, time
 from pathlib import Path
-from nexwarp.run.lock import locked_run
+from nexwarp.run.folder import locked_run
 with locked_run(Path(sys.argv[1])):
     child = os.fork()
     if child:
@@ -102,44 +99,34 @@ def test_the_lock_is_free_after_an_error(tmp_path):
     for _ in range(2):
         with pytest.raises(ZeroDivisionError), locked_run(tmp_path):
             raise ZeroDivisionError
-    assert not lock.held and list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_whose_file_was_deleted_meanwhile_is_taken_anew(tmp_path, monkeypatch):
-    """The holder deletes the file at its end: who has opened it before must not keep a lock that nobody sees."""
-    calls = []
+@pytest.fixture
+def flock_fails(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Let the system refuse locks with an error."""
 
-    def raced(number: int) -> None:
-        calls.append(number)
-        if len(calls) == 1:
-            (tmp_path / "run.lock").unlink()
-        original(number)
+    def fail_with(number: int) -> None:
+        def fail(*_: int) -> None:
+            raise OSError(number, os.strerror(number))
 
-    original = lock._lock
-    monkeypatch.setattr(lock, "_lock", raced)
-    with locked_run(tmp_path):
-        assert len(calls) == 2
-        refused_by(tmp_path)
+        monkeypatch.setattr(fcntl, "flock", fail)
+
+    return fail_with
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
-def test_a_file_system_without_locks_is_told_and_used(tmp_path, monkeypatch, number):
-    monkeypatch.setattr(lock, "_lock", failing(number))
+def test_a_file_system_without_locks_is_told_and_used(tmp_path, flock_fails, number):
+    flock_fails(number)
     told: list[str] = []
     with locked_run(tmp_path, told.append):
         pass
     assert len(told) == 1 and told[0].startswith(f"{tmp_path}: its file system has no locks ({os.strerror(number)}): ")
+    assert list(tmp_path.iterdir()) == []
 
 
-def failing(number: int) -> Callable[[int], None]:
-    def fail(_: int) -> None:
-        raise OSError(number, os.strerror(number))
-
-    return fail
-
-
-def test_other_errors_name_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "_lock", failing(errno.EIO))
+def test_other_errors_name_the_file(tmp_path, flock_fails):
+    flock_fails(errno.EIO)
     with pytest.raises(StorageError, match=re.escape(f"{tmp_path / 'run.lock'}: cannot be written (Input/output")):
         with locked_run(tmp_path):
             pass
@@ -160,36 +147,3 @@ def test_a_damaged_record_of_the_holder_is_another_process(tmp_path, record):
     with locked_run(tmp_path):
         (tmp_path / "run.lock").write_bytes(record)
         assert "but another process does" in refused_by(tmp_path)
-
-
-def test_windows_locks_a_byte_behind_the_record(tmp_path, monkeypatch):
-    """The branch of Windows, on locks of byte ranges: these, too, are free when their file is closed."""
-    locked: dict[tuple[int, int], int] = {}
-
-    def locking(number: int, mode: int, count: int) -> None:
-        place = os.fstat(number).st_ino, os.lseek(number, 0, os.SEEK_CUR)
-        if place in locked and locked[place] != number and is_open(locked[place]):
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
-        locked[place] = number
-
-    def is_open(number: int) -> bool:
-        try:
-            return fcntl.fcntl(number, fcntl.F_GETFD) >= 0
-        except OSError:
-            return False
-
-    msvcrt = types.ModuleType("msvcrt")
-    vars(msvcrt).update(locking=locking, LK_NBLCK=2)
-    monkeypatch.setitem(sys.modules, "msvcrt", msvcrt)
-    monkeypatch.setattr(sys, "platform", "win32")
-    spec = importlib.util.spec_from_file_location("lock_of_windows", lock.__file__)
-    assert spec is not None and spec.loader is not None
-    windows = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(windows)
-    with windows.locked_run(tmp_path):
-        assert {place for _, place in locked} == {windows.LOCKED_BYTE}
-        assert (tmp_path / "run.lock").stat().st_size < 1000
-        with pytest.raises(RunError, match=f"process {os.getpid()} on"), windows.locked_run(tmp_path):
-            pass
-    with windows.locked_run(tmp_path):
-        pass

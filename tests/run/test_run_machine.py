@@ -33,12 +33,13 @@ from rich.console import Console
 
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import NexwarpError, RunError
 from nexwarp.io.files import is_temporary
 from nexwarp.kernels import launch
 from nexwarp.model.model_file import load
 from nexwarp.run.contents import LOCK_FILE
-from nexwarp.run.export import export_run
+from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.folder import read_run
 from nexwarp.run.opened import open_model
 from nexwarp.train import recipe
@@ -71,7 +72,9 @@ flags = st.sampled_from(["resume", "overwrite", ""])
 def train(scene: Path, run: Path, seed: int | None, flag: str) -> None:
     """Train as the command line does; a resumed run has the seed of its own."""
     resume, overwrite = flag == "resume", flag == "overwrite"
-    command = Train(str(scene), run=run, device="cpu", checkpoint_every=1, resume=resume, overwrite=overwrite)
+    command = Train(
+        SceneSource(str(scene)), run=run, device="cpu", checkpoint_every=1, resume=resume, overwrite=overwrite
+    )
     if not resume:
         command = dataclasses.replace(command, iterations=4, max_surfels=24, seed=seed)
     command(Console(file=io.StringIO()))
@@ -227,7 +230,7 @@ class RunFolders(RuleBasedStateMachine):
     def _seed(self, name: str) -> int | None:
         """Return the seed that a folder's config has; None if it has none that can be read."""
         try:
-            return read_run(self.root / name)[1].seed
+            return read_run(self.root / name).config.seed
         except NexwarpError:
             return None
 
@@ -242,7 +245,7 @@ class RunFolders(RuleBasedStateMachine):
     def export(self, name: str, kind: str) -> None:
         slot = self.slots[name]
         try:
-            for file in export_run(open_model(self.root / name), kind, self.root / name / "export"):
+            for file in export_run(open_model(self.root / name), ExportOrder(kind)):
                 assert file.stat().st_size > 0
         except NexwarpError:
             assert not slot.finished or slot.damaged

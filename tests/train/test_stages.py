@@ -14,11 +14,12 @@ from rich.console import Console
 import nexwarp as nw
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
-from nexwarp.cli.staged_session import StagedSession
+from nexwarp.cli.session import Session
 from nexwarp.data import write_demo
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
-from nexwarp.run.folder import SceneSource, create_run, read_own_teachers, read_run
+from nexwarp.run.folder import RunRecord, create_run, read_run
 from nexwarp.train import exposure
 from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
@@ -27,7 +28,7 @@ from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import PRESETS, TextureConfig, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
-from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, teacher_count
+from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner, teacher_count
 from tests.exposed import expose_photos
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -217,12 +218,12 @@ def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, run)
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["iterations"] == 20 and metrics["teachers"] == 2 and "psnr" in metrics
-    assert read_run(run)[1].iterations == 20 and read_run(run)[2]["own_teachers"] == OWN
+    assert read_run(run).config.iterations == 20 and dataclasses.asdict(read_run(run).own) == OWN
     seeds, spent = {0}, 0.0
     for folder in (run / "teachers" / "1", run / "teachers" / "2"):
         facts = json.loads((folder / "metrics.json").read_text())
         assert facts["iterations"] == 4 and "psnr" not in facts and not has_checkpoint(folder)
-        config = read_run(folder)[1]
+        config = read_run(folder).config
         assert (config.iterations, config.max_surfels, config.teachers) == (4, 240, 0)
         seeds, spent = seeds | {config.seed}, spent + facts["seconds"]
         assert cli.main(["eval", str(folder), "--device", "cpu"]) == 0
@@ -300,7 +301,7 @@ def test_a_longer_run_keeps_its_teachers(
     assert command(run, "--resume", iterations=30) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
     assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
-    assert read_run(run)[1].iterations == 30 and read_run(run)[2]["own_teachers"] == OWN
+    assert read_run(run).config.iterations == 30 and dataclasses.asdict(read_run(run).own) == OWN
     model = model_of(run)
     (run / "model.safetensors").unlink()
     assert command(run, "--resume", iterations=30) == 0
@@ -323,7 +324,7 @@ def test_given_runs_take_the_place_of_own_teachers(
 ) -> None:
     run = tmp_path / "run"
     assert command(run, "--teacher", str(finished)) == 0
-    assert not (run / "teachers").exists() and "own_teachers" not in read_run(run)[2]
+    assert not (run / "teachers").exists() and not read_run(run).own.count
     expected = nw.train(tiny_scene, CONFIG, device=CPU, teachers=[nw.load(finished)])
     assert same(nw.load(run), nw.load(expected.save(tmp_path)))
 
@@ -340,10 +341,10 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
     assert command(run, "--overwrite", "--set", "teachers=0") == 2  # twice the same setting
     capsys.readouterr()
     asked = ["--run", str(run), "--iterations", "5", *SMALL, "--overwrite"]
-    assert cli.main(["train", read_run(run)[0].path, *asked]) == 0
+    assert cli.main(["train", read_run(run).source.path, *asked]) == 0
     left = {file.relative_to(run).as_posix() for file in (run / "teachers").rglob("*") if file.is_file()}
     assert left == {"teachers/1/notes.txt", "teachers/3/model.safetensors", "teachers/mine.txt"}
-    assert "own_teachers" not in read_run(run)[2]
+    assert not read_run(run).own.count
 
 
 @pytest.mark.parametrize("kind", ["foreign", "link", "file"])
@@ -355,7 +356,7 @@ def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
     shutil.copytree(finished, run)
     place = run / "teachers"
     if kind == "foreign":  # of a run that has no teachers of its own
-        create_run(run, SceneSource("demo"), CONFIG, "cpu")
+        create_run(run, RunRecord(SceneSource("demo"), CONFIG))
         shutil.copytree(finished / "teachers" / "1", place / "1", dirs_exist_ok=True)
         place = place / "1"
     else:
@@ -381,7 +382,7 @@ def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
     assert command(run, "--resume", iterations=30) == 2
     told = "".join(capsys.readouterr().err.split())
     assert f"{run}/teachers/2:expectedthecompleteteacherthatthestudentin{run}haslearnedfrom" in told
-    assert read_run(run)[1].iterations == 20 and not (run / "teachers" / "2").exists()
+    assert read_run(run).config.iterations == 20 and not (run / "teachers" / "2").exists()
     shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
     assert command(run, "--resume") == 2
     assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in "".join(
@@ -416,7 +417,7 @@ def test_a_longer_run_finishes_its_teachers_as_they_were(
 ) -> None:
     """Although --iterations has grown before they were complete."""
     run = tmp_path / "run"
-    create_run(run, read_run(finished)[0], read_run(finished)[1], "cpu", own=OwnTeachers(2, 4, 240))
+    create_run(run, RunRecord(read_run(finished).source, read_run(finished).config, own=OwnTeachers(2, 4, 240)))
     assert command(run, "--resume", iterations=30) == 0
     for number in "12":
         assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
@@ -428,8 +429,7 @@ def test_an_older_run_keeps_teachers_of_its_own_budget(
 ) -> None:
     """Its config.json does not say how large they are; it resumes with the teacher that is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
-    source, config = read_run(finished)[:2]
-    create_run(whole, source, config, "cpu", own=OwnTeachers(2, 4))
+    create_run(whole, dataclasses.replace(read_run(finished), own=OwnTeachers(2, 4)))
     data = json.loads((whole / "config.json").read_text())
     del data["own_teachers"]["max_surfels"]
     (whole / "config.json").write_text(json.dumps(data))
@@ -437,7 +437,7 @@ def test_an_older_run_keeps_teachers_of_its_own_budget(
     assert command(whole, "--resume") == 0
     shutil.copytree(whole / "teachers" / "1", run / "teachers" / "1")
     assert command(run, "--resume") == 0
-    assert {read_run(run / "teachers" / name)[1].max_surfels for name in "12"} == {60}
+    assert {read_run(run / "teachers" / name).config.max_surfels for name in "12"} == {60}
     assert model_of(run) == model_of(whole) != model_of(finished)
 
 
@@ -471,15 +471,14 @@ def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene,
     """Of the training alone; a resumed run finds them by these."""
     scene = dataclasses.replace(tiny_scene, test=[])
     source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
-    create_run(run, source, CONFIG, "cpu", own=own)
+    create_run(run, RunRecord(source, CONFIG, own=own))
     models = []
     for resume in (False, True):
-        console, ranks = Console(quiet=True), Ranks.alone(CPU)
-        session = StagedSession(scene, CONFIG, own, run, source, console, ranks, resume=resume)
-        assert session.session.stage.teacher != resume
-        session.begin()
-        session.train()
-        models.append(session.finish())
+        session = Session(run, RunRecord(source, CONFIG, own=own), Console(quiet=True), Ranks.alone(CPU), resume=resume)
+        runner = stage_runner(scene, CONFIG, CPU, session, own=own)
+        assert runner.stage.teacher != resume
+        runner.train()
+        models.append(runner.finish())
     assert same(*models) and not (run / "metrics.json").exists()
 
 
@@ -498,17 +497,16 @@ def test_weights_and_biases_gets_the_runs_settings(
 
     monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
     source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
-    create_run(run, source, CONFIG, "cpu", own=own)
-    session = StagedSession(
-        tiny_scene, CONFIG, own, run, source, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"]
-    )
-    session.train()
+    create_run(run, RunRecord(source, CONFIG, own=own))
+    record = RunRecord(source, CONFIG, own=own)
+    session = Session(run, record, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"])
+    stage_runner(tiny_scene, CONFIG, CPU, session, own=own).train()
     assert given == [CONFIG.as_dict()]
 
 
 def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    create_run(run, SceneSource("demo"), CONFIG, "cpu")
+    create_run(run, RunRecord(SceneSource("demo"), CONFIG))
     (run / "teachers" / "1").mkdir(parents=True)
     (run / "teachers" / "1" / "model.safetensors").write_text("mine")
     assert list_files(run) == (["config.json"], ["teachers/1/"])
@@ -528,7 +526,7 @@ def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> Non
             read_run(run)
     data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
     (run / "config.json").write_text(json.dumps(data))
-    assert read_own_teachers(run) == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
+    assert read_run(run).own == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
 
 
 def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -538,12 +536,14 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     class Shown:
         def between_steps(self, step: int, describe: Callable[[], str], stop: Callable[[], bool]) -> None:
             steps.append(step)
-            drawn.append(session.trainer.model().meta["iteration"])
+            drawn.append(runner.trainer.model().meta["iteration"])
 
     drawn: list[object] = []
-    console = Console(quiet=True)
     source, run = SceneSource(str(tiny_scene.path)), tmp_path / "run"
-    session = StagedSession(tiny_scene, CONFIG, OwnTeachers(2, 4, 240), run, source, console, Ranks.alone(CPU))
-    create_run(run, source, CONFIG, "cpu", own=OwnTeachers(2, 4, 240))
-    session.train(Shown())  # type: ignore[arg-type]
+    record = RunRecord(source, CONFIG, own=OwnTeachers(2, 4, 240))
+    session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
+    session.viewer = Shown()  # type: ignore[assignment]
+    runner = stage_runner(tiny_scene, CONFIG, CPU, session, own=record.own)
+    create_run(run, record)
+    runner.train()
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]

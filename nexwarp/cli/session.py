@@ -1,0 +1,331 @@
+"""How `nexwarp train` runs the stages of a training: display, log, checkpoints, and the files of finished models."""
+
+import dataclasses
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import torch
+from rich.console import Console
+
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
+from nexwarp.cli import display
+from nexwarp.cli.eval import evaluate_run, figures
+from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, StorageError
+from nexwarp.io.json_files import Json, write_json
+from nexwarp.machine import needed_memory
+from nexwarp.model.model import Model
+from nexwarp.model.model_file import MODEL_FILE, load, save_model
+from nexwarp.run.contents import (
+    COMPARE,
+    DIVERGED_FILE,
+    METRICS_FILE,
+    RENDERS_FOLDER,
+    TRAIN,
+    picture_name,
+    remove_leftovers,
+    teacher_folder,
+)
+from nexwarp.run.evaluate import evaluate
+from nexwarp.run.folder import RunRecord, check_room, create_run, is_run, read_metrics, read_run
+from nexwarp.run.log import TrainingLog
+from nexwarp.train.checkpoint import CHECKPOINTS, delete_checkpoints, has_checkpoint
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.report import StepReport
+from nexwarp.train.stages import Stage
+from nexwarp.train.trainer import Trainer
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
+
+CHECKPOINTS_A_RUN = 10
+# Large files on the disk at once: two checkpoints, a third while it is written, and the model.
+FILES_AT_A_TIME = 4
+
+
+class Session:
+    """The `StageStore` of a run folder: each stage is trained in a folder of its own.
+
+    A teacher's folder is a run, too: RUN/teachers/1 and so on. The teacher is complete once its metrics.json, which is
+    written last, says how long the training took.
+
+    Attributes:
+        viewer: shows the training between steps; None shows nothing.
+        seconds: that complete teachers took.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        record: RunRecord,
+        console: Console,
+        ranks: Ranks,
+        *,
+        resume: bool = False,
+        sinks: Collection[str] = (),
+        every: int | None = None,
+    ) -> None:
+        """Note what to do; nothing runs yet.
+
+        Args:
+            run: run folder.
+            record: settings of the run.
+            console: where to print.
+            ranks: the processes that train together.
+            resume: go on with the stage that was interrupted.
+            sinks: where the student logs beside the run's file: names of `nexwarp.run.log.PACKAGES`.
+            every: iterations between checkpoints; None is a tenth of each stage.
+        """
+        self.run = run
+        self.record = record
+        self.console = console
+        self.ranks = ranks
+        self.resume = resume
+        self.sinks = sinks
+        self.every = every
+        self.viewer: Viewer | None = None
+        self.seconds = 0.0
+        self.begun = False
+
+    def complete(self, stage: Stage) -> Model | None:
+        """Return the model of a teacher that is complete; None where it is not.
+
+        Raises:
+            RunError: the student has begun, and the teacher is missing or has other settings.
+        """
+        if not self.resume:
+            return None
+        seconds = self.ranks.share(self._seconds_of(stage) if self.ranks.first else None)
+        if not isinstance(seconds, (int, float)):
+            return None
+        self.seconds += seconds
+        return shared_model(self._folder(stage) / MODEL_FILE if self.ranks.first else None, self.ranks)
+
+    def begin(self, stage: Stage, trainer: Trainer) -> None:
+        """Say what comes; restore the newest checkpoint of a stage to resume, or check that the disk has room."""
+        if stage.teachers:
+            config = stage.config
+            limits = f"{config.iterations:,} iterations, at most {config.max_surfels:,} surfels"
+            self.console.print(f"{stage.name}: {limits}, seed {config.seed}")
+        folder, saved = self._folder(stage), False
+        if self.ranks.first and (self.resume or not self.begun):
+            kept = sum((folder / name).is_dir() for name in CHECKPOINTS) if self.resume else 0
+            check_room(folder, max(FILES_AT_A_TIME - kept, 1) * trainer.checkpoint_size())
+        if self.ranks.first and self.resume:
+            if folder.is_dir():  # a teacher that has not begun has no folder yet
+                remove_leftovers(folder)
+            saved = has_checkpoint(folder)
+        if self.ranks.share(saved):
+            # The run's config is the one to trust: a run that is extended writes it before its next checkpoint.
+            trainer.restore(folder, partial(display.warn, self.console), extend=True)
+            self.console.print(f"resumed at iteration {trainer.iteration:,}")
+        elif self.resume and not self.begun:
+            self.console.print(f"{folder}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+        self.begun = True
+
+    def train(self, stage: Stage, trainer: Trainer) -> None:
+        """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
+
+        Of several ranks, all stop after the step in which the signal of one has reached them. Rank 0 writes.
+
+        Raises:
+            DivergedError: the training diverged twice; the last good model and a report are in the run.
+            StorageError: the disk is full; the current model is in the run if there was room for it.
+            Stopped: a signal ended the training; a checkpoint of its last step is in the run.
+        """
+        folder = self._folder(stage)
+        if stage.teacher and self.ranks.first and not (self.resume and is_run(folder)):
+            create_run(folder, RunRecord(self.record.source, stage.config, self.ranks.device.type))
+        total = stage.config.iterations
+        every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
+        bar = display.TrainingDisplay(self.console, total, trainer.iteration, trainer.device, stage.name)
+        sinks = () if stage.teacher else self.sinks
+        log = TrainingLog(folder, trainer, sinks, self.record.config)
+        with ExitStack() as stack:
+            if self.ranks.first:
+                stack.enter_context(bar)
+                stack.enter_context(log)
+            stop_signal = stack.enter_context(deferred_stop())
+
+            def observe(step: StepReport) -> None:
+                if self.ranks.first:
+                    bar(step)
+                    with _model_kept(folder, trainer):
+                        log(step)
+                if self.viewer is not None:
+                    done = stage.before + step.iteration
+                    self.viewer.between_steps(done, partial(_describe, step), lambda: stop_signal() is not None)
+                number = self.ranks.agree(stop_signal(), now=step.iteration == total)
+                if step.passed(every) or step.iteration == total or number is not None:
+                    with _model_kept(folder, trainer):
+                        trainer.save_checkpoint(folder)
+                if self.ranks.size == 1:
+                    number = stop_signal()  # also one that came during the save
+                if number is not None:
+                    self.ranks.leave_together()
+                    raise Stopped(number)
+
+            def warn(text: str) -> None:
+                if self.ranks.first:
+                    display.warn(self.console, text)
+                    log.rewind()
+
+            try:
+                trainer.run(observe, warn)
+            except DivergedError as error:
+                raise self._diverged(folder, trainer, error) from None
+
+    def finish(self, stage: Stage, trainer: Trainer) -> Model:
+        """Finish, write and return the model of a trained stage; that of the run is also evaluated.
+
+        Raises:
+            StorageError, OutOfMemoryError: the last checkpoint holds the trained state; --resume finishes the run.
+        """
+        complete = f"{stage.name} is complete and saved: --resume finishes the run"
+        try:
+            model = self._write(stage, trainer) if self.ranks.first else self._finish_with_others(stage, trainer)
+        except OSError as error:
+            raise StorageError(f"{error}; {complete}") from error
+        except (MemoryError, RuntimeError) as error:
+            if (needed := needed_memory(error)) is None:
+                raise
+            raise OutOfMemoryError(f"out of memory: needed {needed}; {complete}") from error
+        if stage.teacher:
+            self.seconds += trainer.seconds
+            if self.ranks.first:
+                delete_checkpoints(self._folder(stage))  # nothing continues from them
+        return model
+
+    def _folder(self, stage: Stage) -> Path:
+        return teacher_folder(self.run, stage.number) if stage.teacher else self.run
+
+    def _seconds_of(self, stage: Stage) -> float | None:
+        """Return how long the training of a complete teacher took; None where the teacher is not complete."""
+        folder = self._folder(stage)
+        begun = is_run(folder)
+        settings = stage.config
+        if begun and dataclasses.replace(read_run(folder).config, cuda_graphs=settings.cuda_graphs) != settings:
+            raise RunError(f"{folder}: expected a teacher with the settings of {self.run}, got others")
+        seconds = read_metrics(folder).get("seconds") if begun else None
+        if isinstance(seconds, (int, float)):
+            delete_checkpoints(folder)  # a kill can have come before
+            return float(seconds)
+        if has_checkpoint(self.run):
+            raise RunError(f"{folder}: expected the complete teacher that the student in {self.run} has learned from")
+        return None
+
+    def _diverged(self, folder: Path, trainer: Trainer, error: DivergedError) -> DivergedError:
+        """Write a report and the last good model, which the trainer has restored; return the error to raise."""
+        report = {"message": str(error), **error.report}
+        outcome = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {folder}"
+        try:
+            if self.ranks.first:
+                write_json(folder / DIVERGED_FILE, report)
+                save_model(folder, trainer.model())
+        except OSError as problem:
+            outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
+        outcome = str(self.ranks.share(outcome))
+        self.ranks.leave_together()
+        return DivergedError(f"{error}; {outcome}", report)
+
+    def _write(self, stage: Stage, trainer: Trainer) -> Model:
+        """Finish and write the model of a stage, its cameras and figures."""
+        folder, given = self._folder(stage), trainer.scene.cameras
+        with display.stages(self.console) as observe:
+            finished = trainer.finish(observe)
+        file = save_model(folder, finished)
+        model = shared_model(file, self.ranks)
+        cameras = given
+        if trainer.poses is not None:
+            refined = trainer.views.refined_cameras(trainer.poses)
+            cameras = given | {TRAIN: dict(zip(given[TRAIN], refined, strict=True))}
+        save_cameras(folder / CAMERAS_FILE, cameras, given)
+        facts = self._facts(stage, trainer)
+        facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
+        if stage.teacher:
+            write_json(folder / METRICS_FILE, facts)
+        else:
+            self._evaluate(trainer, model, facts)
+        return model
+
+    def _facts(self, stage: Stage, trainer: Trainer) -> dict[str, Json]:
+        """Return what metrics.json says of a training; for a student, with the time of the run's teachers."""
+        iterations = trainer.iteration + (0 if stage.teacher else stage.before)
+        seconds = trainer.seconds + (0.0 if stage.teacher else self.seconds)
+        facts: dict[str, Json] = {
+            "preset": stage.config.preset,
+            "iterations": iterations,
+            "seconds": seconds,
+            "iterations_per_second": iterations / max(seconds, 1e-9),
+            "device": torch.cuda.get_device_name(trainer.device) if trainer.device.type == "cuda" else "cpu",
+        }
+        if trainer.teachers is not None:
+            facts["teachers"] = len(trainer.teachers.models)
+        return facts
+
+    def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
+        """Evaluate the run's model on the test views, if there are any, and print the figures."""
+        scene, run = trainer.scene, self.run
+        rows = {}
+        if scene.test:
+            mask_mode = trainer.config.mask_mode
+            rows = figures(
+                evaluate_run(model, scene, run, self.console, mask_mode=mask_mode, facts=facts, ranks=self.ranks)
+            )
+        rows |= {
+            "surfels": f"{len(model.surfels):,}",
+            "model file": f"{facts['megabytes']:.1f} MB",
+            "training": f"{facts['seconds']:.0f} s, {facts['iterations_per_second']:.1f} it/s",
+            "run": str(run),
+        }
+        self.console.print(display.results_table(rows, f"{len(scene.test)} test views"))
+        if scene.test:
+            strip = run / RENDERS_FOLDER / COMPARE / picture_name(scene.test[0].name)
+            self.console.print(f"photo, render, error: {strip}")
+
+    def _finish_with_others(self, stage: Stage, trainer: Trainer) -> Model:
+        """Return the model that rank 0 has finished; render a share of the test views for it."""
+        if trainer.graphs is not None:
+            trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
+        model = shared_model(None, self.ranks)
+        if trainer.scene.test and not stage.teacher:
+            evaluate(model, trainer.scene.test, mask_mode=trainer.config.mask_mode, ranks=self.ranks)
+        return model
+
+
+@contextmanager
+def _model_kept(folder: Path, trainer: Trainer) -> Iterator[None]:
+    """If the block fails on a full disk, save the model at least, which is smaller than a checkpoint."""
+    try:
+        yield
+    except OSError as error:
+        try:
+            save_model(folder, trainer.model())
+            model = "the current model is saved"
+        except OSError:
+            model = "the model cannot be saved either"
+        checkpoint = "there is no checkpoint"
+        if has_checkpoint(folder):
+            checkpoint = "--resume continues from the last checkpoint"
+        stop = f"training stops at iteration {trainer.iteration:,}: {model}, {checkpoint}"
+        raise StorageError(f"{error}; {stop}") from error
+
+
+def shared_model(file: Path | None, ranks: Ranks) -> Model:
+    """Return rank 0's model, read from its file, on the device of each rank; other ranks give None."""
+    if file is not None:
+        model = load(file)
+        if ranks.size > 1:
+            ranks.share_bytes(file.read_bytes())
+        return model.to(ranks.device)
+    with TemporaryDirectory() as folder:
+        (Path(folder) / MODEL_FILE).write_bytes(ranks.share_bytes(None))
+        return load(folder).to(ranks.device)
+
+
+def _describe(step: StepReport) -> str:
+    return f"loss {step.loss():.4f}, {step.psnr():.2f} dB on this view, {step.surfels:,} surfels"

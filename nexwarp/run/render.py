@@ -1,0 +1,311 @@
+"""Rendering of a run: still views, camera paths, videos and buffers."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import torch
+from tyro.conf import arg
+
+from nexwarp.cameras.camera import Camera, resized
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
+from nexwarp.cameras.nerfstudio import load_camera_path
+from nexwarp.cameras.paths import PATHS
+from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
+from nexwarp.errors import RunError, SettingError
+from nexwarp.io.pictures import save_png, to_uint8
+from nexwarp.io.video import check_video, video_writer
+from nexwarp.model.buffers import render_buffers, save_buffers
+from nexwarp.model.model import Model
+from nexwarp.model.options import Exposure, RenderChanges
+from nexwarp.ops.tiles import Order
+from nexwarp.run.contents import FILE_PATH, PROJECTIONS, RENDERS_FOLDER, TEST, TRAIN, picture_name
+from nexwarp.run.opened import OpenedModel
+
+FRAMES = 120
+FPS = 30.0
+PINHOLE = "pinhole"
+SETS = {"test": (TEST,), "train": (TRAIN,), "all": (TRAIN, TEST), None: ()}
+LARGEST_SIDE = 16384  # pixels
+
+
+@dataclass(frozen=True)
+class PictureJob:
+    """One image to render.
+
+    Attributes:
+        file: PNG file to write.
+        camera: a pinhole camera at the pose, and of the size, of the image.
+        is_frame: whether the image is a frame of the camera path.
+        buffers: whether to write its buffers, too.
+    """
+
+    file: Path
+    camera: Camera
+    is_frame: bool = False
+    buffers: bool = False
+
+
+@dataclass(frozen=True)
+class RenderOrder:
+    """What `nexwarp render` shows, and how."""
+
+    path: Annotated[str | None, arg(metavar="PATH", help_behavior_hint="(default: ellipse)")] = None
+    """Camera path: ellipse, spiral, interpolate, or FILE.json, a nerfstudio camera path or a transforms.json."""
+    video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9). Needs the extra `video`."""
+    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 120, or that of FILE.json)")] = None
+    """Number of frames of the path; 0 renders no path."""
+    fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: 30, or that of FILE.json)")] = None
+    """Frames per second of the video."""
+    set: Annotated[
+        str | None, arg(metavar="{test,train,all}", help_behavior_hint="(default: test without --path and --video)")
+    ] = None
+    """Still views to render."""
+    buffers: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Also write all buffers (depths, normals, weights ...) of the still views, else of the frames, as OpenEXR."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT", help_behavior_hint="(default: that of the photos)")] = None
+    """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
+    scale: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """Factor on the size of the photos, instead of --size."""
+    camera: Annotated[str, arg(metavar="{pinhole,panorama,fisheye,orthographic}")] = PINHOLE
+    """Projection; pictures other than pinhole ones go to RUN/renders/CAMERA (docs/cameras.md)."""
+    fov: Annotated[float, arg(metavar="DEGREES")] = 180.0
+    """Angle that the smaller side of a fisheye image shows."""
+    exposure: Annotated[str | None, arg(metavar="{photos,mean}", help_behavior_hint="(default: that of the model)")] = (
+        None
+    )
+    """Exposure and white balance: of the photos near each camera, or their mean for all images."""
+    order: Annotated[str | None, arg(metavar="{depth,distance}", help_behavior_hint="(default: that of the model)")] = (
+        None
+    )
+    """Blend surfels by z-depth, or by distance from the camera, which suits panoramas (docs/cameras.md)."""
+
+    def check(self) -> None:
+        """Raise SettingError unless the options fit together."""
+        self._check_views()
+        self._check_camera()
+        self._size()
+        if self.video is not None:
+            _check_video(self.video, FPS if self.fps is None else self.fps)
+
+    @property
+    def path_name(self) -> str | None:
+        """The path to render, if any: without any selection, show everything that the run can show."""
+        return self.path or (None if self.video is None and self.set is not None else "ellipse")
+
+    @property
+    def views(self) -> str | None:
+        """The still views to render, if any."""
+        return self.set or ("test" if self.path is None and self.video is None else None)
+
+    def _check_views(self) -> None:
+        if self.set not in SETS:
+            raise SettingError(f"--set: expected test, train or all, got {self.set!r}")
+        if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
+            raise SettingError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
+        if self.frames is not None and self.frames < 0:
+            raise SettingError(f"--frames: expected at least 0, got {self.frames}")
+        if self.frames == 0 and (self.video is not None or self.views is None):
+            raise SettingError("--frames: expected at least 1 for a path or a video, got 0")
+        if self.path_name is None and self.frames:
+            raise SettingError("--frames: expected together with --path or --video, got --set alone")
+        if self.fps is not None and self.video is None:
+            raise SettingError("--fps: expected together with --video, got no --video")
+
+    def _check_camera(self) -> None:
+        kinds = (PINHOLE, *PROJECTIONS)
+        if self.camera not in kinds:
+            raise SettingError(f"--camera: expected {', '.join(kinds)}, got {self.camera!r}")
+        if not 1 <= self.fov <= 360:
+            raise SettingError(f"--fov: expected 1 to 360 degrees, got {self.fov:g}")
+        if self.fov != 180.0 and self.camera != "fisheye":
+            raise SettingError(f"--fov: expected together with --camera fisheye, got --camera {self.camera}")
+        for option, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
+            if value not in (None, *get_args(kind)):
+                raise SettingError(f"--{option}: expected {' or '.join(get_args(kind))}, got {value!r}")
+        for option, asked in (("order", self.order is not None), ("buffers", self.buffers)):
+            if asked and self.camera != PINHOLE:
+                raise SettingError(f"--{option}: expected together with --camera pinhole, got --camera {self.camera}")
+
+    def prepare(self, opened: OpenedModel) -> "RenderJob":
+        """Choose the cameras and the files; write nothing.
+
+        Args:
+            opened: the run or model; one without cameras has no still views, and its paths lead around its surfels.
+
+        Raises:
+            ValueError, FileNotFoundError: the message names the option or file.
+        """
+        self.check()
+        size = self._size()
+        cameras = opened.cameras
+        renders = opened.folder / RENDERS_FOLDER
+        if self.camera != PINHOLE:
+            renders = renders / self.camera
+        pictures = [
+            PictureJob(renders / group / picture_name(name), size(camera), buffers=self.buffers)
+            for group in SETS[self.views]
+            for name, camera in cameras.get(group, {}).items()
+        ]
+        fps = FPS
+        if self.path_name is not None and self.frames != 0:
+            folder, path, fps = self._path(self.path_name, opened, renders)
+            first = size(path[0])
+            buffers = self.buffers and self.views is None
+            for index, camera in enumerate(path):
+                camera = resized(size(camera), first.width, first.height)
+                pictures.append(PictureJob(folder / f"{index:04d}.png", camera, True, buffers))
+        if not pictures:
+            raise RunError(
+                f"{opened.folder / CAMERAS_FILE}: expected {self.views} views to render, found none; see --path"
+            )
+        return RenderJob(pictures, self, fps if self.fps is None else self.fps)
+
+    def _path(self, name: str, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
+        """Return the folder of the frames, their cameras, and the frames per second."""
+        if name not in PATHS:
+            file = Path(name)
+            if self.frames is not None:
+                raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
+            near = next((c.near for group in opened.cameras.values() for c in group.values()), opened.near)
+            path = load_camera_path(file, near)
+            return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
+        count = FRAMES if self.frames is None else self.frames
+        cameras = opened.path_cameras()
+        views = cameras.get(TRAIN, {})
+        if name == "interpolate":
+            views = dict(sorted((views | cameras.get(TEST, {})).items()))
+        try:
+            return renders / name, PATHS[name](list(views.values()), count), FPS
+        except ValueError as error:
+            hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
+            raise SettingError(f"--path {name}: {error}{hint}") from None
+
+    def _size(self) -> Callable[[Camera], Camera]:
+        """Return the function that resizes a camera's image as --size or --scale specify."""
+        if not 0 < self.scale < math.inf:
+            raise SettingError(f"--scale: expected a number above 0, got {self.scale:g}")
+        if self.size is None:
+            return self._scaled
+        if self.scale != 1.0:
+            raise SettingError("--size, --scale: expected at most one of them, got both")
+        match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
+        sides = tuple(int(side) for side in match.groups()) if match else ()
+        if not sides or not all(1 <= side <= LARGEST_SIDE for side in sides):
+            raise SettingError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
+        return lambda camera: resized(camera, sides[0], sides[1])
+
+    def _scaled(self, camera: Camera) -> Camera:
+        """Resize an image by --scale; a panorama's pixels are as large as the photos', a fisheye image is a square."""
+        width, height = camera.width, camera.height
+        if self.camera == "panorama":
+            height = max(min(round(math.pi * camera.focal), MAX_SIDE // 2), 2)
+            width = 2 * height
+        elif self.camera == "fisheye":
+            width = height
+        camera = dataclasses.replace(camera, width=width, height=height)
+        width, height = (max(round(side * self.scale), 1) for side in (width, height))
+        if max(width, height) > LARGEST_SIDE:
+            raise SettingError(
+                f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {width}x{height} with {self.scale:g}"
+            )
+        return resized(camera, width, height)
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Images to render, and the video of their frames.
+
+    Attributes:
+        pictures: the images, in the order of rendering.
+        order: the options.
+        fps: frames per second.
+    """
+
+    pictures: list[PictureJob]
+    order: RenderOrder
+    fps: float = FPS
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the path in seconds."""
+        return sum(picture.is_frame for picture in self.pictures) / self.fps
+
+    @torch.no_grad()
+    def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
+        """Render and write all images and the video. An incomplete video is deleted.
+
+        Args:
+            model: the model, on the device to render on.
+            done: called after each image.
+        """
+        frames = [picture for picture in self.pictures if picture.is_frame]
+        changes: RenderChanges = {}
+        if self.order.exposure is not None:
+            changes["exposure"] = cast(Exposure, self.order.exposure)
+        if self.order.order is not None:
+            changes["order"] = cast(Order, self.order.order)
+        with ExitStack() as stack:
+            append = None
+            if self.order.video is not None:  # before any rendering, which would be lost if it cannot be written
+                size = (frames[0].camera.width, frames[0].camera.height)
+                append = stack.enter_context(video_writer(self.order.video, *size, self.fps))
+            for picture in self.pictures:
+                if picture.buffers:
+                    buffers = render_buffers(model, picture.camera, **changes)
+                    save_buffers(picture.file.with_suffix(".exr"), buffers)
+                    image = buffers.image
+                else:
+                    image = model.render(projected(self.order, model, picture.camera), **changes).image
+                pixels = to_uint8(image).cpu()
+                save_png(picture.file, pixels)
+                if append is not None and picture.is_frame:
+                    append(pixels)
+                done()
+        if frames:
+            _remove_frames(frames[0].file.parent, len(frames))
+
+
+def projected(order: RenderOrder, model: Model, camera: Camera) -> Camera | RayCamera:
+    """Return the camera of an order's projection, at the pose of a pinhole of the picture's size.
+
+    An orthographic view shows what is at the median depth as large as the pinhole does.
+    """
+    viewmat = camera.viewmat.float()
+    size = (camera.width, camera.height)
+    if order.camera == "panorama":
+        return RayCamera.panorama(viewmat, *size, near=camera.near)
+    if order.camera == "fisheye":
+        focal = min(size) / math.radians(order.fov)
+        K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+        return RayCamera.fisheye(viewmat, K.to(viewmat), (0, 0, 0, 0), *size, near=camera.near)
+    if order.camera == "orthographic":
+        depths = model.render(camera).median_depth
+        hit = depths[depths > 0]
+        depth = hit.median().item() if len(hit) else float(cast(float, model.meta.get("scene_scale", 1.0)))
+        return RayCamera.orthographic(viewmat, *size, depth / camera.focal, near=camera.near)
+    return camera
+
+
+def _check_video(path: Path, fps: float) -> None:
+    try:
+        check_video(path, fps)
+    except ValueError as error:
+        option = "--fps" if str(error).startswith("fps: ") else "--video"
+        raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
+
+
+def _remove_frames(folder: Path, count: int) -> None:
+    """Remove the frames numbered `count` and up, which an earlier, longer path left in the folder."""
+    for file in folder.iterdir():
+        if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= count:
+            file.unlink()
