@@ -25,7 +25,7 @@ from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
-# At the start of a training on a CPU.
+# At the start of a training on a CPU: steps that compile kernels, and steps and seconds that are timed.
 SKIPPED_STEPS = 3
 TIMED_STEPS = 5
 TIMED_SECONDS = 2.0
@@ -65,47 +65,6 @@ def plain_warnings(console: Console) -> Iterator[None]:
         yield
 
 
-class CpuEstimate:
-    """Says once, after the first steps of a long training on a CPU, how long the training takes."""
-
-    def __init__(self, total: int, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Prepare the estimate of a training of `total` iterations; `clock` returns seconds."""
-        self.total = total
-        self.clock = clock
-        self.begin: tuple[int, float] | None = None
-        self.seen = 0
-        self.known = False
-
-    def __call__(self, iteration: int) -> str | None:
-        """Take note of a finished iteration; return the text once it is known and the training is long."""
-        if self.known:
-            return None
-        now = self.clock()
-        self.seen += 1
-        if self.seen == SKIPPED_STEPS:  # these compile kernels
-            self.begin = (iteration, now)
-        if self.begin is None or self.seen < SKIPPED_STEPS + TIMED_STEPS or now - self.begin[1] < TIMED_SECONDS:
-            return None
-        self.known = True
-        steps = iteration - self.begin[0]
-        seconds = now - self.begin[1]
-        left = (self.total - iteration) * seconds / steps
-        if left < LONG_SECONDS:
-            return None
-        return (
-            f"on this CPU, the training takes about {duration(left)} ({steps} steps took {seconds:.1f} s), longer as "
-            "surfels are added; a GPU, a larger --downscale or fewer --iterations are faster"
-        )
-
-
-def duration(seconds: float) -> str:
-    """Return a duration as text, in minutes, hours or days."""
-    for unit, size in (("days", 86400.0), ("hours", 3600.0)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds / 60:.0f} minutes"
-
-
 class TrainingDisplay:
     """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
 
@@ -124,7 +83,9 @@ class TrainingDisplay:
         self.done = done
         self.device = device
         self.start = self.shown = time.perf_counter()
-        self.estimate = CpuEstimate(total) if device.type == "cpu" else None
+        self.estimated = device.type != "cpu"
+        self.steps = 0
+        self.timed_from = (done, self.start)
         self.progress = Progress(
             TextColumn(name),
             BarColumn(),
@@ -147,8 +108,8 @@ class TrainingDisplay:
     def __call__(self, step: StepReport) -> None:
         """Show a step; its numbers are fetched from the device only when they are shown."""
         now = time.perf_counter()
-        if self.estimate is not None and (text := self.estimate(step.iteration)) is not None:
-            self.console.print(text, soft_wrap=True, highlight=False)
+        if not self.estimated:
+            self._estimate(step.iteration, now)
         if self.console.is_terminal:
             due = now - self.shown >= REFRESH_SECONDS
         else:
@@ -164,6 +125,24 @@ class TrainingDisplay:
             seconds_left = (self.total - step.iteration) / max(rate, 1e-9)
             self.console.print(
                 f"iteration {step.iteration:,}/{self.total:,}  {text}  {seconds_left:.0f} s left", soft_wrap=True
+            )
+
+    def _estimate(self, iteration: int, now: float) -> None:
+        """Say once, after the first steps of a long training on a CPU, how long it takes."""
+        self.steps += 1
+        if self.steps == SKIPPED_STEPS:
+            self.timed_from = (iteration, now)
+        first, begin = self.timed_from
+        if self.steps < SKIPPED_STEPS + TIMED_STEPS or now - begin < TIMED_SECONDS:
+            return
+        self.estimated = True
+        seconds = (self.total - iteration) * (now - begin) / (iteration - first)
+        if seconds > LONG_SECONDS:
+            self.console.print(
+                f"on this CPU, the training takes about {seconds / 3600:.1f} hours, longer as surfels are added; "
+                "a GPU, a larger --downscale or fewer --iterations are faster",
+                soft_wrap=True,
+                highlight=False,
             )
 
 

@@ -31,9 +31,9 @@ from nexwarp.run.contents import (
     teacher_folder,
 )
 from nexwarp.run.evaluate import evaluate
-from nexwarp.run.folder import RunRecord, check_room, create_run, is_run, read_metrics, read_run
+from nexwarp.run.folder import RunRecord, create_run, is_run, read_metrics, read_run
 from nexwarp.run.log import TrainingLog
-from nexwarp.train.checkpoint import CHECKPOINTS, delete_checkpoints, has_checkpoint
+from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
 from nexwarp.train.stages import Stage
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 CHECKPOINTS_A_RUN = 10
-# Large files on the disk at once: two checkpoints, a third while it is written, and the model.
-FILES_AT_A_TIME = 4
 
 
 class Session:
@@ -106,15 +104,12 @@ class Session:
         return shared_model(self._folder(stage) / MODEL_FILE if self.ranks.first else None, self.ranks)
 
     def begin(self, stage: Stage, trainer: Trainer) -> None:
-        """Say what comes; restore the newest checkpoint of a stage to resume, or check that the disk has room."""
+        """Say what comes, and restore the newest checkpoint of a stage to resume."""
         if stage.teachers:
             config = stage.config
             limits = f"{config.iterations:,} iterations, at most {config.max_surfels:,} surfels"
             self.console.print(f"{stage.name}: {limits}, seed {config.seed}")
         folder, saved = self._folder(stage), False
-        if self.ranks.first and (self.resume or not self.begun):
-            kept = sum((folder / name).is_dir() for name in CHECKPOINTS) if self.resume else 0
-            check_room(folder, max(FILES_AT_A_TIME - kept, 1) * trainer.checkpoint_size())
         if self.ranks.first and self.resume:
             if folder.is_dir():  # a teacher that has not begun has no folder yet
                 remove_leftovers(folder)

@@ -8,7 +8,6 @@ import dataclasses
 import errno
 import json
 import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -331,20 +330,6 @@ def check_teachers_place(run: Path, count: int) -> None:
                 f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or give "
                 "another --run"
             )
-
-
-def check_room(run: Path, size: int) -> None:
-    """Raise StorageError unless the disk of a run folder, which need not exist, has room for `size` bytes."""
-    folder = next(f for f in (run, *run.absolute().parents) if f.is_dir())
-    try:
-        free = shutil.disk_usage(folder).free
-    except OSError:  # the file system does not report its free space
-        return
-    if free < size:
-        raise StorageError(
-            f"{run}: expected about {size / 2**20:,.0f} MiB of free disk space for a model and its checkpoints, "
-            f"got {free / 2**20:,.0f} MiB; free some, give another --run, or lower --max-surfels"
-        )
 
 
 def keep_camera_path(folder: Path, content: bytes, opened: Path | None = None) -> str:

@@ -4,10 +4,11 @@ import importlib.util
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Protocol, TextIO, TypedDict
+from typing import Any, TextIO
 
 import torch
 
@@ -24,33 +25,6 @@ EVERY = 100
 MIN_LINES = 100
 PACKAGES = ("tensorboard", "wandb")  # options, extras and packages have the same names
 WANDB_PROJECT = "nexwarp"  # unless the variable WANDB_PROJECT names one
-
-# Names in `nexwarp.train.recipe.LearningRates` of the optimizer's parameters.
-RATES = {
-    "corrections": "poses",
-    "means": "means",
-    "raw_quats": "quats",
-    "log_scales": "scales",
-    "logit_opacities": "opacities",
-    "raw_gammas": "gammas",
-    "sh0": "sh0",
-    "shN": "shN",
-    "grid": "grid",
-}
-
-
-class LogLine(TypedDict):
-    """One line of the log; `TrainingLog` describes the fields."""
-
-    iteration: int
-    loss: float
-    losses: dict[str, float]
-    psnr: float
-    surfels: int
-    iterations_per_second: float
-    seconds: float
-    memory_bytes: int | None
-    rates: dict[str, float]
 
 
 class TrainingLog:
@@ -87,7 +61,7 @@ class TrainingLog:
         self.settings = trainer.config if settings is None else settings
         self.every = max(min(EVERY, trainer.config.iterations // MIN_LINES), 1)
         self.file: TextIO | None = None
-        self.sinks: list[Sink] = []
+        self.sinks: list[TensorboardSink | WandbSink] = []
 
     def __enter__(self) -> "TrainingLog":
         run = self.path.parent
@@ -132,7 +106,7 @@ class TrainingLog:
         for sink in self.sinks:
             sink.write(scalars, step.iteration)
 
-    def _line(self, step: StepReport) -> LogLine:
+    def _line(self, step: StepReport) -> dict[str, Any]:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr = step.psnr()
@@ -149,7 +123,7 @@ class TrainingLog:
             "iterations_per_second": rate,
             "seconds": self.trainer.seconds,
             "memory_bytes": peak_memory(self.trainer.device),
-            "rates": learning_rates(self.trainer),
+            "rates": learning_rates(self.trainer.optimizer),
         }
 
 
@@ -166,16 +140,9 @@ def peak_memory(device: torch.device) -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Return the learning rates of the trainer's last step by the names of `nexwarp.train.recipe.LearningRates`."""
-    poses = () if trainer.poses is None else (trainer.poses,)
-    modules = (trainer.surfels, trainer.texture, *poses)
-    names = {id(parameter): name for module in modules for name, parameter in module.named_parameters()}
-    rates = {}
-    for group in trainer.optimizer.param_groups:
-        name = names[id(group["params"][0])]
-        rates[RATES.get(name, name.split(".")[0])] = float(group["lr"])
-    return rates
+def learning_rates(optimizer: torch.optim.Optimizer) -> dict[str, float]:
+    """Return an optimizer's learning rates by the names of `nexwarp.train.recipe.LearningRates`."""
+    return {re.sub("^(raw|log|logit)_", "", group["name"]): float(group["lr"]) for group in optimizer.param_groups}
 
 
 def _open_log(path: Path) -> TextIO:
@@ -214,7 +181,7 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _scalars(line: LogLine) -> dict[str, float]:
+def _scalars(line: Mapping[str, Any]) -> dict[str, float]:
     """Return a line as the values that the sinks take, by name."""
     scalars = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
     scalars |= {f"loss/{name}": value for name, value in line["losses"].items()}
@@ -228,16 +195,6 @@ def check_package(name: str) -> None:
     """Raise SettingError unless the package of an option is installed."""
     if importlib.util.find_spec(name) is None:
         raise SettingError(f"--{name}: expected the package {name}, found none; pip install 'nexwarp[{name}]'")
-
-
-class Sink(Protocol):
-    """Takes the scalars of a log line."""
-
-    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Take values by name."""
-
-    def close(self) -> None:
-        """Write what is left."""
 
 
 class TensorboardSink:

@@ -248,10 +248,3 @@ def scene_digest(scene: Scene, texture: NeuralTexture) -> str:
     for values in (scene.points, scene.colors):
         digest.update(values.contiguous().numpy().data)
     return digest.hexdigest()
-
-
-def checkpoint_bytes(surfels: Surfels, texture: NeuralTexture, max_surfels: int) -> int:
-    """Return how many bytes a checkpoint with Adam takes at most, with as many surfels as the budget allows."""
-    each = sum(p.numel() for p in surfels.parameters()) / max(len(surfels), 1)
-    count = each * max(max_surfels, len(surfels)) + sum(p.numel() for p in texture.parameters())
-    return int((1 + MOMENTS) * 4 * count) + HEADERS

@@ -38,7 +38,6 @@ from nexwarp.train.state import (
     Snapshot,
     check_origin,
     check_snapshot,
-    checkpoint_bytes,
     gather_optimizer,
     gather_random,
     known_part,
@@ -354,10 +353,6 @@ class Trainer:
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
             told = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
             raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({told})") from None
-
-    def checkpoint_size(self) -> int:
-        """Return how many bytes a checkpoint takes at most; the model takes less."""
-        return checkpoint_bytes(self.surfels, self.texture, self.config.max_surfels)
 
     def snapshot(self) -> Snapshot:
         """Return everything that shapes the future of the run, as copies on the CPU."""

@@ -7,10 +7,13 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import torch
+from rich.console import Console
 
 import nexwarp
 from nexwarp.cli import main as cli
-from nexwarp.cli.display import LONG_SECONDS, CpuEstimate, duration
+from nexwarp.cli.display import TrainingDisplay
+from nexwarp.train.report import StepReport
 
 CLOSED_PIPE = 141
 
@@ -56,20 +59,16 @@ def test_warp_starts_without_a_word(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_a_long_training_on_a_cpu_says_once_how_long_it_takes() -> None:
+def test_a_long_training_on_a_cpu_says_once_how_long_it_takes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 0.0
-    estimate = CpuEstimate(30_000, lambda: now)
-    told = []
-    for iteration in range(1, 60):
-        now += 20.0 if iteration < 3 else 0.5  # the first steps compile
-        if (text := estimate(iteration)) is not None:
-            told.append((iteration, text))
-    ((iteration, text),) = told
-    assert iteration <= 10
-    assert f"about {duration((30_000 - iteration) * 0.5)} (5 steps took 2.5 s)" in text
-    assert duration((30_000 - iteration) * 0.5) == "4.2 hours"
-    short = CpuEstimate(int(LONG_SECONDS), lambda: now)
-    for iteration in range(1, 60):
-        now += 0.9
-        assert short(iteration) is None
-    assert [duration(seconds) for seconds in (700.0, 7300.0, 400_000.0)] == ["12 minutes", "2.0 hours", "4.6 days"]
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    for total, words in ((30_000, ["about 4.2 hours, longer as surfels are added"]), (1000, [])):
+        now = 0.0
+        shown = TrainingDisplay(Console(), total, 0, torch.device("cpu"))
+        for iteration in range(1, 60):
+            now += 0.5
+            shown(StepReport(iteration, 100, {"l1": torch.tensor(0.1)}, torch.zeros(2, 2, 3), torch.ones(2, 2, 3)))
+        out = " ".join(capsys.readouterr().out.split())
+        assert out.count("on this CPU") == len(words) and all(word in out for word in words)

@@ -29,7 +29,7 @@ def main(tree: str, scene: str, run: str) -> None:
     evaluate = first_of(tree, "nexwarp.run.evaluate", "nexwarp.evaluate")
     cli = first_of(tree, "nexwarp.cli.main", "nexwarp.cli")
     texture = config.TextureConfig(levels=2, table_size=2**6, width=8)
-    recipe.PRESETS["default"] = config.Config(texture=texture, densify=densify.DensifyConfig(every=3), sh_degree=1)
+    presets.PRESETS["default"] = config.Config(texture=texture, densify=densify.DensifyConfig(every=3), sh_degree=1)
     pictures, to_uint8 = [], evaluate.to_uint8
 
     def record(image: torch.Tensor) -> torch.Tensor:

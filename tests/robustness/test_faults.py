@@ -15,9 +15,9 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
-from nexwarp.errors import NexwarpError, StorageError
+from nexwarp.errors import NexwarpError
 from nexwarp.io.pictures import load_exr
-from nexwarp.run.folder import check_room, read_metrics, read_run
+from nexwarp.run.folder import read_metrics, read_run
 from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.faults import Disk, failing
@@ -141,18 +141,6 @@ def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_p
     one_line(capsys, "No space left", "training stops at iteration 2", "the current model is saved", "--resume")
     assert nw.load(run).meta["iteration"] == 2
     assert whole_checkpoints(run) == [1]
-
-
-def test_a_disk_without_room_is_refused_before_training(trained, scene, tmp_path, monkeypatch, capsys):
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2**20))
-    command = ["train", str(scene), "--run", str(tmp_path / "new" / "run"), *FLAGS]
-    assert cli.main(command) == 2
-    one_line(capsys, str(tmp_path / "new" / "run"), "of free disk space", "got 1 MiB", "--max-surfels")
-    assert not (tmp_path / "new").exists()
-    with pytest.raises(StorageError, match="of free disk space"):
-        check_room(tmp_path, 2**20 + 1)
-    check_room(tmp_path, 2**20)
 
 
 def test_a_read_only_folder_is_refused_before_training(scene, tmp_path, capsys):
