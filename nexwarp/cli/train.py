@@ -172,15 +172,9 @@ class Train:
 
     def _record(self, run: Path, resume: bool, ranks: Ranks) -> RunRecord:
         """Return the run of the options, which must agree with the run to resume."""
-        check_max_hits(self.max_hits)
-        flags = self._flags()
-        settings = self._settings(flags)
         if resume:
-            return self._resumed(read_run(run), flags, settings)
-        base = preset(self.preset)
-        if self.scene.path == DEMO:
-            base = with_settings(base, DEMO_SETTINGS)
-        config = _with_set(with_settings(base, flags), settings)
+            return self._resumed(read_run(run))
+        config = self._config()
         for path in self.teachers:
             if path.resolve().is_relative_to(run.resolve()):
                 raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
@@ -188,8 +182,18 @@ class Train:
             raise SettingError("--teacher: expected poses that stay as given, got --refine-poses")
         return RunRecord(self.scene, config, ranks.device.type, ranks.launch, self.teachers)
 
+    def _config(self) -> Config:
+        """Return the settings of a new run."""
+        flags = self._flags()
+        settings = self._settings(flags)
+        base = preset(self.preset)
+        if self.scene.path == DEMO:
+            base = with_settings(base, DEMO_SETTINGS)
+        return _with_set(with_settings(base, flags), settings)
+
     def _flags(self) -> dict[str, Json]:
         """Return the settings that are given as options of their own."""
+        check_max_hits(self.max_hits)
         flags: dict[str, Json] = {
             "iterations": self.iterations,
             "max_surfels": self.max_surfels,
@@ -211,8 +215,10 @@ class Train:
                 raise SettingError(f"--set: {name}: expected {_flag(name)} instead of --set")
         return settings
 
-    def _resumed(self, old: RunRecord, flags: dict[str, Json], settings: dict[str, Json]) -> RunRecord:
+    def _resumed(self, old: RunRecord) -> RunRecord:
         """Return the run to resume. Its scene may have moved, and --iterations may be larger; the rest must agree."""
+        flags = self._flags()
+        settings = self._settings(flags)
         given = self.scene.absolute()
         for field in dataclasses.fields(SceneSource):
             if field.name != "path" and getattr(given, field.name) != field.default:

@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import torch
 
@@ -106,7 +106,7 @@ class TrainingLog:
         for sink in self.sinks:
             sink.write(scalars, step.iteration)
 
-    def _line(self, step: StepReport) -> dict[str, Any]:
+    def _line(self, step: StepReport) -> dict[str, Json]:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
         terms = torch.stack([x.detach().float() for x in step.losses.values()]).tolist()
         psnr = step.psnr()
@@ -181,14 +181,16 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _scalars(line: Mapping[str, Any]) -> dict[str, float]:
+def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
     """Return a line as the values that the sinks take, by name."""
-    scalars = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
-    scalars |= {f"loss/{name}": value for name, value in line["losses"].items()}
-    scalars["speed/iterations_per_second"] = line["iterations_per_second"]
-    if line["memory_bytes"] is not None:
-        scalars["memory/GiB"] = line["memory_bytes"] / 2**30
-    return scalars | {f"rate/{name}": value for name, value in line["rates"].items()}
+    tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
+    tags["speed/iterations_per_second"] = line["iterations_per_second"]
+    for group, values in (("loss", line["losses"]), ("rate", line["rates"])):
+        assert isinstance(values, dict)
+        tags |= {f"{group}/{name}": value for name, value in values.items()}
+    if isinstance(line["memory_bytes"], int):
+        tags["memory/GiB"] = line["memory_bytes"] / 2**30
+    return {name: value for name, value in tags.items() if isinstance(value, (int, float))}
 
 
 def check_package(name: str) -> None:

@@ -12,6 +12,7 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data import write_demo
+from nexwarp.data.scene import SceneSource
 from nexwarp.train.recipe import PRESETS, Config, LearningRates, preset
 from nexwarp.train.settings import config_from_dict, parse_settings, setting, with_settings
 from tests.scene_writers import write_blender
@@ -174,9 +175,9 @@ def test_a_scene_on_a_background_takes_it_from_its_flag(scene, tmp_path, capsys)
 
 def test_the_demo_keeps_what_makes_a_preset():
     """Its own settings are those of a short run on a CPU; the paper's texture stays the paper's."""
-    train = Train("demo", preset="paper")
-    config, paper = train._config(Path("nowhere")), preset("paper")
+    train = Train(SceneSource("demo"), preset="paper")
+    config, paper = train._config(), preset("paper")
     assert (config.preset, config.iterations, config.texture.levels) == ("paper", 1200, 12)
     for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "smooth_sh"):
         assert setting(config, name) == setting(paper, name)
-    assert dataclasses.replace(train, preset="default")._config(Path("nowhere")).texture.residual
+    assert dataclasses.replace(train, preset="default")._config().texture.residual
