@@ -34,7 +34,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "exposures.lengths": (1e-15, LARGEST_DISTANCE),
     "exposures.falloff": (-1e3, LARGEST_DISTANCE),
     "texture.grid": (-LARGEST_HALF, LARGEST_HALF),
-    "texture.cells": (-1e15, 1e15),
     "texture.resolutions": (0.0, LARGEST_RESOLUTION * ROUNDING),
 }
 MATRICES = "texture.mlp."

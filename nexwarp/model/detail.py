@@ -1,13 +1,11 @@
 """Level of detail: the first surfels of an ordered model and the coarse levels of its texture are a coarser model."""
 
-import copy
 import math
 
 import torch
 
 from nexwarp.errors import check_range
 from nexwarp.model.detail_limits import DetailLimits
-from nexwarp.model.merged_texture import MergedTexture
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture, TextureShape
@@ -34,14 +32,10 @@ def texture_levels(detail: float, levels: int) -> int:
     return max(1, math.ceil(levels * min(1.0, 1.0 + math.log2(2.0 * detail) / LOG_SHARE)))
 
 
-def coarse_shape(shape: TextureShape, resolutions: torch.Tensor, levels: int) -> TextureShape:
-    """Return the shape of a texture's first levels; `resolutions` (L,) are those of all."""
-    return {**shape, "levels": levels, "max_resolution": float(resolutions[levels - 1])}
-
-
 def coarse_texture(texture: NeuralTexture, levels: int) -> NeuralTexture:
     """Return a texture of the first levels alone: what the MLP makes of zeros in the features of all finer ones."""
-    shape = coarse_shape(texture.config, texture.resolutions, levels)
+    finest = float(texture.resolutions[levels - 1])
+    shape: TextureShape = {**texture.config, "levels": levels, "max_resolution": finest}
     coarse = NeuralTexture(**shape).to(texture.device)
     coarse.half_precision = texture.half_precision
     columns = levels * shape["features"]
@@ -71,9 +65,7 @@ def at_detail(model: Model, detail: float) -> Model:
         )
     rows = torch.arange(surfel_count(detail, len(model.surfels)), device=model.device)
     coarse = pick_surfels(model, rows)
-    if isinstance(model.texture, MergedTexture):
-        coarse.texture = copy.deepcopy(model.texture)
-    elif model.texture is not None:
+    if model.texture is not None:
         levels = len(model.texture.resolutions)
         coarse.texture = coarse_texture(model.texture, texture_levels(detail, levels))
     return coarse

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -17,10 +16,9 @@ from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
 from nexwarp.model.compact import STORED, code_names, decode, encode
-from nexwarp.model.detail import ORDERED, check_detail, coarse_shape, surfel_count, texture_levels
+from nexwarp.model.detail import ORDERED, check_detail
 from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.exposures import BUFFERS, Exposures
-from nexwarp.model.merged_texture import MergedTexture, make_texture
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions, check_removed
 from nexwarp.model.surfels import PARAMETERS, Surfels
@@ -65,7 +63,7 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     if model.texture is not None:
         for name, x in model.texture.state_dict().items():
-            tensors[f"texture.{name}"] = x.clone() if name.endswith(("resolutions", "cells")) else x.half()
+            tensors[f"texture.{name}"] = x.clone() if name == "resolutions" else x.half()
     if model.detail_limits is not None:
         tensors |= {stored: getattr(model.detail_limits, name) for name, stored in DETAIL_LIMITS.items()}
     if model.exposures is not None:
@@ -92,11 +90,12 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
 
     Args:
         path: a run folder or a model file.
-        detail: read the first surfels and coarse texture levels only, as `Model.at_detail` describes.
+        detail: keep the first surfels and coarse texture levels only, as `Model.at_detail` describes.
 
     Raises:
         FileNotFoundError: the folder or the file does not exist.
-        ValueError: the file is not a nexwarp model, has another format version, is damaged, or its tensors do not fit.
+        ValueError: the file is not a nexwarp model, has another format version, is damaged, its tensors do not fit, or
+            it uses what was removed.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -111,73 +110,107 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
     try:
         check_tensors_header(path)
         with safe_open(path, "pt") as file:
-            header = _read_header(path, (file.metadata() or {}).get("nexwarp"))
+            meta = _read_metadata(path, (file.metadata() or {}).get("nexwarp"))
+            compact = meta["format_version"] == COMPACT_VERSION
+            options, shape = _read_options(meta), _read_texture_shape(meta)
+            texture_shapes = _shapes_of(shape)
             # Tensors that this version does not know are passed over.
-            kinds = {
-                name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape())
-                for name in file.keys()
-                if name in FIXED_NAMES or name in header.texture_shapes or (header.compact and name in CODE_NAMES)
-            }
-            _check_kinds(path, kinds, header)
-            if detail < 1.0 and header.meta.get(ORDERED) is not True:
-                raise FormatError(f"{path}: expected surfels in the order of their share of the pictures, for a detail")
-            if detail < 1.0 and header.compact:
-                return load(path).at_detail(detail)  # codes are decoded together
-            parts = {name: _first_parts(name, kinds, detail) for name in kinds if detail < 1.0}
-            tensors = {n: file.get_slice(n)[parts[n]] if n in parts else file.get_tensor(n) for n in kinds}
+            known = FIXED_NAMES | texture_shapes.keys() | (CODE_NAMES if compact else set())
+            names = [name for name in file.keys() if name in known]
+            kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in names}
+            _check_kinds(kinds, texture_shapes, compact)
+            tensors = {name: file.get_tensor(name) for name in names}
+        model = _make_model(decode(tensors) if compact else tensors, options, shape, meta)
     except FormatError:
         raise
     except (SafetensorError, OSError) as error:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
+    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError, OverflowError) as error:
+        raise FormatError(f"{path}: expected the tensors of a nexwarp model ({one_line(error)})") from None
+    if detail == 1.0:
+        return model
+    if model.meta.get(ORDERED) is not True:
+        raise FormatError(f"{path}: expected surfels in the order of their share of the pictures, for a detail")
+    return model.at_detail(detail)
+
+
+def _read_metadata(path: Path, text: str | None) -> dict[str, Json]:
+    if text is None:
+        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
     try:
-        if detail < 1.0 and header.texture is not None and "parts" not in header.texture:
-            resolutions = tensors["texture.resolutions"]
-            shape = coarse_shape(cast(TextureShape, header.texture), resolutions, len(resolutions))
-            header = dataclasses.replace(header, texture=cast(dict[str, Json], shape))
-        return _make_model(header, tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-        raise _no_model(path, error) from None
+        meta = parse_json(f"{path}: nexwarp metadata", text.encode("utf-8", "surrogatepass"))
+    except ValueError:
+        meta = None
+    if not isinstance(meta, dict):
+        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {text[:40]!r}")
+    try:
+        check_version(meta.get("format_version"), COMPACT_VERSION)
+    except ValueError as error:
+        raise FormatError(f"{path}: {error}") from None
+    return meta
 
 
-def _first_parts(name: str, kinds: Mapping[str, tuple[str, list[int]]], detail: float) -> tuple[slice, ...]:
-    """Return the part of a tensor that a detail has."""
-    shape = kinds[name][1]
-    everything = tuple(slice(size) for size in shape)
-    if name.startswith("surfels.") or name in DETAIL_LIMITS.values():
-        return (slice(surfel_count(detail, shape[0])), *everything[1:])
-    if name.startswith("texture.") and "texture.grid" in kinds:  # a merged texture is read whole
-        all_levels, _, features = kinds["texture.grid"][1]
-        levels = texture_levels(detail, all_levels)
-        if name in ("texture.grid", "texture.resolutions"):
-            return (slice(levels), *everything[1:])
-        if name == "texture.mlp.0.weight":
-            return (everything[0], slice(levels * features))
-    return everything
+def _read_options(meta: dict[str, Json]) -> RenderOptions:
+    """Remove the options from the metadata and return them; raise ValueError or TypeError for an invalid value."""
+    check_removed(meta)
+    names = [field.name for field in dataclasses.fields(RenderOptions)]
+    missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
+    if missing:
+        raise ValueError(f"metadata: expected {missing[0]}, found none")
+    values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
+    if isinstance(color := values["background"], list):
+        values["background"] = tuple(color)
+    for name in ("near", "scene_scale", "smooth_sh"):
+        if name in meta:
+            value = meta[name]
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{name}: expected a number, got {value!r:.60}")
+            check_range(name, value, 0.0, LARGEST_LENGTH)
+    return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types
 
 
-@dataclass(frozen=True)
-class _Header:
-    """A model file's metadata.
-
-    Attributes:
-        options: the options of the rendering.
-        texture: the arguments of `NeuralTexture`; None for a model without texture.
-        texture_shapes: names and shapes of the texture's tensors.
-        meta: the other entries.
-        compact: whether the tensors are coded.
-    """
-
-    options: RenderOptions
-    texture: dict[str, Json] | None
-    texture_shapes: dict[str, list[int]]
-    meta: dict[str, Json]
-    compact: bool
+def _read_texture_shape(meta: dict[str, Json]) -> TextureShape | None:
+    """Remove the arguments of the texture from the metadata and return them; the constructor checks their values."""
+    shape = meta.pop("texture")
+    if shape is not None and not isinstance(shape, dict):
+        raise ValueError(f"texture: expected the settings of a texture, got {shape!r:.60}")
+    if shape is not None and "parts" in shape:
+        raise ValueError("texture: expected one texture: models merged from blocks were removed after 7f7bd6c")
+    known = {name: value for name, value in (shape or {}).items() if name in TextureShape.__annotations__}
+    return None if shape is None else cast(TextureShape, known)
 
 
-def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
-    """Make a model from a file's metadata and tensors; raise an error if they do not fit."""
-    if header.compact:
-        tensors = decode(tensors)
+def _shapes_of(shape: TextureShape | None) -> dict[str, list[int]]:
+    """Return names and shapes of a texture's tensors; allocate nothing, even if the metadata gives huge sizes."""
+    if shape is None:
+        return {}
+    with torch.device("meta"):
+        state = NeuralTexture(**shape).state_dict()
+    return {f"texture.{name}": list(x.shape) for name, x in state.items()}
+
+
+def _check_kinds(
+    kinds: Mapping[str, tuple[str, list[int]]], texture_shapes: Mapping[str, list[int]], compact: bool
+) -> None:
+    """Check the dtypes of all tensors and the shapes of the texture's before anything is allocated."""
+    for name, (dtype, shape) in kinds.items():
+        coded = COMPACT_DTYPES.get(name) if compact else None
+        if coded is not None and dtype != STORED[coded]:
+            raise ValueError(f"{name}: expected {STORED[coded]}, got {dtype}")
+        if coded is None and dtype not in DTYPES:
+            raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
+        expected = texture_shapes.get(name, shape)
+        if expected != shape:
+            raise ValueError(f"{name}: expected shape {expected}, got {shape}")
+    missing = sorted(texture_shapes.keys() - kinds.keys())
+    if missing:
+        raise ValueError(f"expected the tensor {missing[0]}, found none")
+
+
+def _make_model(
+    tensors: Mapping[str, torch.Tensor], options: RenderOptions, shape: TextureShape | None, meta: dict[str, Json]
+) -> Model:
+    """Make a model from a full file's tensors and metadata; raise an error if they do not fit."""
     surfels = Surfels(_part(tensors, "surfels."))
     limits = None
     if any(stored in tensors for stored in DETAIL_LIMITS.values()):
@@ -195,93 +228,13 @@ def _make_model(header: _Header, tensors: Mapping[str, torch.Tensor]) -> Model:
     exposures = Exposures(**parts) if parts else None
     check_bounds(tensors)
     texture = None
-    if header.texture is not None:
-        texture = make_texture(header.texture)
+    if shape is not None:
+        texture = NeuralTexture(**shape)
         texture.load_state_dict(_part(tensors, "texture."))
-        for prefix, part in _simple_textures(texture):
-            own = {f"texture.{name}": x for name, x in _part(tensors, prefix).items()}
-            check_bounds(own)
-            part.half_precision = fits_half(own)
-    return Model(surfels, texture, exposures, limits, header.options, header.meta)
+        texture.half_precision = fits_half(tensors)
+    return Model(surfels, texture, exposures, limits, options, meta)
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Return the tensors with a prefix in their names, as float32, by the names without it."""
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
-
-
-def _simple_textures(texture: NeuralTexture) -> list[tuple[str, NeuralTexture]]:
-    """Return a texture, or the parts of a merged one, with the prefixes of their tensors."""
-    if isinstance(texture, MergedTexture):
-        return [(f"texture.parts.{index}.", part) for index, part in enumerate(texture.textures)]
-    return [("texture.", texture)]
-
-
-def _read_header(path: Path, text: str | None) -> _Header:
-    """Read the metadata; allocate nothing of the sizes that it gives."""
-    if text is None:
-        raise FormatError(f"{path}: expected a nexwarp model, but the file has no nexwarp metadata")
-    try:
-        meta = parse_json(f"{path}: nexwarp metadata", text.encode("utf-8", "surrogatepass"))
-    except ValueError:
-        meta = None
-    if not isinstance(meta, dict):
-        raise FormatError(f"{path}: expected a JSON object as the nexwarp metadata, got {text[:40]!r}")
-    try:
-        check_version(meta.get("format_version"), COMPACT_VERSION)
-    except ValueError as error:
-        raise FormatError(f"{path}: {error}") from None
-    try:
-        options = _read_options(meta)
-        texture, shapes = meta.pop("texture"), {}
-        if not isinstance(texture, (dict, type(None))):
-            raise ValueError(f"texture: expected the settings of a texture, got {texture!r:.60}")
-        if texture is not None:
-            with torch.device("meta"):  # allocates nothing, even if the metadata gives huge sizes
-                state = make_texture(texture).state_dict()
-            shapes = {f"texture.{name}": list(x.shape) for name, x in state.items()}
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise _no_model(path, error) from None
-    return _Header(options, texture, shapes, meta, compact=meta["format_version"] == COMPACT_VERSION)
-
-
-def _check_kinds(path: Path, kinds: Mapping[str, tuple[str, list[int]]], header: _Header) -> None:
-    """Check the dtypes of all tensors and the shapes of the texture's before anything is allocated."""
-    try:
-        for name, (dtype, shape) in kinds.items():
-            coded = COMPACT_DTYPES.get(name) if header.compact else None
-            if coded is not None and dtype != STORED[coded]:
-                raise ValueError(f"{name}: expected {STORED[coded]}, got {dtype}")
-            if coded is None and dtype not in DTYPES:
-                raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
-            expected = header.texture_shapes.get(name, shape)
-            if expected != shape:
-                raise ValueError(f"{name}: expected shape {expected}, got {shape}")
-        missing = sorted(header.texture_shapes.keys() - kinds.keys())
-        if missing:
-            raise ValueError(f"expected the tensor {missing[0]}, found none")
-    except ValueError as error:
-        raise _no_model(path, error) from None
-
-
-def _no_model(path: Path, error: Exception) -> FormatError:
-    return FormatError(f"{path}: expected the tensors of a nexwarp model ({one_line(error)})")
-
-
-def _read_options(meta: dict[str, Json]) -> RenderOptions:
-    """Remove the options from the metadata and return them; raise ValueError or TypeError for an invalid value."""
-    names = [field.name for field in dataclasses.fields(RenderOptions)]
-    missing = [name for name in names if name not in meta and name not in LATER_OPTIONS]
-    if missing:
-        raise ValueError(f"metadata: expected {missing[0]}, found none")
-    check_removed(meta)
-    values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
-    if isinstance(color := values["background"], list):
-        values["background"] = tuple(color)
-    for name in ("near", "scene_scale", "smooth_sh"):
-        if name in meta:
-            value = meta[name]
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{name}: expected a number, got {value!r:.60}")
-            check_range(name, value, 0.0, LARGEST_LENGTH)
-    return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types

@@ -25,8 +25,7 @@ from tests.tolerances import assert_finite
 DENORMAL = 1e-44
 VALUES = (math.nan, math.inf, -math.inf, 1e30, -1e30, 3e38, 0.0, DENORMAL, -1.0)
 MATRICES = tuple(f"texture.mlp.{index}.weight" for index in (0, 2, 4))
-MERGED = ("texture.cells",)  # of models merged from blocks, which tests/model/test_blocks.py is about
-TENSORS = (*(name for name in BOUNDS if name not in MERGED), *MATRICES)
+TENSORS = (*BOUNDS, *MATRICES)
 
 # What must be refused: not finite pictures, or a value that the format excludes.
 REFUSED = {
@@ -155,7 +154,7 @@ def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
     assert set(TENSORS) == tensors.keys()
 
 
-@pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats", *MERGED}))
+@pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats"}))
 @pytest.mark.parametrize("end", [0, 1])
 def test_bounds_themselves_render_finite(stored: Path, tmp_path: Path, name: str, end: int) -> None:
     """All elements at an end of the range at once, up to the float32 value next to it."""

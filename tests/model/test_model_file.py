@@ -267,6 +267,7 @@ def test_models_that_cannot_render_are_refused(tmp_path):
         ("background", [0, 0]),
         ("low_pass", 1),
         ("low_pass", True),
+        ("texture", {"parts": [{}]}),
         ("sh_degree", 7),
         ("sh_degree", None),
         ("near", "far"),

@@ -16,7 +16,7 @@ from tests.narrowing import present
 from tests.render_support import assert_same
 
 # None of them the default.
-OPTIONS = nw.RenderOptions(1, (0.3, 0.2, 0.1), 2, True, True, "mean", False, "distance")
+OPTIONS = nw.RenderOptions(1, (0.3, 0.2, 0.1), 2, True, "mean", False, "distance")
 META: dict[str, Json] = {
     "near": 0.02,
     "scene_scale": 3.0,
