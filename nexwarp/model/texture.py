@@ -124,7 +124,7 @@ class NeuralTexture(nn.Module):
         """Return how many values an evaluation keeps for each point, at least, and their dtype.
 
         Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone.
-        Without gradients, those on CUDA keep nothing.
+        Without gradients, those keep nothing, nor does a CPU, which evaluates part of the points at a time.
 
         Args:
             sh_degree: SH degree of the evaluation.
@@ -135,6 +135,8 @@ class NeuralTexture(nn.Module):
         matrices = [*hidden, last[:outputs]]
         if self._in_half() and fused_texture.fits(self.grid, matrices, 0):
             return features * kept, torch.float16
+        if not kept and self.device.type == "cpu":
+            return 0, self.grid.dtype
         dtype = torch.float16 if self._in_half() else self.grid.dtype
         return features + outputs + sum(map(len, hidden)) * kept, dtype
 
@@ -207,7 +209,8 @@ class NeuralTexture(nn.Module):
         degree = min(sh_degree, self.sh_degree)
         flat = directions.reshape(-1, 3)
         image = (directions.shape[0], directions.shape[1]) if directions.ndim == 3 else None
-        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, flat, clamp, image)
+        rays = ops.Rays(flat, 0.0 if self.residual else 0.5, clamp, image)
+        colors = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, degree, rays)
         return colors.view(positions.shape)
 
     def _evaluate(
@@ -216,9 +219,7 @@ class NeuralTexture(nn.Module):
         depths: torch.Tensor,
         focal: float | torch.Tensor,
         degree: int,
-        directions: torch.Tensor | None = None,
-        clamp: bool = False,
-        image: tuple[int, int] | None = None,
+        rays: ops.Rays | None = None,
     ) -> torch.Tensor:
         *hidden, last = self.mlp.parameters()
         if not self.down_weighting:
@@ -231,20 +232,10 @@ class NeuralTexture(nn.Module):
             raise TypeError(f"focal: expected a number or a tensor, got {type(focal).__name__}")
         else:
             focal = self.grid.new_full((1,), float(focal))
-        return ops.texture(
-            positions,
-            depths,
-            self.grid,
-            [*hidden, last[: 3 * (degree + 1) ** 2]],
-            self.resolutions.to(self.grid.dtype),
-            focal,
-            directions=directions,
-            offset=0.0 if self.residual else 0.5,
-            clamp=clamp,
-            half=self._in_half(),
-            table=self.half_copy() if self._in_half() and self._half_copy is not None else None,
-            image=image,
-        )
+        table = self.half_copy() if self._in_half() and self._half_copy is not None else None
+        weights = [*hidden, last[: 3 * (degree + 1) ** 2]]
+        field = ops.Field(self.grid, weights, self.resolutions.to(self.grid.dtype), self._in_half(), table)
+        return ops.texture(ops.Points(positions, depths, focal), field, rays)
 
 
 def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:

@@ -8,6 +8,7 @@ from nexwarp.ops.expose import expose
 from nexwarp.ops.graphs import captured
 from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
+from nexwarp.ops.neural_field import Field, Points, Rays
 from nexwarp.ops.project import Pinhole, Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import DifferentiableSurface, Surface, surface
@@ -17,10 +18,13 @@ from nexwarp.ops.unproject import unproject
 
 __all__ = [
     "DifferentiableSurface",
+    "Field",
     "Hits",
     "ListCapacity",
     "Pinhole",
+    "Points",
     "Projection",
+    "Rays",
     "SplatErrorRequest",
     "Surface",
     "Tiles",

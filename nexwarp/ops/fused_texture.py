@@ -1,4 +1,4 @@
-"""Texturing in one kernel each way, for the shapes that `fused_texture` takes; see `nexwarp.ops.texture`."""
+"""Texturing in one kernel each way, for the shapes that `fits` names; see `nexwarp.ops.texture`."""
 
 import functools
 from collections.abc import Sequence
@@ -31,8 +31,8 @@ from nexwarp.native.fused_texture import (
     logical_feature,
     logical_output,
 )
-from nexwarp.ops._interop import Context, array, device_of, graph_is_kept, launch
-from nexwarp.ops.half_gradients import HALF_GRADIENT
+from nexwarp.ops._interop import Argument, Context, array, graph_is_kept, launch
+from nexwarp.ops.neural_field import HALF_GRADIENT, Field, Points, Rays
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
 
@@ -43,16 +43,19 @@ class Shape(NamedTuple):
     Attributes:
         width, height: in pixels; without an image, the number of directions and 1.
         hits: K.
+        shift: tiles are (1 << shift) pixels wide and (16 >> shift) high.
     """
 
     width: int
     height: int
     hits: int
+    shift: int
 
-    @property
-    def shift(self) -> int:
-        """Tiles are (1 << shift) pixels wide and (16 >> shift) high."""
-        return 3 if self.height > 1 else 4
+    @staticmethod
+    def of(points: Points, rays: Rays) -> "Shape":
+        """Return the shape of points along rays."""
+        height, width = rays.image or (1, len(rays.directions))
+        return Shape(width, height, len(points) // max(len(rays.directions), 1), 3 if height > 1 else 4)
 
     @property
     def units(self) -> int:
@@ -61,61 +64,33 @@ class Shape(NamedTuple):
         return -(-self.width // wide) * -(-self.height // high) * self.hits
 
 
-def takes_shape(levels: int, features: int, width: int, hidden_layers: int) -> bool:
-    """Whether the fused kernels take textures of a shape: L * F = 32, F 2 or 4, two hidden layers of 64."""
-    return levels * features == FEATURES and features in (2, 4) and width == WIDTH and hidden_layers == 2
-
-
 def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bool:
     """Whether the fused kernels take a grid (L, T, F) and matrices, of SH degree 0 to 3, for so many points."""
     levels, size, features = grid.shape
     shapes = [tuple(matrix.shape) for matrix in weights]
     hidden: list[tuple[int, ...]] = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
     return (
-        takes_shape(levels, features, len(weights[0]), len(weights) - 1)
+        levels * features == FEATURES
+        and features in (2, 4)
         and any(shapes == [*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
         and levels * size * features <= LARGEST_INT
         and points <= LARGEST_INT // 64
     )
 
 
-def supported(device: torch.device) -> bool:
-    """Whether a GPU has the tensor cores' instructions that the fused kernels use."""
-    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
-
-
-def usable(
-    positions: torch.Tensor, directions: torch.Tensor, grid: torch.Tensor, weights: Sequence[torch.Tensor]
-) -> bool:
+def usable(points: Points, field: Field, rays: Rays) -> bool:
     """Whether the fused kernels compute these colours; see `nexwarp.ops.texture`."""
+    positions = points.positions
     return (
-        supported(positions.device)
+        field.half
+        and positions.is_cuda
+        and torch.cuda.get_device_capability(positions.device) >= (8, 0)  # tensor cores' instructions
         and positions.dtype == torch.float32
-        and not (torch.is_grad_enabled() and directions.requires_grad)
+        and not (torch.is_grad_enabled() and rays.directions.requires_grad)
         and not torch.are_deterministic_algorithms_enabled()
         and len(positions) > 0
-        and fits(grid, weights, len(positions))
+        and fits(field.grid, field.weights, len(positions))
     )
-
-
-class Inputs(NamedTuple):
-    """What the kernels read: see `nexwarp.ops.texture`, whose arguments these are.
-
-    Attributes:
-        positions, depths, directions, resolutions, focal: float32, contiguous.
-        table: (L, T, F) the grid in half precision.
-        weights: the matrices, float32.
-        shape: of the image.
-    """
-
-    positions: torch.Tensor
-    depths: torch.Tensor
-    directions: torch.Tensor
-    table: torch.Tensor
-    weights: Sequence[torch.Tensor]
-    resolutions: torch.Tensor
-    focal: torch.Tensor
-    shape: Shape
 
 
 class Kept(NamedTuple):
@@ -132,183 +107,153 @@ class Kept(NamedTuple):
     colors: torch.Tensor
 
 
-def colors(inputs: Inputs, grid: torch.Tensor, offset: float, clamp: bool, *, keep: bool) -> torch.Tensor:
+def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Tensor:
     """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
 
     Args:
-        inputs: what the kernels read.
-        grid: (L, T, F) float32, of which `inputs.table` is a copy.
-        offset: colour of coefficients of 0.
-        clamp: limit colours to >= 0.
+        points: float32, contiguous.
+        field: with its `table`.
+        rays: contiguous.
         keep: whether there will be a backward pass.
     """
-    positions, depths, directions, table, weights, resolutions, focal, shape = inputs
-    fixed = (directions, table, resolutions, focal, shape, offset, clamp, keep)
-    return _Colors.apply(positions, depths, grid, *fixed, *weights)
+    return _Colors.apply(points, field, rays, keep, points.positions, points.depths, field.grid, *field.weights)
 
 
 class _Context(Context):
-    shape: Shape
+    rays: Rays
 
 
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context,
-        positions: torch.Tensor,
-        depths: torch.Tensor,
-        grid: torch.Tensor,
-        directions: torch.Tensor,
-        table: torch.Tensor,
-        resolutions: torch.Tensor,
-        focal: torch.Tensor,
-        shape: Shape,
-        offset: float,
-        clamp: bool,
-        keep: bool,
-        *weights: torch.Tensor,
+        ctx: _Context, points: Points, field: Field, rays: Rays, keep: bool, *tensors: torch.Tensor
     ) -> torch.Tensor:
-        inputs = Inputs(positions, depths, directions, table, weights, resolutions, focal, shape)
-        result, kept = forward(inputs, offset, clamp, keep)
-        ctx.shape = shape
+        result, kept = forward(points, field, rays, keep)
         if keep:
-            ctx.save_for_backward(positions, depths, directions, table, resolutions, focal, *kept, *weights)
+            assert field.table is not None
+            ctx.rays = Rays(rays.directions[:0], rays.offset, rays.clamp, rays.image)
+            fixed = (rays.directions, points.focal, field.table, field.resolutions)
+            ctx.save_for_backward(points.positions, points.depths, *fixed, *kept, *field.weights)
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        positions, depths, directions, table, resolutions, focal, encoded, packed, result, *weights = ctx.saved_tensors
-        need_positions, need_depths, need_grid, *_ = ctx.needs_input_grad
-        inputs = Inputs(positions, depths, directions, table, weights, resolutions, focal, ctx.shape)
-        kept, need_points = Kept(encoded, packed, result), need_positions or need_depths
-        again = graph_is_kept()
-        grad_grid, grad_points, grad_matrices = backward(grad.contiguous(), inputs, kept, need_points, again)
+        positions, depths, directions, focal, table, resolutions, encoded, packed, result, *weights = ctx.saved_tensors
+        need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]
+        points, field = Points(positions, depths, focal), Field(table, weights, resolutions, True, table)
+        rays = Rays(directions, ctx.rays.offset, ctx.rays.clamp, ctx.rays.image)
+        backward_pass = Backward(points, field, rays, Kept(encoded, packed, result), again=graph_is_kept())
+        grad_grid, grad_points, grad_matrices = backward_pass(grad.contiguous(), need_positions or need_depths)
         return (
-            grad_points[:, :3] if need_positions and grad_points is not None else None,
-            grad_points[:, 3] if need_depths and grad_points is not None else None,
+            *(None,) * 4,
+            grad_points[:, :3] if need_positions else None,
+            grad_points[:, 3] if need_depths else None,
             grad_grid if need_grid else None,
-            *(None,) * 8,
             *grad_matrices,
         )
 
 
-def forward(inputs: Inputs, offset: float, clamp: bool, keep: bool) -> tuple[torch.Tensor, Kept]:
-    """Return the colours (n, 3), and what `backward` needs, without the features unless `keep`.
-
-    Args:
-        inputs: what the kernels read.
-        offset: colour of coefficients of 0.
-        clamp: limit colours to >= 0.
-        keep: whether there will be a backward pass.
-    """
-    positions, depths, directions, table, weights, resolutions, focal, shape = inputs
-    packed = _pack(weights, table.shape[2])
+def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch.Tensor, Kept]:
+    """Return the colours (n, 3), and what `Backward` needs, without the features unless `keep`."""
+    table, shape = field.stored(), Shape.of(points, rays)
+    packed = _pack(field.weights, table.shape[2])
     encoded = torch.empty(shape.units * 256 if keep else 0, dtype=torch.int32, device=table.device)
-    result = torch.empty_like(positions)
-    warps = _warps(positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
-    _launch(
-        fused_kernels(table.shape[2]).forward,
-        positions,
-        warps,
-        [
-            array(table.view(-1), wp.float16),
-            wp.uint32(table.shape[1] - 1),
-            array(positions, wp.vec3),
-            array(depths, wp.float32),
-            array(directions, wp.vec3),
-            array(resolutions, wp.float32),
-            array(focal, wp.float32),
-            array(packed, wp.int32),
-            *shape,
-            shape.shift,
-            offset,
-            int(clamp),
-        ],
-        [array(encoded, wp.int32), array(result, wp.vec3)],
-        FORWARD_THREADS,
-    )
-    return result, Kept(encoded, packed, result if clamp else result.new_empty(0, 3))
+    result = torch.empty_like(points.positions)
+    warps = _warps(points.positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
+    inputs = [
+        array(table.view(-1), wp.float16),
+        wp.uint32(table.shape[1] - 1),
+        array(points.positions, wp.vec3),
+        array(points.depths, wp.float32),
+        array(rays.directions, wp.vec3),
+        array(field.resolutions, wp.float32),
+        array(points.focal, wp.float32),
+        array(packed, wp.int32),
+        *shape,
+        rays.offset,
+        int(rays.clamp),
+    ]
+    outputs = [array(encoded, wp.int32), array(result, wp.vec3)]
+    _launch(fused_kernels(table.shape[2]).forward, points.positions, warps, inputs, outputs, FORWARD_THREADS)
+    return result, Kept(encoded, packed, result if rays.clamp else result.new_empty(0, 3))
 
 
-def backward(
-    grad_colors: torch.Tensor, inputs: Inputs, kept: Kept, need_points: bool, again: bool
-) -> tuple[torch.Tensor, torch.Tensor | None, list[torch.Tensor]]:
-    """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices.
+class Backward(NamedTuple):
+    """The backward pass.
 
-    Args:
-        grad_colors: (n, 3).
-        inputs: of `forward`.
+    Attributes:
+        points, field, rays: of `forward`.
         kept: of `forward`.
-        need_points: whether positions or depths need a gradient.
         again: whether `kept` will be needed again; otherwise the features are overwritten by their gradients.
     """
-    scale, unscale = _scales(grad_colors)
-    grad_encoded = torch.empty_like(kept.encoded) if again else kept.encoded
-    sums = _mlp_backward(grad_colors, scale, inputs, kept, grad_encoded)
-    order = _order(inputs.table.shape[2], len(inputs.weights[-1]), grad_colors.device)
-    flat = grad_colors.new_empty(len(order))
-    given = [array(sums, wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
-    launch(grad_colors, order_gradients, len(order), given, [array(flat, wp.float32)])
-    ends = np.cumsum([0, *(matrix.numel() for matrix in inputs.weights)]).tolist()
-    grad_matrices = [flat[a:b].view_as(matrix) for a, b, matrix in zip(ends, ends[1:], inputs.weights, strict=False)]
-    return *_scatter(grad_encoded, unscale, inputs, need_points), grad_matrices
 
+    points: Points
+    field: Field
+    rays: Rays
+    kept: Kept
+    again: bool
 
-def _mlp_backward(
-    grad_colors: torch.Tensor, scale: torch.Tensor, inputs: Inputs, kept: Kept, grad_encoded: torch.Tensor
-) -> torch.Tensor:
-    """Write the gradients of the features, and return those of the matrices in permuted order, both scaled."""
-    shape, features = inputs.shape, inputs.table.shape[2]
-    warps = _warps(grad_colors, shape.units, BACKWARD_BLOCKS * WARPS)
-    sums = grad_colors.new_empty(warps // (WARPS if grad_colors.is_cuda else 1), sum(GRADIENTS))
-    _launch(
-        fused_kernels(features).backward,
-        grad_colors,
-        warps,
-        [
-            array(kept.encoded, wp.int32),
-            array(inputs.directions, wp.vec3),
-            array(kept.packed, wp.int32),
+    def __call__(
+        self, grad_colors: torch.Tensor, need_points: bool
+    ) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
+        """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices."""
+        scale, unscale = _scales(grad_colors)
+        grad_encoded = torch.empty_like(self.kept.encoded) if self.again else self.kept.encoded
+        sums = self._mlp(grad_colors, scale, grad_encoded)
+        weights = self.field.weights
+        order = _order(self.field.grid.shape[2], len(weights[-1]), grad_colors.device)
+        flat = grad_colors.new_empty(len(order))
+        inputs = [array(sums, wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
+        launch(grad_colors, order_gradients, len(order), inputs, [array(flat, wp.float32)])
+        parts = flat.split([matrix.numel() for matrix in weights])
+        grad_matrices = [part.view_as(matrix) for part, matrix in zip(parts, weights, strict=True)]
+        return *self._scatter(grad_encoded, unscale, need_points), grad_matrices
+
+    def _mlp(self, grad_colors: torch.Tensor, scale: torch.Tensor, grad_encoded: torch.Tensor) -> torch.Tensor:
+        """Write the gradients of the features, and return those of the matrices in permuted order, both scaled."""
+        shape = Shape.of(self.points, self.rays)
+        warps = _warps(grad_colors, shape.units, BACKWARD_BLOCKS * WARPS)
+        sums = grad_colors.new_empty(warps // (WARPS if grad_colors.is_cuda else 1), sum(GRADIENTS))
+        inputs = [
+            array(self.kept.encoded, wp.int32),
+            array(self.rays.directions, wp.vec3),
+            array(self.kept.packed, wp.int32),
             *shape,
-            shape.shift,
             array(scale, wp.float32),
-            array(kept.colors, wp.vec3),
+            array(self.kept.colors, wp.vec3),
             array(grad_colors, wp.vec3),
-        ],
-        [array(grad_encoded, wp.int32), array(sums.view(-1), wp.float32)],
-        BACKWARD_THREADS,
-    )
-    return sums.sum(0)
+        ]
+        outputs = [array(grad_encoded, wp.int32), array(sums.view(-1), wp.float32)]
+        kernel = fused_kernels(self.field.grid.shape[2]).backward
+        _launch(kernel, grad_colors, warps, inputs, outputs, BACKWARD_THREADS)
+        return sums.sum(0)
 
-
-def _scatter(
-    grad_encoded: torch.Tensor, unscale: torch.Tensor, inputs: Inputs, need_points: bool
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
-    table, positions, shape = inputs.table, inputs.positions, inputs.shape
-    grad_grid = torch.zeros_like(table, dtype=torch.float32)
-    count = shape.units * (32 if positions.is_cuda else 1)
-    grad_points = positions.new_empty(len(positions) * need_points, 4)
-    levels, size, features = table.shape
-    kernel = fused_scatter_kernel(features)
-    given = [
-        array(table.view(-1), wp.float16),
-        array(positions, wp.vec3),
-        array(inputs.depths, wp.float32),
-        array(inputs.resolutions, wp.float32),
-        array(inputs.focal, wp.float32),
-        wp.uint32(size - 1),
-        array(grad_encoded.view(torch.float16), wp.float16),
-        array(unscale, wp.float32),
-        *shape,
-        shape.shift,
-    ]
-    outputs = [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)]
-    for group in level_groups(levels, size * features * 4):
-        # In one thread on a CPU.
-        launch(positions, kernel, count, [*given, *group], outputs, block_dim=SCATTER_THREADS, smallest=count)
-    return grad_grid, grad_points if need_points else None
+    def _scatter(
+        self, grad_encoded: torch.Tensor, unscale: torch.Tensor, need_points: bool
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
+        table, positions, shape = self.field.stored(), self.points.positions, Shape.of(self.points, self.rays)
+        grad_grid = torch.zeros_like(table, dtype=torch.float32)
+        grad_points = positions.new_empty(len(positions) * need_points, 4)
+        levels, size, features = table.shape
+        inputs = [
+            array(table.view(-1), wp.float16),
+            array(positions, wp.vec3),
+            array(self.points.depths, wp.float32),
+            array(self.field.resolutions, wp.float32),
+            array(self.points.focal, wp.float32),
+            wp.uint32(size - 1),
+            array(grad_encoded.view(torch.float16), wp.float16),
+            array(unscale, wp.float32),
+            *shape,
+        ]
+        outputs = [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)]
+        kernel, threads = fused_scatter_kernel(features), shape.units * (32 if positions.is_cuda else 1)
+        for group in level_groups(levels, size * features * 4):
+            # In one thread on a CPU.
+            launch(positions, kernel, threads, [*inputs, *group], outputs, block_dim=SCATTER_THREADS, smallest=threads)
+        return grad_grid, grad_points
 
 
 def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
@@ -329,11 +274,11 @@ def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
 
 
 def _launch(
-    kernel: wp.Kernel, like: torch.Tensor, warps: int, inputs: list[object], outputs: list[object], threads: int
+    kernel: wp.Kernel, like: torch.Tensor, warps: int, inputs: list[Argument], outputs: list[Argument], block_dim: int
 ) -> None:
     """Launch a kernel whose second argument is its number of threads, on CUDA 32 for each warp."""
-    count = warps * 32 if device_of(like).is_cuda else warps
-    launch(like, kernel, count, [count, *inputs], outputs, block_dim=threads, smallest=count)
+    threads = warps * 32 if like.is_cuda else warps
+    launch(like, kernel, threads, [threads, *inputs], outputs, block_dim=block_dim, smallest=threads)
 
 
 def _warps(like: torch.Tensor, most: int, each: int) -> int:
@@ -348,8 +293,8 @@ def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:
     sources = _sources(features, len(weights[-1]), weights[0].device)
     packed = torch.empty(len(sources), dtype=torch.float16, device=sources.device)
     matrices = [array(matrix.reshape(-1), wp.float32) for matrix in weights]
-    given = [*matrices, array(sources, wp.int32)]
-    launch(packed, pack_matrices, len(packed), given, [array(packed, wp.float16)])
+    inputs = [*matrices, array(sources, wp.int32)]
+    launch(packed, pack_matrices, len(packed), inputs, [array(packed, wp.float16)])
     return packed.view(torch.int32)
 
 
@@ -357,8 +302,8 @@ def _scales(grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the factor (1,) that gradients in half precision are multiplied by, and its inverse."""
     largest = torch.linalg.vector_norm(grad, float("inf")).view(1)
     scale, unscale = torch.empty_like(largest), torch.empty_like(largest)
-    given = [array(largest, wp.float32), HALF_GRADIENT]
-    launch(grad, half_scale, 1, given, [array(x, wp.float32) for x in (scale, unscale)])
+    outputs = [array(x, wp.float32) for x in (scale, unscale)]
+    launch(grad, half_scale, 1, [array(largest, wp.float32), HALF_GRADIENT], outputs)
     return scale, unscale
 
 

@@ -14,7 +14,6 @@ from nexwarp.ops.columns import parts_of, share_columns
 POINT_MULTIPLE = 64
 # Not among torch's documented functions.
 _FUSED_RELU = hasattr(torch, "_addmm_activation")
-OUTPUTS = tuple(3 * (degree + 1) ** 2 for degree in range(4))  # of the last matrix, by SH degree
 
 
 def padded(count: int, dtype: torch.dtype) -> int:
@@ -36,10 +35,7 @@ def outputs(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool)
             if not keep:
                 del layers[0]
         return [*layers[: len(layers) * keep], matrices[-1] @ layers[-1]]
-    count = encoded.shape[1]
-    if not keep:
-        return [_mlp_on_cpu(encoded, matrices)]
-    layers = [encoded, *(encoded.new_empty(len(matrix), count) for matrix in matrices)]
+    layers = [encoded, *(encoded.new_empty(len(matrix), encoded.shape[1]) for matrix in matrices)]
 
     def part(_: int, columns: slice) -> None:
         for i, matrix in enumerate(matrices):
@@ -47,22 +43,8 @@ def outputs(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool)
             if i + 1 < len(matrices):
                 out.relu_()
 
-    share_columns(count, part)
-    return layers
-
-
-def _mlp_on_cpu(encoded: torch.Tensor, matrices: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return the output of the last layer; the others exist for one part of the columns at a time."""
-    result = encoded.new_empty(len(matrices[-1]), encoded.shape[1])
-
-    def part(_: int, columns: slice) -> None:
-        layer = encoded[:, columns]
-        for matrix in matrices[:-1]:
-            layer = torch.mm(matrix, layer).relu_()
-        torch.mm(matrices[-1], layer, out=result[:, columns])
-
     share_columns(encoded.shape[1], part)
-    return result
+    return layers
 
 
 def _product_relu(matrix: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:

@@ -26,13 +26,12 @@ def rounded(x: torch.Tensor) -> torch.Tensor:
 class Case(NamedTuple):
     """Points of an image, and a texture whose table is exact in half precision."""
 
-    shape: fused_texture.Shape
+    hits: int
     leaves: list[torch.Tensor]  # positions, depths, grid, matrices
-    directions: torch.Tensor
+    rays: ops.Rays
     resolutions: torch.Tensor
     focal: torch.Tensor
     signal: torch.Tensor
-    clamp: bool
 
     def reference(self) -> torch.Tensor:
         """Return the colours (n, 3) in float64, with the roundings to half precision that both computations do.
@@ -47,28 +46,19 @@ class Case(NamedTuple):
         for matrix in hidden:
             layer = rounded(torch.relu(layer @ matrix.T))
         coefficients = (layer @ last.T).unflatten(1, (-1, 3))
-        directions = self.directions.double().repeat_interleave(self.shape.hits, 0)[seen]
+        directions = self.rays.directions.double().repeat_interleave(self.hits, 0)[seen]
         found = sh.evaluate(coefficients, directions, 3)
         colors = 0.1 + torch.zeros_like(positions).index_put((seen.nonzero()[:, 0],), found)
-        return colors.clamp_min(0.0) if self.clamp else colors
+        return colors.clamp_min(0.0) if self.rays.clamp else colors
 
-    def texture(self, *, half: bool, fused: bool) -> torch.Tensor:
-        """Return the colours (n, 3) of `ops.texture`."""
+    def inputs(self, half: bool) -> tuple[ops.Points, ops.Field, ops.Rays]:
+        """Return the arguments of `ops.texture`."""
         positions, depths, grid, *weights = self.leaves
-        return ops.texture(
-            positions,
-            depths,
-            grid,
-            weights,
-            self.resolutions,
-            self.focal,
-            directions=self.directions,
-            offset=0.1,
-            clamp=self.clamp,
-            half=half,
-            image=(self.shape.height, self.shape.width),
-            fused=fused,
-        )
+        return ops.Points(positions, depths, self.focal), ops.Field(grid, weights, self.resolutions, half), self.rays
+
+    def texture(self, *, fused: bool) -> torch.Tensor:
+        """Return the colours (n, 3) in half precision."""
+        return ops.texture(*self.inputs(half=True), fused=fused)
 
 
 def make_case(
@@ -88,19 +78,20 @@ def make_case(
     grid = torch.empty_like(texture.grid.detach()).uniform_(-1, 1).half().float()
     leaves = [x.to(device).requires_grad_() for x in (positions, depths, grid, *weights)]
     signal = 1e-4 * torch.randn(count, 3)
-    given = [x.to(device) for x in (directions, texture.resolutions, torch.tensor([60.0]), signal)]
-    return Case(fused_texture.Shape(*size), leaves, given[0], given[1], given[2], given[3], clamp)
+    rays = ops.Rays(directions.to(device), 0.1, clamp, (height, width))
+    focal = torch.tensor([60.0], device=device)
+    return Case(hits, leaves, rays, texture.resolutions.to(device), focal, signal.to(device))
 
 
 def fused_on_cpu(case: Case, again: bool = False) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return colours and gradients as the kernels' CPU branch computes them."""
-    positions, depths, grid, *weights = (x.detach() for x in case.leaves)
-    points = (positions, depths, case.directions, grid.half())
-    inputs = fused_texture.Inputs(*points, weights, case.resolutions, case.focal, case.shape)
-    colors, kept = fused_texture.forward(inputs, 0.1, case.clamp, True)
-    features = kept.encoded.clone()
-    grad_grid, grad_points, matrices = fused_texture.backward(case.signal, inputs, kept, True, again)
-    assert grad_points is not None and torch.equal(features, kept.encoded) is again
+    points, field, rays = case.inputs(half=True)
+    with torch.no_grad():
+        colors, kept = fused_texture.forward(points, field, rays, True)
+        features = kept.encoded.clone()
+        backward = fused_texture.Backward(points, field, rays, kept, again)
+        grad_grid, grad_points, matrices = backward(case.signal, True)
+    assert torch.equal(features, kept.encoded) is again
     return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
 
 
@@ -177,9 +168,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     calls: list[int] = []
     forward = fused_texture.forward
 
-    def spy(inputs: fused_texture.Inputs, *options: bool) -> tuple[torch.Tensor, fused_texture.Kept]:
-        calls.append(len(inputs.positions))
-        return forward(inputs, *options)
+    def spy(points: ops.Points, *rest: Any) -> tuple[torch.Tensor, fused_texture.Kept]:
+        calls.append(len(points))
+        return forward(points, *rest)
 
     monkeypatch.setattr(fused_texture, "forward", spy)
     yield calls
@@ -195,13 +186,13 @@ def test_fused_and_layered_agree(
     exact = case.reference()
     references = list(torch.autograd.grad(exact, case.leaves, case.signal))
     for fused in (False, True):
-        colors = case.texture(half=True, fused=fused)
+        colors = case.texture(fused=fused)
         gradients = list(torch.autograd.grad(colors, case.leaves, case.signal))
         assert_agree(colors, gradients, exact, references)
     assert len(counted) == 1
     with torch.no_grad():
-        assert torch.equal(case.texture(half=True, fused=True), colors)
-    colors = case.texture(half=True, fused=True)
+        assert torch.equal(case.texture(fused=True), colors)
+    colors = case.texture(fused=True)
     for keep in (True, False):
         again = torch.autograd.grad(colors, case.leaves, case.signal, retain_graph=keep)
         assert_agree(colors, list(again), exact, references)
@@ -211,13 +202,13 @@ def test_fused_and_layered_agree(
 def test_what_the_fused_kernels_do_not_take_is_computed_in_layers(counted: list[int]) -> None:
     case = make_case(torch.device("cuda"), 4, 3, False, (20, 10, 2))
     with deterministic(True):
-        case.texture(half=True, fused=True)
-    case.directions.requires_grad_()
-    colors = case.texture(half=True, fused=True)
-    assert torch.autograd.grad(colors, case.directions, case.signal)[0].abs().max() > 0
+        case.texture(fused=True)
+    case.rays.directions.requires_grad_()
+    colors = case.texture(fused=True)
+    assert torch.autograd.grad(colors, case.rays.directions, case.signal)[0].abs().max() > 0
     assert not counted
     with torch.no_grad():
-        case.texture(half=True, fused=True)
+        case.texture(fused=True)
     assert counted == [400]
 
 
@@ -227,7 +218,7 @@ def test_values_that_are_not_finite_are_passed_on() -> None:
     case = make_case(torch.device("cuda"), 4, 3, False, (20, 10, 2))
     with torch.no_grad():
         case.leaves[2].fill_(float("nan"))
-    colors = case.texture(half=True, fused=True)
+    colors = case.texture(fused=True)
     assert colors[case.leaves[1] > 0].isnan().all()
     gradients = torch.autograd.grad(colors, case.leaves[3:], case.signal)
     assert all(not gradient.isfinite().all() for gradient in gradients)

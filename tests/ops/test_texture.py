@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 from typing import Any
 
 import pytest
@@ -51,6 +52,16 @@ def test_textured_colors_agree_with_the_reference(
     assert_close(out, expected, kind="value", name="colors")
     for index, (gradient, reference) in enumerate(zip(grads, references, strict=True)):
         assert_close(gradient, reference, kind="gradient", name=f"gradient {index}")
+
+
+def test_points_evaluated_in_parts_have_the_same_colors(monkeypatch: pytest.MonkeyPatch) -> None:
+    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0)
+    positions, depths = torch.rand(37, 2, 3), torch.ones(37, 2)
+    directions = torch.nn.functional.normalize(torch.rand(37, 3), dim=-1)
+    with torch.no_grad():
+        whole = texture.colors(positions, depths, directions, 24.0)
+        monkeypatch.setattr(sys.modules["nexwarp.ops.texture"], "PART", 16)
+        assert_close(texture.colors(positions, depths, directions, 24.0), whole, kind="value", name="colors")
 
 
 @pytest.mark.parametrize("part", ["grid", "hidden", "last"])

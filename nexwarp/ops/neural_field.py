@@ -1,0 +1,79 @@
+"""What a neural texture consists of and where it is evaluated, and the scale of gradients in half precision."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+# Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
+HALF_GRADIENT = 64.0
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points at which a texture is evaluated.
+
+    Attributes:
+        positions: (n, 3) world.
+        depths: (n,) z-depths from the camera, world units; a point with depth 0 is skipped and has features 0.
+        focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 4; not differentiated.
+    """
+
+    positions: torch.Tensor
+    depths: torch.Tensor
+    focal: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A hash grid and an MLP.
+
+    Attributes:
+        grid: (L, T, F) features, T a power of two, F in 1, 2, 4, 8.
+        weights: the MLP's matrices (out, in), ReLU between them, no biases; 3 (d + 1)^2 outputs for SH degree d.
+        resolutions: (L,) cells per world unit; not differentiated.
+        half: keep features, activations and coefficients in half precision; gradients are scaled on the way and summed
+            in float32.
+        table: (L, T, F) the grid in half precision, where the caller has it already.
+    """
+
+    grid: torch.Tensor
+    weights: Sequence[torch.Tensor]
+    resolutions: torch.Tensor
+    half: bool = False
+    table: torch.Tensor | None = None
+
+    def stored(self) -> torch.Tensor:
+        """The grid's values, contiguous, in the precision of the evaluation."""
+        if self.half and self.table is not None:
+            return self.table
+        return self.grid.detach().contiguous().to(torch.float16 if self.half else self.grid.dtype)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Directions along which coefficients become colours.
+
+    Attributes:
+        directions: (P, 3) unit directions, world; of n = P * K points, point i belongs to direction i // K.
+        offset: colour of coefficients of 0; 0 makes them residuals.
+        clamp: limit colours to >= 0.
+        image: (height, width), whose product is P, of the image that the directions belong to, row by row; neighbouring
+            pixels then work together. It changes no result but for the order of sums.
+    """
+
+    directions: torch.Tensor
+    offset: float = 0.5
+    clamp: bool = False
+    image: tuple[int, int] | None = None
+
+
+def gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """(1,) power of two that brings the largest gradient near HALF_GRADIENT in half precision; 1 otherwise."""
+    if dtype != torch.float16 or grad.numel() == 0:
+        return grad.new_ones(1)
+    largest = torch.linalg.vector_norm(grad, float("inf")).clamp_min(1e-30)
+    return torch.exp2(torch.floor(torch.log2(HALF_GRADIENT / largest))).clamp(2.0**-24, 2.0**60).view(1)
