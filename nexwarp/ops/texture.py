@@ -87,10 +87,8 @@ class _Texture(torch.autograd.Function):
         read = rays is not None and (rays.clamp or ctx.needs_input_grad[6])
         kept = coefficients if read else coefficients.new_empty(len(coefficients), 0)
         directions = None if rays is None else rays.directions
-        ctx.save_for_backward(  # type: ignore[arg-type]  # torch saves None too
-            *(points.positions, points.depths, points.focal, directions),
-            *(field.resolutions, lookup.table, kept, *layers, *matrices),
-        )
+        inputs = [points.positions, points.depths, points.focal, directions, field.resolutions]
+        ctx.save_for_backward(*inputs, lookup.table, kept, *layers, *matrices)  # type: ignore[arg-type]  # None too
         if rays is None:
             return coefficients[:, : len(points)].to(field.grid.dtype)
         colors = torch.empty_like(points.positions)
