@@ -14,12 +14,7 @@ MAX_FRAMES = 20_000
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A camera that a path passes through.
-
-    Attributes:
-        pose: (4, 4) float64 camera to world, x right, y down, z forward.
-        fov: vertical field of view in radians.
-    """
+    """A camera that a path passes through: its (4, 4) camera-to-world pose and vertical field of view in radians."""
 
     pose: np.ndarray
     fov: float
@@ -28,20 +23,14 @@ class Keyframe:
 def interpolate(keyframes: Sequence[Keyframe], count: int, closed: bool = False) -> list[Keyframe]:
     """Return `count` cameras on a smooth path through the keyframes, with equal time between neighbours.
 
-    An open path starts at the first and ends at the last keyframe. A closed path returns to the first keyframe without
-    repeating it at the end. Positions and fields of view follow cubic splines, rotations follow a rotation spline.
-
-    Raises:
-        ValueError: fewer than two keyframes, or `count` < 2.
+    A closed path returns to the first keyframe without repeating it at the end. ValueError for fewer than two.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 
     n = len(keyframes)
-    if n < 2:
-        raise ValueError(f"keyframes: expected at least two, got {n}")
-    if count < 2:
-        raise ValueError(f"count: expected at least 2, got {count}")
+    if min(n, count) < 2:
+        raise ValueError(f"keyframes: expected at least two, got {n} for {count} frames")
     # A closed path repeats all keyframes at each end, so that the splines are smooth at the seam.
     order = np.arange(-n, 2 * n + 1) if closed else np.arange(n)
     times = np.linspace(0, n, count, endpoint=False) if closed else np.linspace(0, n - 1, count)
@@ -63,14 +52,6 @@ def path_json(
 ) -> bytes:
     """Return a path through keyframes as nerfstudio's camera-path JSON in UTF-8, one camera for each frame.
 
-    Args:
-        keyframes: at least two.
-        width: width of the frames, pixels.
-        height: height of the frames, pixels.
-        fps: frames a second.
-        seconds: duration of the video.
-        closed: return to the first keyframe.
-
     Raises:
         ValueError: fewer than two keyframes, a size or time that is not positive, or more than 20,000 frames.
     """
@@ -80,13 +61,10 @@ def path_json(
     count = max(round(fps * seconds), 2)
     if count > MAX_FRAMES:
         raise ValueError(f"seconds: expected at most {MAX_FRAMES:,} frames, got {count:,} ({seconds:g} s at {fps:g})")
-    data: dict[str, object] = {"render_width": width, "render_height": height, "fps": fps, "seconds": seconds}
-    data["camera_path"] = [
-        {
-            "camera_to_world": (frame.pose @ OPENGL).ravel().tolist(),
-            "fov": math.degrees(frame.fov),
-            "aspect": width / height,
-        }
-        for frame in interpolate(keyframes, count, closed)
-    ]
+    frames = []
+    for frame in interpolate(keyframes, count, closed):
+        pose = (frame.pose @ OPENGL).ravel().tolist()
+        frames.append({"camera_to_world": pose, "fov": math.degrees(frame.fov), "aspect": width / height})
+    size = {"render_width": width, "render_height": height}
+    data = {**size, "fps": fps, "seconds": seconds, "camera_path": frames}
     return (json.dumps(data, indent=2) + "\n").encode()

@@ -74,12 +74,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn view.
-
-    Attributes:
-        pixels: (H, W, 3) uint8.
-        span: values at the two ends of the colour scale; None without a colour scale.
-    """
+    """A drawn view: (H, W, 3) uint8 pixels, and the values at the two ends of the colour scale if it has one."""
 
     pixels: np.ndarray
     span: tuple[float, float] | None = None
@@ -89,17 +84,9 @@ class Picture:
 def draw(
     model: Model, bands: Iterable[Camera], settings: Settings, stale: Callable[[], bool] = lambda: False
 ) -> Picture | None:
-    """Render one view in the mode of the settings.
+    """Render one view in the mode of the settings, as bands of rows from top to bottom.
 
-    Args:
-        model: the model to render.
-        bands: cameras of the bands of rows of the picture, from top to bottom.
-        settings: display settings. Their K replaces that of the model's options; their SH degree limits that of the
-            options.
-        stale: called before each band but the first; True cancels the picture.
-
-    Returns:
-        The picture, or None if it was cancelled.
+    `stale` is called before each band but the first; True cancels the picture, which is then None.
     """
     mode, hits = settings.mode, settings.max_hits
     if mode in BY_SLOT:

@@ -34,14 +34,7 @@ class Panel:
     """The controls of one client."""
 
     def __init__(self, session: "Session", cameras: Sequence[str], fov: float, size: tuple[int, int]) -> None:
-        """Add the controls.
-
-        Args:
-            session: what the controls act on.
-            cameras: names of the scene's cameras.
-            fov: initial vertical field of view, degrees.
-            size: initial width and height of path videos, pixels.
-        """
+        """Add the controls, with an initial field of view in degrees and size of path videos in pixels."""
         self.session, self.gui = session, session.client.gui
         tabs = self.gui.add_tab_group(order=10.0)
         with tabs.add_tab("Look"):
@@ -172,18 +165,14 @@ class Panel:
 
 
 class TrainingPanel:
-    """The controls of a training: progress, pause, and the share of time for pictures.
-
-    Attributes:
-        paused: whether the training is held between two steps.
-    """
+    """The controls of a training: progress, pause, and the share of time for pictures."""
 
     def __init__(self, gui: "viser.GuiApi", total: int, share: Share, wake: Callable[[], None]) -> None:
         """Add the controls of a training of `total` iterations; `wake` is called when it is paused or resumed."""
         from viser import Icon
 
         self.total, self.share, self.wake = total, share, wake
-        self.paused = False
+        self.paused = False  # held between two steps
         self._last: tuple[float, int] | None = None  # time and step of the last status line
         with gui.add_folder("Training", order=0.0):
             self.progress = gui.add_progress_bar(0.0)

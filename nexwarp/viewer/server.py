@@ -57,10 +57,6 @@ class Server:
 def start_server(host: str, port: int) -> Server:
     """Start viser on exactly this address; it refuses all requests until `gate.is_open` is set.
 
-    Args:
-        host: name or address of an interface of this machine. `nexwarp.viewer.access` says who may connect.
-        port: 1 to 65535, or 0 for any free port.
-
     Raises:
         ValueError: viser is not installed, or the address cannot be used; the message gives the reason.
     """

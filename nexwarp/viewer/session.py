@@ -51,16 +51,7 @@ class Session:
         home: Viewpoint,
         wake: Callable[[], None],
     ) -> None:
-        """Take up a client, whose panel and frustums `start` adds.
-
-        Args:
-            client: the connected client.
-            world: the browser's frame.
-            cameras: the scene's cameras by name, "train/..." or "test/...".
-            settings: initial display settings.
-            home: initial view.
-            wake: called when a new picture is needed.
-        """
+        """Take up a client, whose panel and frustums `start` adds; `wake` is called when a new picture is needed."""
         self.client, self.world, self.cameras, self.home = client, world, cameras, home
         self.settings, self.wake = settings, wake
         self.viewpoint: Viewpoint | None = None
@@ -128,12 +119,7 @@ class Session:
         self.go(self.home.pose, self.home.fov)
 
     def go(self, pose: np.ndarray, fov: float) -> None:
-        """Move to a (4, 4) camera-to-world pose in the scene's frame, and orbit a point in front of it.
-
-        Args:
-            pose: (4, 4) float64, x right, y down, z forward.
-            fov: vertical field of view, radians.
-        """
+        """Move to a (4, 4) camera-to-world pose in the scene's frame, and orbit a point in front of it; fov in rad."""
         position, forward = self.world.to_browser(pose[:3, 3]), pose[:3, 2]
         distance = max(float((self.world.to_browser(self.world.focus) - position) @ forward), 0.5)
         camera = self.client.camera
@@ -233,7 +219,7 @@ class Session:
         return self.world.to_browser(np.stack([key.pose[:3, 3] for key in keys])).astype(np.float32)
 
     async def play(self, seconds: float, closed: bool) -> None:
-        """Move along the path once, back to the first view if `closed`; if that is in progress, stop it."""
+        """Move along the path once, back to the first view if `closed`; stop if that is in progress."""
         if self.playing:
             self.playing = False
             return
@@ -264,15 +250,7 @@ class Session:
             self.wake()
 
     def save_path(self, width: int, height: int, fps: float, seconds: float, closed: bool) -> None:
-        """Send the path to the browser as a file, and write it into the run.
-
-        Args:
-            width: width of the frames, pixels.
-            height: height of the frames, pixels.
-            fps: frames a second.
-            seconds: duration of the video.
-            closed: return to the first view.
-        """
+        """Send the path to the browser as a file, and write it into the run; the arguments are those of `path_json`."""
         keys = self.keyframes
         if len(keys) < 2:
             self.tell("Add at least two views first", "")

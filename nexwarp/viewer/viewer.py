@@ -179,11 +179,8 @@ class Viewer:
     def _draw_next(self, longest: float | None) -> float | None:
         """Draw one picture, for the client that has waited longest, of those that have taken their last one.
 
-        Args:
-            longest: largest predicted time of the picture, seconds; None for any. Screenshots take any time.
-
-        Returns:
-            The time for `Share`, seconds; None if no picture is due.
+        It should take `longest` seconds at most; screenshots may take any time. Returns the time for `Share`; None if
+        no picture is due.
         """
         for session in sorted(list(self.sessions.values()), key=lambda s: s.drawn_at):
             if session.waiting():

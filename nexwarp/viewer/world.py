@@ -97,15 +97,7 @@ class Viewpoint:
 
     @staticmethod
     def of(wxyz: FloatVector, position: FloatVector, fov: float, width: int, height: int, world: World) -> "Viewpoint":
-        """Convert a browser's camera, after a check of its values.
-
-        Args:
-            wxyz: (4,) rotation as a quaternion, camera to world.
-            position: (3,) in browser units.
-            fov: vertical field of view, radians.
-            width: width of the canvas, pixels.
-            height: height of the canvas, pixels.
-            world: the browser's frame.
+        """Convert a browser's camera: rotation (4,), position (3,) in browser units, fov in radians, size in pixels.
 
         Raises:
             ValueError: values that are not finite or do not describe a camera.
@@ -132,8 +124,7 @@ class Viewpoint:
             near: near depth of the cameras, world units.
             like: a tensor with the dtype and device of the cameras.
             count: largest number of bands; the height of each but the last is a multiple of 16 rows.
-            focal_limit: upper limit of `Camera.focal`, pixels. It limits the detail of the texture to that of a
-                picture with this focal length.
+            focal_limit: upper limit of `Camera.focal`, pixels, which limits the detail of the texture.
         """
         width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
         focal = 0.5 * height / math.tan(0.5 * self.fov)

@@ -7,17 +7,12 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras.camera import resized
 from nexwarp.cameras.paths import look_at
-from nexwarp.data import write_demo
 from nexwarp.export.splats import Pieces, split_large
 from nexwarp.export.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.metrics import psnr
-from nexwarp.train.recipe import DEMO_SETTINGS, preset
-from nexwarp.train.settings import with_settings
-from nexwarp.train.trainer import Trainer
-from tests.gsplat_support import draw, untextured
+from tests.gsplat_support import draw
 from tests.reference import ewa
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_surfels, random_scene
@@ -231,26 +226,6 @@ def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> 
         record_property(f"psnr from {position}", found)
         assert mine.std() > 0.1
         assert found >= 35.0
-
-
-@pytest.mark.cuda
-def test_gsplat_renders_a_trained_scene_as_we_do(tmp_path: Path, record_property) -> None:
-    """The demo as `nexwarp train demo` trains it, at 4 times its photos' size, where the blur is small."""
-    pytest.importorskip("gsplat", reason="gsplat is not installed (pip install gsplat==1.5.3)")
-    scene = nw.load_scene(write_demo(tmp_path / "demo"))
-    trainer = Trainer(scene, with_settings(preset("default"), DEMO_SETTINGS), "cuda")
-    trainer.run()
-    surfels = untextured(trainer.surfels)
-    cameras = [view.camera for view in [*scene.train, *scene.test]]
-    save_splats_ply(tmp_path / "splats.ply", surfels, cameras=cameras)
-    for view in scene.test:
-        camera = resized(view.camera, 4 * view.camera.width, 4 * view.camera.height).to("cuda")
-        with torch.no_grad():
-            mine = nw.render(surfels, None, camera).image
-        theirs = draw(tmp_path / "splats.ply", camera, (0.0, 0.0, 0.0))
-        found = float(psnr(to_uint8(theirs), to_uint8(mine)))
-        record_property(f"psnr of {view.name}", found)
-        assert found >= 35.0, view.name
 
 
 # Bad files
