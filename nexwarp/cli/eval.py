@@ -12,7 +12,7 @@ from rich.console import Console
 from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Flag_, Run_, option
-from nexwarp.data import Scene
+from nexwarp.data import View
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
@@ -54,14 +54,17 @@ class Eval:
             model = opened.model.to(device)
             with display.loading(console) as progress:
                 scene = source.load(progress)
+            if not scene.test:
+                raise SceneError(f"{scene.path}: expected test views, found none")
+            views, facts = scene.test, read_metrics(opened.folder)
+            facts.pop("test_poses", None)  # of an earlier evaluation
+            if self.refine_poses:
+                with display.counting(console, "fitting test poses", len(views)) as done:
+                    views, moves = fit_poses(model, views, progress=done)
+                facts["test_poses"] = {**moves}
+            mask_mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
             results = evaluate_run(
-                model,
-                scene,
-                opened.folder,
-                console,
-                mask_mode=MASK_MODES[0] if opened.config is None else opened.config.mask_mode,
-                metrics=self.metrics,
-                refine_poses=self.refine_poses,
+                model, views, opened.folder, console, facts, mask_mode=mask_mode, metrics=self.metrics
             )
         rows = figures(results, self.metrics)
         fitted = ", poses fitted to their photos" if self.refine_poses else ""
@@ -90,47 +93,32 @@ def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim
 
 def evaluate_run(
     model: Model,
-    scene: Scene,
+    views: Sequence[View],
     run: Path,
     console: Console,
+    facts: dict[str, Json],
     *,
     mask_mode: str,
     metrics: Sequence[str] = ("psnr", "ssim"),
-    facts: dict[str, Json] | None = None,
-    refine_poses: bool = False,
     ranks: Ranks | None = None,
 ) -> dict[str, Json]:
-    """Evaluate a model on its test views and write metrics.json.
+    """Evaluate a model on test views and write metrics.json; return its entries.
 
     Args:
         model: the model, on the device to render on.
-        scene: the scene with the test views.
+        views: the test views.
         run: run folder.
         console: where to show the progress.
+        facts: the file's entries beside the metrics.
         mask_mode: see `evaluate`.
         metrics: see `evaluate`.
-        facts: the file's entries beside the metrics; None keeps those of an existing file.
-        refine_poses: fit the test poses first, see `fit_poses`; the file then has an entry `test_poses`.
         ranks: see `evaluate`; this is rank 0.
-
-    Returns:
-        The entries of metrics.json.
     """
-    if not scene.test:
-        raise SceneError(f"{scene.path}: expected test views, found none")
-    views, fitted = scene.test, None
-    if refine_poses:
-        with display.counting(console, "fitting test poses", len(scene.test)) as done:
-            views, fitted = fit_poses(model, scene.test, progress=done)
-    with display.counting(console, "evaluating", len(scene.test)) as done:
-        renders = run / RENDERS_FOLDER
+    renders = run / RENDERS_FOLDER
+    with display.counting(console, "evaluating", len(views)) as done:
         results = evaluate(
             model, views, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
         )
-    entries: dict[str, Json] = {**(read_metrics(run) if facts is None else facts)}
-    entries |= cast(dict[str, Json], results)
-    entries.pop("test_poses", None)  # of an earlier evaluation
-    if fitted is not None:
-        entries["test_poses"] = {**fitted}
+    entries = facts | cast(dict[str, Json], results)
     write_json(run / METRICS_FILE, entries)
     return entries

@@ -269,7 +269,7 @@ class Session:
         if scene.test:
             mask_mode = trainer.config.mask_mode
             rows = figures(
-                evaluate_run(model, scene, run, self.console, mask_mode=mask_mode, facts=facts, ranks=self.ranks)
+                evaluate_run(model, scene.test, run, self.console, facts, mask_mode=mask_mode, ranks=self.ranks)
             )
         rows |= {
             "surfels": f"{len(model.surfels):,}",
