@@ -52,11 +52,7 @@ class StorageError(NexwarpError, OSError):
 
 
 class DivergedError(NexwarpError, RuntimeError):
-    """A training produced NaN or infinity.
-
-    Attributes:
-        report: facts about the failure, as JSON values.
-    """
+    """A training produced NaN or infinity; `report` holds facts about it, as JSON values."""
 
     def __init__(self, message: str, report: Mapping[str, object] | None = None) -> None:
         super().__init__(message)
@@ -68,11 +64,7 @@ class RankError(NexwarpError, RuntimeError):
 
 
 class OutOfMemoryError(NexwarpError, MemoryError):
-    """A GPU or computer has too little memory for the task; the message says which settings to lower.
-
-    Attributes:
-        needed: how much memory was needed, for a message.
-    """
+    """A GPU or computer has too little memory for the task; `needed` says how much would have done."""
 
     def __init__(self, message: str, needed: str | None = None) -> None:
         super().__init__(message)

@@ -29,11 +29,10 @@ KEEP_FREED = {-4: 0, -1: 2**31 - 1, -2: 64 * 2**20}
 
 @functools.cache
 def keep_freed_memory() -> None:
-    """Let glibc keep freed memory for reuse, up to 2 GiB, for work on a CPU; the first call counts.
+    """Let glibc keep freed memory for reuse, up to 2 GiB, for work on a CPU; NEXWARP_KEEP_MEMORY=0 leaves it as it is.
 
     Each rendering allocates the same blocks again. glibc would get those of over 32 MiB from the system each time,
-    page by page, which takes a third of a frame's time. NEXWARP_KEEP_MEMORY=0 in the environment leaves glibc as it
-    is. No effect with other C libraries.
+    page by page, which takes a third of a frame's time.
     """
     if not sys.platform.startswith("linux") or os.environ.get("NEXWARP_KEEP_MEMORY") == "0":
         return
@@ -79,10 +78,7 @@ def needed_memory(error: BaseException) -> str | None:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs.
-
-    A thread that first uses torch inside the context keeps this number.
-    """
+    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -123,12 +119,6 @@ def seed_everything(seed: int) -> None:
 
 
 def derived_seed(seed: int, number: int, stream: int) -> int:
-    """Return a seed of its own for each of many series of random numbers, for `torch.Generator.manual_seed`.
-
-    Args:
-        seed: of the training.
-        number: of what they are for, such as a view among all that the training sees.
-        stream: number of the series.
-    """
+    """Return a seed, for `torch.Generator.manual_seed`, of its own for each number and series of a training."""
     digest = hashlib.blake2b(f"{seed} {number} {stream}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1  # manual_seed takes 63 bits

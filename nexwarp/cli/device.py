@@ -29,16 +29,7 @@ def pick_device(name: str | None) -> torch.device:
 def joined_ranks(name: str | None, gpus: int | None) -> Iterator[Ranks]:
     """Join the other ranks of a training, if torchrun has started this process as one of several.
 
-    Args:
-        name: of the device; None selects CUDA if available, else the CPU.
-        gpus: number of ranks that the command asks for; None is what there is.
-
-    Yields:
-        The ranks; this process alone where it is none of several.
-
-    Raises:
-        SettingError: there is no such device, or there are other ranks than the command asks for.
-        RankError: see `Ranks.join`.
+    `name` is that of `pick_device`; `gpus` is the number of ranks that the command asks for, None for what there is.
     """
     if not is_rank():
         if gpus is not None:

@@ -69,15 +69,7 @@ class TrainingDisplay:
     """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
 
     def __init__(self, console: Console, total: int, done: int, device: torch.device, name: str = "training") -> None:
-        """Prepare the display.
-
-        Args:
-            console: where to print.
-            total: iterations of the run.
-            done: iterations done before.
-            device: device of the training, whose memory is shown.
-            name: what the display calls the training.
-        """
+        """Prepare the display of `total` iterations, of which `done` were done before."""
         self.console = console
         self.total = total
         self.done = done
@@ -176,11 +168,7 @@ def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar for each stage, or one line per stage in a log file.
-
-    Yields:
-        A function to call with a stage's name, the number of items done and their total.
-    """
+    """Show a bar, or a line in a log file, for each stage; yield a function of its name, items done and total."""
     tasks: dict[str, TaskID] = {}
     with _bars(console, TimeElapsedColumn()) as progress:
 

@@ -102,18 +102,7 @@ def evaluate_run(
     metrics: Sequence[str] = ("psnr", "ssim"),
     ranks: Ranks | None = None,
 ) -> dict[str, Json]:
-    """Evaluate a model on test views and write metrics.json; return its entries.
-
-    Args:
-        model: the model, on the device to render on.
-        views: the test views.
-        run: run folder.
-        console: where to show the progress.
-        facts: the file's entries beside the metrics.
-        mask_mode: see `evaluate`.
-        metrics: see `evaluate`.
-        ranks: see `evaluate`; this is rank 0.
-    """
+    """Evaluate a model on test views and write metrics.json with `facts`; return its entries. See `evaluate`."""
     renders = run / RENDERS_FOLDER
     with display.counting(console, "evaluating", len(views)) as done:
         results = evaluate(

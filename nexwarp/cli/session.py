@@ -67,17 +67,7 @@ class Session:
         sinks: Collection[str] = (),
         every: int | None = None,
     ) -> None:
-        """Note what to do; nothing runs yet.
-
-        Args:
-            run: run folder.
-            record: settings of the run.
-            console: where to print.
-            ranks: the processes that train together.
-            resume: go on with the stage that was interrupted.
-            sinks: where the student logs beside the run's file: names of `nexwarp.run.log.PACKAGES`.
-            every: iterations between checkpoints; None is a tenth of each stage.
-        """
+        """Note what to do; the student also logs to `sinks`; `every` None saves ten checkpoints a stage."""
         self.run = run
         self.record = record
         self.console = console
@@ -90,11 +80,7 @@ class Session:
         self.begun = False
 
     def complete(self, stage: Stage) -> Model | None:
-        """Return the model of a teacher that is complete; None where it is not.
-
-        Raises:
-            RunError: the student has begun, and the teacher is missing or has other settings.
-        """
+        """Return the model of a teacher that is complete; None where it is not."""
         if not self.resume:
             return None
         seconds = self.ranks.share(self._seconds_of(stage) if self.ranks.first else None)
@@ -126,11 +112,6 @@ class Session:
         """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
 
         Of several ranks, all stop after the step in which the signal of one has reached them. Rank 0 writes.
-
-        Raises:
-            DivergedError: the training diverged twice; the last good model and a report are in the run.
-            StorageError: the disk is full; the current model is in the run if there was room for it.
-            Stopped: a signal ended the training; a checkpoint of its last step is in the run.
         """
         folder = self._folder(stage)
         if stage.teacher and self.ranks.first and not (self.resume and is_run(folder)):
@@ -175,11 +156,7 @@ class Session:
                 raise self._diverged(folder, trainer, error) from None
 
     def finish(self, stage: Stage, trainer: Trainer) -> Model:
-        """Finish, write and return the model of a trained stage; that of the run is also evaluated.
-
-        Raises:
-            StorageError, OutOfMemoryError: the last checkpoint holds the trained state; --resume finishes the run.
-        """
+        """Finish, write and return the model of a trained stage; that of the run is also evaluated."""
         complete = f"{stage.name} is complete and saved: --resume finishes the run"
         try:
             model = self._write(stage, trainer) if self.ranks.first else self._finish_with_others(stage, trainer)

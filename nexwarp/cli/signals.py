@@ -8,11 +8,7 @@ from types import FrameType
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal ends the program.
-
-    Attributes:
-        number: number of the signal.
-    """
+    """The signal of this number ends the program."""
 
     def __init__(self, number: int) -> None:
         super().__init__()

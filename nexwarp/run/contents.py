@@ -100,12 +100,7 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
 
 
 def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
-    """Delete the files of a run, and the folders that this leaves empty; return what is left, as `list_files` does.
-
-    Args:
-        run: run folder.
-        keep: names of files of ours to keep.
-    """
+    """Delete the files of a run but those to keep, and the folders that this leaves empty; return what is not ours."""
     own, foreign = list_files(run)
     # The files of a run folder itself go last: until then they tell which pictures are ours.
     runs = [run, *teacher_folders(run)]

@@ -18,23 +18,14 @@ Values = dict[str, float | None]  # of a view, by metric
 
 
 class Evaluation(TypedDict, total=False):
-    """The requested metrics of held-out views: their means over the views, and the values of each view.
+    """The requested metrics of held-out views; flip and lpips are None where their packages are not installed."""
 
-    Attributes:
-        psnr: mean PSNR [dB].
-        ssim: mean SSIM, at most 1.
-        flip: mean FLIP error in [0, 1], lower is better; None if its package is not installed.
-        lpips: mean LPIPS, lower is better; None if its package is not installed.
-        views: the metrics of each view, by view name.
-        convention: how the metrics are computed, as text.
-    """
-
-    psnr: float
-    ssim: float
-    flip: float | None
-    lpips: float | None
-    views: dict[str, Values]
-    convention: str
+    psnr: float  # means over the views, dB
+    ssim: float  # at most 1
+    flip: float | None  # 0 to 1, lower is better
+    lpips: float | None  # lower is better
+    views: dict[str, Values]  # by view name
+    convention: str  # how the metrics are computed
 
 
 @torch.no_grad()

@@ -58,19 +58,10 @@ def export_run(
     device: torch.device | str = "cpu",
     observe: Progress = lambda *_: None,
 ) -> Sequence[Path]:
-    """Export a run or a model to a folder; docs/outputs.md describes the files.
+    """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 
-    Args:
-        opened: the run or model.
-        order: what to write, and where.
-        device: where to render the mesh's depths, or what the texture of "web" and "glb" is baked from.
-        observe: progress of "mesh", see `nexwarp.export.mesh.extract_mesh`.
-
-    Returns:
-        The files that were written.
-
-    Raises:
-        ValueError, OSError: the message names the option or file.
+    `device` renders what a mesh or a baked texture is made of; `observe` is the progress of
+    `nexwarp.export.mesh.extract_mesh`.
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER

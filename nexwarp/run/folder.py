@@ -109,12 +109,7 @@ def _own_teachers(data: object) -> OwnTeachers:
 
 
 def read_run(run: Path) -> RunRecord:
-    """Read a run's config.
-
-    Raises:
-        FileNotFoundError: the folder is not a run.
-        ValueError: the config is damaged.
-    """
+    """Read a run's config; MissingError where there is none, FormatError where it is damaged."""
     path = run / CONFIG_FILE
     if not path.is_file():
         raise MissingError(f"{run}: expected a run folder, found no {CONFIG_FILE} there")
@@ -156,14 +151,8 @@ def read_metrics(run: Path) -> dict[str, Json]:
 def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> bool:
     """Check that a run folder may be created, resumed or overwritten; change nothing.
 
-    Returns:
-        Whether the folder holds a run to resume. False with `resume` too, if a process was killed before it wrote the
-        run's config: the training then starts from the beginning.
-
-    Raises:
-        ValueError: the folder exists and neither flag is given; both flags are given; the folder to overwrite is not a
-            run, or its config is damaged; or the folder contains the scene.
-        FileNotFoundError: the folder to resume is not a run.
+    Return whether the folder holds a run to resume. False with `resume` too, if a process was killed before it wrote
+    the run's config: the training then starts from the beginning.
     """
     if resume and overwrite:
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
@@ -206,15 +195,7 @@ def _check_replaceable(run: Path) -> None:
 def claimed_run(
     run: Path, source: SceneSource, *, resume: bool, overwrite: bool, warn: Callable[[str], None] = lambda _: None
 ) -> Iterator[bool]:
-    """Check and lock a run folder for a training; yields what `prepare_run` returns, whose errors it raises.
-
-    Args:
-        run: run folder.
-        source: the scene.
-        resume: whether to resume the run.
-        overwrite: whether to overwrite the run.
-        warn: see `locked_run`.
-    """
+    """Check a run folder as `prepare_run` does, and lock it for a training; yield whether there is a run to resume."""
     prepare_run(run, source, resume=resume, overwrite=overwrite)  # before a lock is written to a foreign folder
     with locked_run(run, warn):
         yield prepare_run(run, source, resume=resume, overwrite=overwrite)  # another process may have changed it
@@ -222,18 +203,11 @@ def claimed_run(
 
 @contextmanager
 def locked_run(run: Path, warn: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-    """Hold the lock of a run folder during the block; the death of the process releases it.
+    """Hold the lock of a run folder during the block; RunError where another process or thread holds it.
 
     A missing folder is created, and removed if it is empty at the end. The lock's file, `run.lock`, tells the holder
-    and is deleted at the end. A process that is killed leaves the file, but not the lock.
-
-    Args:
-        run: run folder.
-        warn: is told if the file system has no locks; the block then runs without.
-
-    Raises:
-        RunError: another process, or another thread of this one, holds the lock.
-        StorageError: the lock's file cannot be created.
+    and is deleted at the end. A process that is killed leaves the file, but not the lock. Where the file system has no
+    locks, `warn` is told, and the block runs without.
     """
     lock = FileLock(run / LOCK_FILE, timeout=0, fallback_to_soft=False, on_acquired=_write_holder)
     try:
@@ -287,13 +261,10 @@ def _holder(path: Path) -> str:
 
 
 def create_run(run: Path, record: RunRecord) -> list[str]:
-    """Create a run folder that holds only its config; delete the files of an old run (see `prepare_run`).
+    """Create a run folder that holds only its config; delete the files of an old run, and return the names of others.
 
     The new config is on the disk before anything is deleted, and replaces the old config last, when the disk has stored
     the deletions. An interruption at any point thus leaves a folder that is still a run.
-
-    Returns:
-        Names of the files and folders that nexwarp did not write; they stay.
     """
     with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(record.as_dict(), indent=2) + "\n").encode())
@@ -335,10 +306,7 @@ def check_teachers_place(run: Path, count: int) -> None:
 def keep_camera_path(folder: Path, content: bytes, opened: Path | None = None) -> str:
     """Write a camera path (JSON) into a folder under the next free name; return the command that renders it.
 
-    Args:
-        folder: run folder, or the folder of a model's results; created if it does not exist.
-        content: the path.
-        opened: the run or model that the command renders; None is `folder`.
+    `opened` is the run or model that the command names; None is the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     number = 1

@@ -49,11 +49,7 @@ class TrainingLog:
     ) -> None:
         """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
 
-        Args:
-            run: an existing folder.
-            trainer: the trainer to observe.
-            sinks: where else to log, names of `PACKAGES`.
-            settings: of the run, for Weights & Biases; None takes the trainer's.
+        `sinks` names `PACKAGES` that log, too; Weights & Biases gets `settings`, by default those of the trainer.
         """
         self.path = run / LOG_FILE
         self.trainer = trainer

@@ -91,12 +91,7 @@ def near_depth(model: Model) -> float:
 
 
 def open_model(path: Path) -> OpenedModel:
-    """Open a run folder, a folder with a model, or a model's file; the model itself is read on first use.
-
-    Raises:
-        FileNotFoundError: there is neither a run nor a model.
-        ValueError: the run's config is damaged.
-    """
+    """Open a run folder, a folder with a model, or a model's file; the model itself is read on first use."""
     folder, file = path, path / MODEL_FILE
     if path.is_file() and path.suffix == SUFFIX:
         folder, file = (path.parent if path.name == MODEL_FILE else path.with_suffix("")), path

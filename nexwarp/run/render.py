@@ -36,19 +36,12 @@ LARGEST_SIDE = 16384  # pixels
 
 @dataclass(frozen=True)
 class PictureJob:
-    """One image to render.
+    """One image to render."""
 
-    Attributes:
-        file: PNG file to write.
-        camera: a pinhole camera at the pose, and of the size, of the image.
-        is_frame: whether the image is a frame of the camera path.
-        buffers: whether to write its buffers, too.
-    """
-
-    file: Path
-    camera: Camera
-    is_frame: bool = False
-    buffers: bool = False
+    file: Path  # PNG
+    camera: Camera  # a pinhole at the pose, and of the size, of the image
+    is_frame: bool = False  # of the camera path
+    buffers: bool = False  # also write them
 
 
 @dataclass(frozen=True)
@@ -136,11 +129,7 @@ class RenderOrder:
     def prepare(self, opened: OpenedModel) -> "RenderJob":
         """Choose the cameras and the files; write nothing.
 
-        Args:
-            opened: the run or model; one without cameras has no still views, and its paths lead around its surfels.
-
-        Raises:
-            ValueError, FileNotFoundError: the message names the option or file.
+        A model without cameras has no still views, and its paths lead around its surfels.
         """
         self.check()
         size = self._size()
@@ -220,13 +209,7 @@ class RenderOrder:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Images to render, and the video of their frames.
-
-    Attributes:
-        pictures: the images, in the order of rendering.
-        order: the options.
-        fps: frames per second.
-    """
+    """Images to render, in their order, and the video of their frames."""
 
     pictures: list[PictureJob]
     order: RenderOrder
@@ -242,12 +225,7 @@ class RenderJob:
 
     @torch.no_grad()
     def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
-        """Render and write all images and the video. An incomplete video is deleted.
-
-        Args:
-            model: the model, on the device to render on.
-            done: called after each image.
-        """
+        """Render and write all images and the video, and call `done` after each. An incomplete video is deleted."""
         frames = [picture for picture in self.pictures if picture.is_frame]
         changes: RenderChanges = {}
         if self.order.exposure is not None:
