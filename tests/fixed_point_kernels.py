@@ -12,5 +12,4 @@ def add_in_order(
     sums: wp.array2d(dtype=wp.int64),
     bad: wp.array(dtype=wp.int32),
 ):
-    put = wp.static(fixed_point_add(wp.float32))
-    put(sums, 0, terms[order[wp.tid()]], bad)
+    fixed_point_add(sums, 0, terms[order[wp.tid()]], bad)

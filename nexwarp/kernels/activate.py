@@ -8,102 +8,85 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.types import types
+from nexwarp.kernels.types import Real, Vec2, Vec4, types
 
 # Quaternions shorter than this are divided by it: torch.nn.functional.normalize's.
-SHORTEST = 1e-12
+SHORTEST = wp.constant(wp.float64(1e-12))
+
+
+@wp.func
+def unit(quat: Vec4):
+    """Quaternion over its length."""
+    return quat / wp.max(wp.length(quat), quat.dtype(SHORTEST))
+
+
+@wp.func
+def exponentials(x: Vec2):
+    """Exponential of each component."""
+    return wp.vector(wp.exp(x[0]), wp.exp(x[1]))
+
+
+@wp.func
+def sigmoid(x: Real):
+    """1 / (1 + exp(-x))."""
+    # The exponential must not overflow: the adjoint of 1 / (1 + exp(-x)) would be 0 * inf there.
+    one = type(x)(1.0)
+    e = wp.exp(-wp.abs(x))
+    return wp.where(x < type(x)(0.0), e, one) / (one + e)
+
+
+@wp.func
+def activated_dot(
+    quat: Vec4,
+    scale: Vec2,
+    opacity: Real,
+    gamma: Vec2,
+    grad_quat: Vec4,
+    grad_scale: Vec2,
+    grad_opacity: Real,
+    grad_gamma: Vec2,
+):
+    """Sum of outputs * gradients (a constant is left out): its gradient is the vector-Jacobian product."""
+    return (
+        wp.dot(unit(quat), grad_quat)
+        + wp.exp(scale[0]) * grad_scale[0]
+        + wp.exp(scale[1]) * grad_scale[1]
+        + sigmoid(opacity) * grad_opacity
+        + wp.exp(gamma[0]) * grad_gamma[0]
+        + wp.exp(gamma[1]) * grad_gamma[1]
+    )
 
 
 @functools.cache
 def activate_kernels(real: type) -> SimpleNamespace:
     """Make the kernels of quaternion / length, exp, sigmoid and 1 + exp."""
     t = types(real)
-    vec2, vec4 = t.vec2, t.vec4
-    ZERO, ONE, EPS = t.ZERO, t.ONE, wp.constant(real(SHORTEST))
-
-    @wp.func
-    def unit(quat: vec4):
-        return quat / wp.max(wp.length(quat), EPS)
-
-    @wp.func
-    def sigmoid(x: real):
-        # The exponential must not overflow: the adjoint of 1 / (1 + exp(-x)) would be 0 * inf there.
-        e = wp.exp(-wp.abs(x))
-        return wp.where(x < ZERO, e, ONE) / (ONE + e)
-
-    @wp.func
-    def activated_dot(
-        quat: vec4,
-        log_scale: vec2,
-        logit: real,
-        raw_gamma: vec2,
-        grad_quat: vec4,
-        grad_scale: vec2,
-        grad_opacity: real,
-        grad_gamma: vec2,
-    ):
-        """Sum of outputs * gradients (a constant is left out): its gradient is the vector-Jacobian product."""
-        return (
-            wp.dot(unit(quat), grad_quat)
-            + wp.exp(log_scale[0]) * grad_scale[0]
-            + wp.exp(log_scale[1]) * grad_scale[1]
-            + sigmoid(logit) * grad_opacity
-            + wp.exp(raw_gamma[0]) * grad_gamma[0]
-            + wp.exp(raw_gamma[1]) * grad_gamma[1]
-        )
+    vec2, ONE, Parameters = t.vec2, t.ONE, t.Parameters
 
     @wp.kernel(enable_backward=False, module="unique")
-    def activate(
-        first: wp.int32,
-        raw_quats: wp.array(dtype=vec4),
-        log_scales: wp.array(dtype=vec2),
-        logit_opacities: wp.array(dtype=real),
-        raw_gammas: wp.array(dtype=vec2),
-        # outputs
-        quats: wp.array(dtype=vec4),
-        scales: wp.array(dtype=vec2),
-        opacities: wp.array(dtype=real),
-        gammas: wp.array(dtype=vec2),
-    ):
+    def activate(first: wp.int32, raw: Parameters, activated: Parameters):
         i = first + wp.tid()
-        log_scale = log_scales[i]
-        raw_gamma = raw_gammas[i]
-        quats[i] = unit(raw_quats[i])
-        scales[i] = vec2(wp.exp(log_scale[0]), wp.exp(log_scale[1]))
-        opacities[i] = sigmoid(logit_opacities[i])
-        gammas[i] = vec2(ONE + wp.exp(raw_gamma[0]), ONE + wp.exp(raw_gamma[1]))
+        activated.quats[i] = unit(raw.quats[i])
+        activated.scales[i] = exponentials(raw.scales[i])
+        activated.opacities[i] = sigmoid(raw.opacities[i])
+        activated.gammas[i] = vec2(ONE, ONE) + exponentials(raw.gammas[i])
 
     @wp.kernel(enable_backward=False, module="unique")
-    def activate_backward(
-        first: wp.int32,
-        raw_quats: wp.array(dtype=vec4),
-        log_scales: wp.array(dtype=vec2),
-        logit_opacities: wp.array(dtype=real),
-        raw_gammas: wp.array(dtype=vec2),
-        grad_quats: wp.array(dtype=vec4),
-        grad_scales: wp.array(dtype=vec2),
-        grad_opacities: wp.array(dtype=real),
-        grad_gammas: wp.array(dtype=vec2),
-        # outputs
-        grad_raw_quats: wp.array(dtype=vec4),
-        grad_log_scales: wp.array(dtype=vec2),
-        grad_logit_opacities: wp.array(dtype=real),
-        grad_raw_gammas: wp.array(dtype=vec2),
-    ):
+    def activate_backward(first: wp.int32, raw: Parameters, grads: Parameters, grad_raw: Parameters):
         i = first + wp.tid()
-        quat, log_scale, logit, raw_gamma, _q, _s, _o, _g = wp.grad(activated_dot)(
-            raw_quats[i],
-            log_scales[i],
-            logit_opacities[i],
-            raw_gammas[i],
-            grad_quats[i],
-            grad_scales[i],
-            grad_opacities[i],
-            grad_gammas[i],
+        quat, scale, opacity, gamma, _q, _s, _o, _g = wp.grad(activated_dot)(
+            raw.quats[i],
+            raw.scales[i],
+            raw.opacities[i],
+            raw.gammas[i],
+            grads.quats[i],
+            grads.scales[i],
+            grads.opacities[i],
+            grads.gammas[i],
         )
-        grad_raw_quats[i] = quat
-        grad_log_scales[i] = log_scale
-        grad_logit_opacities[i] = logit
-        grad_raw_gammas[i] = raw_gamma
+        grad_raw.quats[i] = quat
+        grad_raw.scales[i] = scale
+        grad_raw.opacities[i] = opacity
+        grad_raw.gammas[i] = gamma
 
     return SimpleNamespace(forward=activate, backward=activate_backward)

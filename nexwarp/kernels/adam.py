@@ -127,7 +127,6 @@ def rest_of_power(log_beta: wp.float32, count: wp.float32) -> wp.float32:
 @functools.cache
 def adam_kernel() -> wp.Kernel:
     """Make the kernel; parameters and moments are flat float32, on CUDA from addresses that are multiples of 16."""
-    add_up = warp_sum(wp.float32)
 
     @wp.func_native(_STEP)
     def update(
@@ -192,7 +191,7 @@ def adam_kernel() -> wp.Kernel:
             epsilon,
         )
         if losses.shape[0] > 0:
-            loss = add_up(loss)
+            loss = warp_sum(loss)
             if lane_index() == 0:
                 losses[thread // warp_size()] = loss
 

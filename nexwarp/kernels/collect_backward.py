@@ -71,6 +71,74 @@ def gradient_types(real: type, fixed_point: bool = False) -> SimpleNamespace:
 
 
 @functools.cache
+def add_function(real: type, fixed_point: bool, by_place: bool) -> wp.Function:
+    """Make the function that adds the sum over a warp of records' gradients to the slot of place k, or of surfel i."""
+    t = types(real)
+    vec4, Sums = t.vec4, gradient_types(real, fixed_point).Sums
+
+    @wp.func
+    def add(sums: Sums, i: wp.int32, k: wp.int32, a: vec4, b: vec4, n: vec4, c: vec4):
+        slot = int(i)
+        if wp.static(by_place):
+            slot = sums.slots[k]
+        if wp.static(fixed_point):
+            fixed_point_record_sum(sums.records, slot, a, b, n, c, sums.bad)
+        else:
+            warp_record_sum(sums.records, slot, a, b, n, c)
+        return slot
+
+    return add
+
+
+@functools.cache
+def add_error_function(real: type, fixed_point: bool) -> wp.Function:
+    """Make the function that adds the sum of errors over a warp to a slot."""
+    Sums = gradient_types(real, fixed_point).Sums
+
+    @wp.func
+    def add_error(sums: Sums, slot: wp.int32, error: real):
+        total = warp_sum(error)
+        if lane_index() == 0:
+            if wp.static(fixed_point):
+                fixed_point_add(sums.errors, slot, total, sums.bad)
+            else:
+                wp.atomic_add(sums.errors, slot, total)
+
+    return add_error
+
+
+@functools.cache
+def reduce_slots_kernel(dtype: type) -> wp.Kernel:
+    """Make the kernel of the second half of a backward pass on a CPU: the sums of each surfel's gradient slots.
+
+    A thread is a surfel. Read: `slots` (M, columns), one for each (tile, surfel) entry in the order of emission, in
+    which the entries of the surfel order[rank] lie together and end at ends[rank]. Added to: `sums` (N, columns), in a
+    fixed order. A CPU has no atomics, and a slot has one owner, so this gives the same bits whatever the number of
+    threads.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def reduce_slots(
+        first: wp.int32,
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        slots: wp.array2d(dtype=dtype),
+        columns: wp.int32,
+        # outputs
+        sums: wp.array2d(dtype=dtype),
+    ):
+        rank = first + wp.tid()
+        start = int(0)
+        if rank > 0:
+            start = ends[rank - 1]
+        for c in range(columns):
+            for e in range(start, ends[rank]):
+                sums[order[rank], c] += slots[e, c]
+
+    return reduce_slots
+
+
+@functools.cache
 def collect_backward_kernel(
     real: type, max_hits: int, with_errors: bool = False, fixed_point: bool = False, by_place: bool = False
 ) -> wp.Kernel:
@@ -87,8 +155,7 @@ def collect_backward_kernel(
     vec4 = t.vec4
     g = gradient_types(real, fixed_point)
     buffer = hit_buffer(real, max_hits)
-    add_up, add_record = warp_sum(real), warp_record_sum(real)
-    put_record, put = fixed_point_record_sum(real), fixed_point_add(real)
+    add, add_error = add_function(real, fixed_point, by_place), add_error_function(real, fixed_point)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -167,22 +234,10 @@ def collect_backward_kernel(
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
                         grad = hit_gradients(a, b, n, c[3], d, grad_alpha, grad_depth)
                     transmittance = transmittance * (ONE - alpha)
-                    share = weight * error
                     row_a, row_b, row_n = record_gradients(grad, d)
                     row_c = vec4(grad_color[0] * weight, grad_color[1] * weight, grad_color[2] * weight, grad[3])
-                    target = int(i)
-                    if wp.static(by_place):
-                        target = sums.slots[k]
-                    if wp.static(fixed_point):
-                        put_record(sums.records, target, row_a, row_b, row_n, row_c, sums.bad)
-                    else:
-                        add_record(sums.records, target, row_a, row_b, row_n, row_c)
+                    target = add(sums, i, k, row_a, row_b, row_n, row_c)
                     if wp.static(with_errors):
-                        share = add_up(share)
-                        if lane == 0:
-                            if wp.static(fixed_point):
-                                put(sums.errors, target, share, sums.bad)
-                            else:
-                                wp.atomic_add(sums.errors, target, share)
+                        add_error(sums, target, weight * error)
 
     return collect_backward

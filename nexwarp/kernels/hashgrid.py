@@ -152,7 +152,6 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
     scatter = scatter_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
     merge_cells, add_row = scatter.merge_cells, scatter.add_row
     table_of_sums = wp.array2d(dtype=wp.int64) if fixed_point else wp.array2d(dtype=vec)
-    add_units = fixed_point_units(real)
 
     @wp.func
     def cell(x: vec3):
@@ -238,7 +237,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
                 if wp.static(fixed_point):
                     first_sum = int(hash_slot(corner, j, mask)) * wp.static(features)
                     for k in range(wp.static(features)):
-                        add_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
+                        fixed_point_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
                 else:
                     part = vec()
                     for k in range(wp.static(features)):

@@ -8,14 +8,13 @@ with u and v in units of the surfel's scales. The compositing passes call `alpha
 Another shape with the same parameters, opacity and two exponents, changes these files:
 
     kernels/shape.py                    the functions below
-    ops/rays.py                         `reaches_of`, the reach for cameras of any rays, in torch
     tests/reference/collect.py          the float64 reference that proves the functions
     export/web/shaders/                 the same in WGSL: project.wgsl the reach, collect.wgsl alpha
     export/web/page/baked_shaders.js    the same in GLSL, for baked pages; export/bake/glb.py draws it as opacities
     docs/format.md                      the same in NumPy
 
 Another number of parameters also changes the record (kernels/surfel.py, kernels/project.py), activation and
-antialiasing (kernels/activate.py, kernels/antialias.py), `Surfels` and model files (model/), and what export/ writes
+antialiasing (kernels/activate.py, kernels/detail.py), `Surfels` and model files (model/), and what export/ writes
 of them.
 """
 

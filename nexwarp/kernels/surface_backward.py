@@ -17,12 +17,11 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.collect_backward import gradient_types
+from nexwarp.kernels.collect_backward import add_function, gradient_types
 from nexwarp.kernels.shape import alpha_at, far_outside
 from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
 from nexwarp.kernels.walk import PIXELS, block_of, candidate, overflowed, pixel_of, walk
-from nexwarp.native.fixed_point import fixed_point_record_sum
 from nexwarp.native.vector_loads import load_record
 from nexwarp.native.warp import (
     any_in_warp,
@@ -31,18 +30,17 @@ from nexwarp.native.warp import (
     lane_index,
     lowest_lane,
     warp_max,
-    warp_record_sum,
     warp_size,
 )
 
 
 @functools.cache
-def surface_backward_kernel(real: type, fixed_point: bool = False) -> wp.Kernel:
-    """Make the kernel; for `fixed_point` see `collect_backward.gradient_types`."""
+def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: bool = False) -> wp.Kernel:
+    """Make the kernel; for `fixed_point` and `by_place` see `collect_backward_kernel`."""
     t = types(real)
     vec3, vec4 = t.vec3, t.vec4
     g = gradient_types(real, fixed_point)
-    add_record, put_record = warp_record_sum(real), fixed_point_record_sum(real)
+    add = add_function(real, fixed_point, by_place)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -120,12 +118,6 @@ def surface_backward_kernel(real: type, fixed_point: bool = False) -> wp.Kernel:
                     row_a, row_b, row_n = record_gradients(grad, d)
                     row_n += vec4(grad_normal[0], grad_normal[1], grad_normal[2], ZERO)
                     row_c = vec4(ZERO, ZERO, ZERO, grad[3])
-                    target = int(i)
-                    if k < sums.slots.shape[0]:
-                        target = sums.slots[k]
-                    if wp.static(fixed_point):
-                        put_record(sums.records, target, row_a, row_b, row_n, row_c, sums.bad)
-                    else:
-                        add_record(sums.records, target, row_a, row_b, row_n, row_c)
+                    add(sums, i, k, row_a, row_b, row_n, row_c)
 
     return surface_backward

@@ -86,6 +86,15 @@ def types(real: type) -> SimpleNamespace:
         picks: wp.array(dtype=wp.vec2i)
 
     @wp.struct
+    class Parameters:
+        """Parameters of surfels, raw or activated, or their gradients; arrays that a kernel does not use are null."""
+
+        quats: wp.array(dtype=vec4)
+        scales: wp.array(dtype=vec2)
+        opacities: wp.array(dtype=real)
+        gammas: wp.array(dtype=vec2)
+
+    @wp.struct
     class Polygons:
         """Tile polygons of surfels, see `tiles`."""
 
@@ -106,6 +115,7 @@ def types(real: type) -> SimpleNamespace:
         Hits=Hits,
         Surface=Surface,
         Polygons=Polygons,
+        Parameters=Parameters,
         ALPHA_MIN=wp.constant(real(ALPHA_MIN)),
         ALPHA_MAX=wp.constant(real(ALPHA_MAX)),
         TRANSMITTANCE_MIN=wp.constant(real(TRANSMITTANCE_MIN)),

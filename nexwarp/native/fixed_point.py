@@ -5,11 +5,10 @@ A float is a pair of 64-bit integers, its multiples of 2^-20 and what is left in
 sums NaN. A hash grid would take too much memory so: its terms share one scale, see `hashgrid`.
 """
 
-import functools
-
 import warp as wp
 
-from nexwarp.native.warp import EXCHANGES, GATHER_RECORD
+from nexwarp.native import for_both_reals, snippet
+from nexwarp.native.warp import record_sum_snippet
 
 HIGH, LOW = 2.0**20, 2.0**60
 
@@ -18,18 +17,19 @@ LARGEST = 2.0**23
 # One term that is scaled already may have at most this many units.
 MOST_UNITS = 2.0**52
 
-_ADD = """
-#if defined(__CUDA_ARCH__)
+_CUDA_ADD = """
     auto add = [](wp::int64* sum, long long term) {
         atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(term));
     };
     auto raise = [&]() { atomicOr(&wp::index(bad, 0), 1); };
-#else
+"""
+_CPU_ADD = """
     auto add = [](wp::int64* sum, long long term) { *sum += term; };
     auto raise = [&]() { wp::index(bad, 0) = 1; };
-#endif
-    auto nearest = [](double x) { return static_cast<long long>(x + (x < 0.0 ? -0.5 : 0.5)); };
 """
+_ADD = (
+    snippet(_CUDA_ADD, _CPU_ADD) + "auto nearest = [](double x) { return (long long)(x + (x < 0.0 ? -0.5 : 0.5)); };\n"
+)
 
 _PUT = (
     _ADD
@@ -46,26 +46,6 @@ _PUT = (
 """
 )
 
-_RECORD = f"""
-    {GATHER_RECORD}
-    {_PUT}
-    wp::int64* target = &wp::index(records, slot, 0);
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31;
-    EXCHANGES
-    v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
-    if (!(lane & 1)) put(target + 2 * (lane >> 1), v[0]);
-#else
-    for (int k = 0; k < 16; ++k) put(target + 2 * k, v[k]);
-#endif
-"""
-
-_VECTOR = f"""
-    {_PUT}
-    wp::int64* target = &wp::index(sums, slot, 0);
-    for (int k = 0; k < LENGTH; ++k) put(target + 2 * k, VALUE);
-"""
-
 _UNITS = f"""
     {_ADD}
     const double units = double(value) * scale;
@@ -78,13 +58,13 @@ _UNITS = f"""
 """
 
 
-@functools.cache
+@for_both_reals
 def fixed_point_record_sum(real: type) -> wp.Function:
-    """Make a function that adds the sum over all lanes of four vec4 to the 16 pairs of records[slot]."""
+    """Add the sum over all lanes of four vec4 to the 16 pairs of records[slot]."""
     vec4 = wp.types.vector(length=4, dtype=real)
-    name = "float" if real is wp.float32 else "double"
+    target = _PUT + "wp::int64* target = &wp::index(records, slot, 0);\n"
 
-    @wp.func_native(_RECORD.replace("EXCHANGES", EXCHANGES).replace("REAL", name))
+    @wp.func_native(record_sum_snippet(real, target, "put(target + 2 * k, value);"))
     def add_record(
         records: wp.array2d(dtype=wp.int64),
         slot: wp.int32,
@@ -98,21 +78,19 @@ def fixed_point_record_sum(real: type) -> wp.Function:
     return add_record
 
 
-@functools.cache
-def fixed_point_add(dtype: type) -> wp.Function:
-    """Make a function that adds a scalar or a vector to the pairs of sums[slot]."""
-    length = 0 if dtype in (wp.float32, wp.float64) else dtype._length_
-    text = _VECTOR.replace("LENGTH", str(max(length, 1))).replace("VALUE", "x.c[k]" if length else "x")
+@for_both_reals
+def fixed_point_add(real: type) -> wp.Function:
+    """Add a scalar to the pair sums[slot]."""
 
-    @wp.func_native(text)
-    def add_value(sums: wp.array2d(dtype=wp.int64), slot: wp.int32, x: dtype, bad: wp.array(dtype=wp.int32)): ...
+    @wp.func_native(_PUT + "put(&wp::index(sums, slot, 0), x);")
+    def add_value(sums: wp.array2d(dtype=wp.int64), slot: wp.int32, x: real, bad: wp.array(dtype=wp.int32)): ...
 
     return add_value
 
 
-@functools.cache
+@for_both_reals
 def fixed_point_units(real: type) -> wp.Function:
-    """Make a function that adds a scalar times a scale, rounded, to sums[row, column]."""
+    """Add a scalar times a scale, rounded, to sums[row, column]."""
 
     @wp.func_native(_UNITS)
     def add_units(

@@ -5,25 +5,21 @@ Accurate to 2 units in the last place, as Warp's `fast_math` makes of base e. Th
 
 import warp as wp
 
-from nexwarp.native import for_both_reals
+from nexwarp.native import for_both_reals, snippet
 
 _FAST = """
-#if defined(__CUDA_ARCH__)
     float result;
     asm("INSTRUCTION.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(v));
     return result;
-#else
-    return ::FUNCTION(v);
-#endif
 """
 
 
 @for_both_reals
 def power_of_2(real: type) -> wp.Function:
     """Return 2 to the power of v."""
-    fast = _FAST.replace("INSTRUCTION", "ex2").replace("FUNCTION", "exp2f")
+    fast = snippet(_FAST.replace("INSTRUCTION", "ex2"), "return ::exp2f(v);")
 
-    @wp.func_native(fast if real is wp.float32 else "    return ::exp2(v);")
+    @wp.func_native(fast if real is wp.float32 else "return ::exp2(v);")
     def power_of_2(v: real) -> real: ...
 
     return power_of_2
@@ -32,9 +28,9 @@ def power_of_2(real: type) -> wp.Function:
 @for_both_reals
 def binary_logarithm(real: type) -> wp.Function:
     """Return the logarithm of v to base 2."""
-    fast = _FAST.replace("INSTRUCTION", "lg2").replace("FUNCTION", "log2f")
+    fast = snippet(_FAST.replace("INSTRUCTION", "lg2"), "return ::log2f(v);")
 
-    @wp.func_native(fast if real is wp.float32 else "    return ::log2(v);")
+    @wp.func_native(fast if real is wp.float32 else "return ::log2(v);")
     def binary_logarithm(v: real) -> real: ...
 
     return binary_logarithm

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from nexwarp.native import for_both_reals
+from nexwarp.native import for_both_reals, snippet
 from nexwarp.native.vector_loads import load_record
 
 # Of a CUDA block whose warps stage records.
@@ -18,7 +18,6 @@ BLOCK_DIM = 128
 # One function writes and reads, since a shared array belongs to the function that declares it: step 0 writes, step
 # j + 1 reads row j. Rows of neighbouring slots are neighbours, so that writes meet no bank twice.
 _ROW = """
-#if defined(__CUDA_ARCH__)
     struct __align__(16) Row { REAL x, y, z, w; };
     __shared__ Row rows[4 * BLOCK_DIM];
     Row* mine = rows + (threadIdx.x >> 5) * 128 + slot;
@@ -31,21 +30,15 @@ _ROW = """
     }
     const Row row = mine[32 * (step - 1)];
     return wp::vec_t<4, REAL>(row.x, row.y, row.z, row.w);
-#else
-    return step == 0 ? a : records.data[4 * (size_t)i + step - 1];
-#endif
 """
+_ROW_ITSELF = "return step == 0 ? a : records.data[4 * (size_t)i + step - 1];"
 
-_NAME = """
-#if defined(__CUDA_ARCH__)
-    __shared__ int2 names[BLOCK_DIM];
+_NAME = f"""
+    __shared__ int2 names[{BLOCK_DIM}];
     int2* mine = names + (threadIdx.x >> 5) * 32 + slot;
     if (step == 0) *mine = make_int2(i, place);
     const int2 name = *mine;
     return wp::vec_t<2, int>(name.x, name.y);
-#else
-    return wp::vec_t<2, int>(i, place);
-#endif
 """
 
 
@@ -54,7 +47,7 @@ def _access(real: type) -> wp.Function:
     vec4 = wp.types.vector(length=4, dtype=real)
     kind = "float" if real is wp.float32 else "double"
 
-    @wp.func_native(_ROW.replace("REAL", kind).replace("BLOCK_DIM", str(BLOCK_DIM)))
+    @wp.func_native(snippet(_ROW.replace("REAL", kind).replace("BLOCK_DIM", str(BLOCK_DIM)), _ROW_ITSELF))
     def access_row(
         step: wp.int32,
         slot: wp.int32,
@@ -69,7 +62,7 @@ def _access(real: type) -> wp.Function:
     return access_row
 
 
-@wp.func_native(_NAME.replace("BLOCK_DIM", str(BLOCK_DIM)))
+@wp.func_native(snippet(_NAME, "return wp::vec_t<2, int>(i, place);"))
 def _access_name(step: wp.int32, slot: wp.int32, i: wp.int32, place: wp.int32) -> wp.vec2i: ...
 
 

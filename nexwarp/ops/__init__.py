@@ -1,12 +1,11 @@
 """What a tensor means and how it differentiates: one torch op a stage, the only torch <-> Warp boundary."""
 
 from nexwarp.ops.activate import activate
-from nexwarp.ops.antialias import antialias
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
+from nexwarp.ops.detail import antialias, limit_depths
 from nexwarp.ops.expose import expose
 from nexwarp.ops.graphs import captured
-from nexwarp.ops.limit_depths import limit_depths
 from nexwarp.ops.memory import check_image
 from nexwarp.ops.neural_field import Field, Points, Rays
 from nexwarp.ops.project import Pinhole, Projection, project

@@ -1,14 +1,12 @@
 """Activation of the surfels' raw parameters."""
 
-from collections.abc import Iterable
-
 import torch
 from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, launch, real_of, struct
 
 
 def activate(
@@ -42,26 +40,36 @@ def activate(
     return _Activate.apply(*(x.contiguous() for x in (raw_quats, log_scales, logit_opacities, raw_gammas)))
 
 
-def _arrays(real: type, tensors: Iterable[torch.Tensor]) -> list[Argument]:
+def parameters(
+    quats: torch.Tensor | None, scales: torch.Tensor, opacities: torch.Tensor, gammas: torch.Tensor
+) -> Argument:
+    """The struct `Parameters` of the kernels."""
+    real = real_of(scales)
     t = types(real)
-    return [array(x, dtype) for x, dtype in zip(tensors, (t.vec4, t.vec2, real, t.vec2), strict=True)]
+    return struct(
+        t.Parameters,
+        quats=array(quats, t.vec4),
+        scales=array(scales.contiguous(), t.vec2),
+        opacities=array(opacities.contiguous(), real),
+        gammas=array(gammas.contiguous(), t.vec2),
+    )
 
 
 class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, *raw: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        real = real_of(raw[0])
         activated = tuple(torch.empty_like(x) for x in raw)
-        launch(raw[0], activate_kernels(real).forward, len(raw[0]), _arrays(real, raw), _arrays(real, activated))
+        kernel = activate_kernels(real_of(raw[0])).forward
+        launch(raw[0], kernel, len(raw[0]), [parameters(*raw)], [parameters(*activated)])
         ctx.save_for_backward(*raw)
         return activated
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, grad_quats: torch.Tensor, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         raw = ctx.saved_tensors
-        real = real_of(raw[0])
         grad_raw = [torch.empty_like(x) for x in raw]
-        inputs = [*_arrays(real, raw), *_arrays(real, (x.contiguous() for x in grads))]
-        launch(raw[0], activate_kernels(real).backward, len(raw[0]), inputs, _arrays(real, grad_raw))
+        inputs = [parameters(*raw), parameters(grad_quats.contiguous(), *grads)]
+        kernel = activate_kernels(real_of(raw[0])).backward
+        launch(raw[0], kernel, len(raw[0]), inputs, [parameters(*grad_raw)])
         return tuple(x if need else None for x, need in zip(grad_raw, ctx.needs_input_grad, strict=True))

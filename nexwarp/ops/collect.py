@@ -9,8 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
-from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types
-from nexwarp.kernels.reduce import reduce_slots_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types, reduce_slots_kernel
 from nexwarp.kernels.types import MAX_HITS, TILE_SIZE, TileLists, types
 from nexwarp.native.staging import BLOCK_DIM
 from nexwarp.ops._interop import (

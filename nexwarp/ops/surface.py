@@ -96,7 +96,7 @@ class _Surface(torch.autograd.Function):
         outputs = surface_argument(scene.real, (expected, None, None, normals), totals, picks)
         incoming = surface_argument(scene.real, tuple(x.contiguous() for x in grads))
         arguments = [array(stops.view(-1), wp.int32), outputs, incoming, sums.argument()]
-        scene.launch(surface_backward_kernel(scene.real, sums.fixed_point), arguments)
+        scene.launch(surface_backward_kernel(scene.real, sums.fixed_point, scene.tiles.exact), arguments)
         return sums.totals()[0], None, None
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nexwarp import ops
-from nexwarp.kernels.antialias import FILTER
+from nexwarp.kernels.detail import FILTER
 from nexwarp.model.detail_limits import NEVER
 from tests.tolerances import assert_close, assert_finite
 

@@ -1,5 +1,5 @@
 // Projection: a thread is a surfel. Antialiasing, record, tile polygon, plain colour and sorting key
-// (nexwarp/kernels/antialias.py, project.py, tiles.py and sh.py).
+// (nexwarp/kernels/detail.py, project.py, tiles.py and sh.py).
 //
 // A tile polygon is four rows: corners 0 and 1; 2 and 3; corner 4, margin; number of corners, first tile row, and one
 // behind the last.

@@ -1,0 +1,113 @@
+"""Limits of detail: surfels and depths of texture look-ups for cameras that are not where training views were."""
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from nexwarp.errors import check_tensors
+from nexwarp.kernels.detail import antialias_kernels, limit_depths_kernel
+from nexwarp.ops._interop import Context, array, launch, real_of
+from nexwarp.ops.activate import parameters
+
+
+def antialias(
+    depths: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    gammas: torch.Tensor,
+    farthest: torch.Tensor,
+    focal: float | torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Blur surfels where a pixel covers more of them than it did in training.
+
+    Differentiable with respect to all arguments but `farthest` and `focal`.
+
+    Args:
+        depths: (N,) z-depths of the centres, world units.
+        scales: (N, 2) world units.
+        opacities: (N,).
+        gammas: (N, 2).
+        farthest: (N,) largest depth / focal at which a training view saw the surfel, world units.
+        focal: of the camera, pixels; a number, or a tensor (1,) on the device.
+
+    Returns:
+        (N, 2) scales, (N,) opacities and (N, 2) gammas; those given where depth / focal is no larger than in training.
+
+    Raises:
+        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    """
+    check_tensors(
+        {
+            "depths": (depths, ("N",)),
+            "scales": (scales, ("N", 2)),
+            "opacities": (opacities, ("N",)),
+            "gammas": (gammas, ("N", 2)),
+            "farthest": (farthest, ("N",)),
+        }
+    )
+    tensors = (x.contiguous() for x in (depths, scales, opacities, gammas))
+    focal = focal.to(farthest) if isinstance(focal, torch.Tensor) else farthest.new_full((1,), float(focal))
+    return _Antialias.apply(farthest.contiguous(), focal, *tensors)
+
+
+class _Antialias(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Context, farthest: torch.Tensor, focal: torch.Tensor, depths: torch.Tensor, *shape: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        real = real_of(farthest)
+        blurred = tuple(torch.empty_like(x) for x in shape)
+        inputs = [array(depths, real), parameters(None, *shape), array(farthest, real), array(focal, real)]
+        launch(farthest, antialias_kernels(real).forward, len(farthest), inputs, [parameters(None, *blurred)])
+        ctx.save_for_backward(farthest, focal, depths, *shape)
+        return blurred
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        farthest, focal, depths, *shape = ctx.saved_tensors
+        real = real_of(farthest)
+        grad_depths, *grad_shape = (torch.empty_like(x) for x in (depths, *shape))
+        inputs = [array(depths, real), parameters(None, *shape), array(farthest, real), array(focal, real)]
+        outputs = [array(grad_depths, real), parameters(None, *grad_shape)]
+        kernel = antialias_kernels(real).backward
+        launch(farthest, kernel, len(farthest), [*inputs, parameters(None, *grads)], outputs)
+        needed = zip((grad_depths, *grad_shape), ctx.needs_input_grad[2:], strict=True)
+        return (None, None, *(x if need else None for x, need in needed))
+
+
+def limit_depths(
+    ids: torch.Tensor,
+    depths: torch.Tensor,
+    nearest: torch.Tensor,
+    farthest: torch.Tensor,
+    focal: float | torch.Tensor,
+) -> torch.Tensor:
+    """Clamp depths to at most focal * farthest, then to at least focal * nearest; differentiable in depths.
+
+    Args:
+        ids: (H, W, K) int32 surfels of the hits, -1 in empty slots, whose depths stay.
+        depths: (H, W, K) z-depths of the hits, world units.
+        nearest: (N,) smallest depth / focal, world units.
+        farthest: (N,) largest depth / focal.
+        focal: in pixels, a number or a tensor (1,) on the device.
+    """
+    focal = focal.to(depths) if isinstance(focal, torch.Tensor) else depths.new_full((1,), float(focal))
+    return _LimitDepths.apply(ids, depths.contiguous(), nearest.contiguous(), farthest.contiguous(), focal)
+
+
+class _LimitDepths(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Context, ids: torch.Tensor, depths: torch.Tensor, *limits: torch.Tensor) -> torch.Tensor:
+        real = real_of(depths)
+        limited = torch.empty_like(depths)
+        inputs = [array(ids.view(-1), wp.int32), *(array(x, real) for x in (depths.view(-1), *limits))]
+        launch(depths, limit_depths_kernel(real), depths.numel(), inputs, [array(limited.view(-1), real)])
+        ctx.save_for_backward(depths, limited)
+        return limited
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        depths, limited = ctx.saved_tensors
+        return None, grad.where(depths == limited, 0.0), None, None, None
