@@ -88,7 +88,7 @@ def _train_nexwarp(
     return lambda camera: model.render(camera).image, {
         "primitives": len(model.surfels),
         "megabytes": megabytes,
-        "teachers": 0 if trainer.teachers is None else len(trainer.teachers.models),
+        "teachers": len(trainer.targets.teachers),
         "end": end,
     }
 

@@ -2,24 +2,49 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 
-from nexwarp.cameras.camera import Camera
 from nexwarp.errors import DivergedError
-from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.state import Snapshot
+from nexwarp.train.state import Snapshot, TrainingState
 
 LOWERED_RATES = 0.5
 
 
-class LossLog:
-    """Losses of the iterations since the last check; a check waits for the GPU once, noting does not."""
+class RestorableRun(Protocol):
+    """A run that can be taken back to a snapshot and repeated from there.
 
-    def __init__(self) -> None:
+    Attributes:
+        iteration: steps done.
+        rate_factor: multiplies all learning rates.
+        health: of the steps since the last check.
+    """
+
+    iteration: int
+    rate_factor: float
+    health: "Health"
+
+    def step(self) -> StepReport:
+        """Do one step."""
+
+    def check(self) -> None:
+        """Raise DivergedError where something is not finite."""
+
+    def load_snapshot(self, snapshot: Snapshot) -> None:
+        """Return to a snapshot."""
+
+
+class Health:
+    """Losses of the iterations since the last check; a check waits for the GPU once, noting does not.
+
+    Attributes:
+        checked: iteration of the last check.
+    """
+
+    def __init__(self, checked: int = 0) -> None:
+        self.checked = checked
         self.noted: list[tuple[int, str, torch.Tensor]] = []
 
     def note(self, iteration: int, losses: Mapping[str, torch.Tensor]) -> None:
@@ -35,45 +60,36 @@ class LossLog:
         bad = ((i, name, x) for (i, name, _), x in zip(noted, values, strict=True) if not math.isfinite(x))
         return next(bad, None)
 
+    def check(self, state: TrainingState, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Raise DivergedError unless the noted losses and all tensors are finite; forget the noted losses.
 
-@dataclass(frozen=True)
-class StepFacts:
-    """Where a run stands, for messages and reports.
-
-    Attributes:
-        iteration: steps done.
-        checked_before: the iteration of the last check.
-        surfels: how many there are.
-        rate_factor: multiplies all learning rates.
-    """
-
-    iteration: int
-    checked_before: int
-    surfels: int
-    rate_factor: float
-
-
-class RestorableRun(Protocol):
-    """A run that can be taken back to a snapshot and repeated from there.
-
-    Attributes:
-        iteration: steps done.
-        rate_factor: multiplies all learning rates.
-        loss_log: of the losses since the last check.
-    """
-
-    iteration: int
-    rate_factor: float
-    loss_log: LossLog
-
-    def step(self) -> StepReport:
-        """Do one step."""
-
-    def check(self) -> None:
-        """Raise DivergedError where something is not finite."""
-
-    def load_snapshot(self, snapshot: Snapshot) -> None:
-        """Return to a snapshot."""
+        Args:
+            state: of the training, for the message and the report.
+            tensors: parameters, the optimizer's state and whatever else must stay finite, by name.
+        """
+        before, self.checked = self.checked, state.iteration
+        loss, bad = self.first_bad(), not_finite(tensors)
+        if loss is None and not bad:
+            return
+        if loss is not None:
+            when, name, value = loss
+            message = f"iteration {when}: the loss {name!r} is {value}"
+        else:
+            span = f"{before + 1} to " if before + 1 < state.iteration else ""
+            message = f"iteration {span}{state.iteration}: not finite"
+        places = [describe(name, tensors[name]) for name in bad]
+        if len(places) > 1:
+            others = dict.fromkeys(name.rpartition(" ")[2] for name in bad)
+            places[0] += f" (in all: {', '.join(others)})"
+        report = {
+            "iteration": state.iteration,
+            "checked_before": before,
+            "loss": None if loss is None else {"iteration": loss[0], "term": loss[1], "value": str(loss[2])},
+            "tensors": places,
+            "surfels": len(state.surfels),
+            "rate_factor": state.rate_factor,
+        }
+        raise DivergedError("; ".join([message, *places[:1]]), report)
 
 
 def not_finite(tensors: Mapping[str, torch.Tensor]) -> list[str]:
@@ -106,38 +122,6 @@ def watched_tensors(
                 watched[f"{moments.get(key, key)} of {name}"] = value
         watched[name] = parameter
     return watched
-
-
-def check_health(losses: LossLog, tensors: Mapping[str, torch.Tensor], facts: StepFacts) -> None:
-    """Raise DivergedError unless the noted losses and all tensors are finite; forget the noted losses.
-
-    Args:
-        losses: of the iterations since the last check.
-        tensors: parameters, the optimizer's state and whatever else must stay finite, by name.
-        facts: of the run, for the message and the report.
-    """
-    loss, bad = losses.first_bad(), not_finite(tensors)
-    if loss is None and not bad:
-        return
-    if loss is not None:
-        when, name, value = loss
-        told = f"iteration {when}: the loss {name!r} is {value}"
-    else:
-        span = f"{facts.checked_before + 1} to " if facts.checked_before + 1 < facts.iteration else ""
-        told = f"iteration {span}{facts.iteration}: not finite"
-    found = [describe(name, tensors[name]) for name in bad]
-    if len(found) > 1:
-        others = dict.fromkeys(name.rpartition(" ")[2] for name in bad)
-        found[0] += f" (in all: {', '.join(others)})"
-    report = {
-        "iteration": facts.iteration,
-        "checked_before": facts.checked_before,
-        "loss": None if loss is None else {"iteration": loss[0], "term": loss[1], "value": str(loss[2])},
-        "tensors": found,
-        "surfels": facts.surfels,
-        "rate_factor": facts.rate_factor,
-    }
-    raise DivergedError("; ".join([told, *found[:1]]), report)
 
 
 def go_back(run: RestorableRun, good: Snapshot, fault: DivergedError) -> str:
@@ -175,33 +159,29 @@ def first_fault(run: RestorableRun, good: Snapshot, fault: DivergedError) -> Div
     run.rate_factor = rate_factor
     try:
         while run.iteration < until:
-            run.loss_log.note(run.iteration + 1, run.step().losses)
+            run.health.note(run.iteration + 1, run.step().losses)
             run.check()
     except DivergedError as first:
         return first
     return fault
 
 
-def oom_message(
-    needed: str, facts: StepFacts, camera: Camera, config: Config, device: torch.device, *, graphs: bool
-) -> str:
+def oom_message(state: TrainingState, needed: str, *, graphs: bool) -> str:
     """Return what to say when memory does not suffice: what it was needed for, and what to lower.
 
     Args:
+        state: of the training.
         needed: as `needed_memory` tells it.
-        facts: of the run.
-        camera: of the first training view, whose size stands for all.
-        config: settings.
-        device: of the training.
         graphs: whether CUDA graphs are in use.
     """
     place, used, advice = "memory", "", ""
-    if device.type == "cuda":
-        free, total = torch.cuda.mem_get_info(device)
+    if state.device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(state.device)
         place, used = "GPU memory", f", with {(total - free) / 2**30:.1f} of {total / 2**30:.1f} GiB in use"
         advice = ", or do without CUDA graphs (--set cuda_graphs=false)" if graphs else ""
+    camera, config = state.scene.train[0].camera, state.config
     return (
-        f"out of {place} at iteration {facts.iteration}: it needed {needed}{used}, for {facts.surfels:,} "
+        f"out of {place} at iteration {state.iteration}: it needed {needed}{used}, for {len(state.surfels):,} "
         f"surfels and photos of {camera.width}x{camera.height}; lower --max-surfels (now "
         f"{config.max_surfels:,}) or --max-hits (now {config.max_hits}), or raise --downscale{advice}"
     )

@@ -7,7 +7,6 @@ import torch
 
 from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
-from nexwarp.io.json_files import Json
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import Surfels
@@ -125,12 +124,6 @@ def _typical_depth(view: View, scene: Scene) -> float:
     depths = view.camera.project(points)[1]
     depths = depths[depths > view.camera.near]
     return depths.median().item() if len(depths) else scene.scale
-
-
-def model_facts(scene: Scene, config: Config, iteration: int) -> dict[str, Json]:
-    """Return the facts that a model tells of its training; see `Model.meta`."""
-    near = scene.train[0].camera.near
-    return {"near": near, "scene_scale": scene.scale, "preset": config.preset, "iteration": iteration}
 
 
 def texture_shape(scene: Scene, config: Config) -> TextureShape:

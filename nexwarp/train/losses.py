@@ -7,7 +7,7 @@ Terms of images are differentiable once; a `target` gets no gradient, and one th
 
 import torch
 
-from nexwarp.errors import check_range, check_tensors
+from nexwarp.errors import check_tensors
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
@@ -16,31 +16,25 @@ from nexwarp.train.recipe import LossWeights
 ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
-def training_losses(
-    *,
+def photo_losses(
     image: torch.Tensor,
     textured: torch.Tensor,
     weights: torch.Tensor,
     target: torch.Tensor,
-    opacities: torch.Tensor,
-    grid: torch.Tensor | None,
-    resolutions: torch.Tensor | None,
-    loss_weights: LossWeights,
+    factors: LossWeights,
+    *,
     mask: torch.Tensor | None = None,
     empty: torch.Tensor | None = None,
     saturation: float | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Return the terms of the training loss, already multiplied by their factors: their sum is the loss.
+    """Return the terms that compare a rendering with its photo, already multiplied by their factors.
 
     Args:
         image: (H, W, 3), the rendering with its background.
         textured: (H, W, 3), sum_k W T.
         weights: (H, W, K), W; with K = 0 there is no texture and no alpha term.
         target: (H, W, 3), the photograph.
-        opacities: (N,) in [0, 1].
-        grid: (L, T, F), hash-grid values; None without a texture: no grid term.
-        resolutions: (L,), cells per world unit; None where `grid` is.
-        loss_weights: the factors; a term whose factor is 0 is neither computed nor returned.
+        factors: of the terms; one whose factor is 0 is neither computed nor returned.
         mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
             and the texture are 0. None is True everywhere.
         empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
@@ -48,12 +42,12 @@ def training_losses(
             None compares all values.
 
     Returns:
-        Term ("l1", "dssim", "texture", "alpha", "opacity", "grid") -> weighted scalar tensor.
+        Term ("l1", "dssim", "texture", "alpha") -> weighted scalar tensor.
     """
-    factors, has_slots = loss_weights, weights.shape[-1] > 0
     _check_masks(image, mask=mask, empty=empty)
     image, textured, weights = _counted(image, textured, weights, target, mask, empty)
-    # With all hits of K = 4, test views were worse than with K = 2: benchmarks/notes/hits.md.
+    has_slots = weights.shape[-1] > 0
+    # With all hits of K = 4, test views were worse than with K = 2.
     all_count = weights.shape[-1] <= ALPHA_HITS
     shares = {
         "l1": 1.0 - factors.dssim,
@@ -70,10 +64,7 @@ def training_losses(
         "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,
         "texture": texture_term,
         "alpha": alpha_term,
-        "opacity": factors.opacity * opacity_loss(opacities) if factors.opacity > 0.0 else None,
     }
-    if factors.grid > 0.0 and grid is not None and resolutions is not None:
-        terms["grid"] = factors.grid * grid_loss(grid, resolutions)
     return {name: term for name, term in terms.items() if term is not None}
 
 
@@ -135,23 +126,6 @@ def dssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         ValueError: `target` requires a gradient, which it would not get.
     """
     return weighted_dssim(image, target)
-
-
-def image_loss(image: torch.Tensor, target: torch.Tensor, weight: float = 0.2) -> torch.Tensor:
-    """L_image = (1 - weight) L_1 + weight L_D-SSIM of two (H, W, 3) images."""
-    check_range("weight", weight, 0.0, 1.0)
-    return (1.0 - weight) * l1(image, target) + weight * dssim(image, target)
-
-
-def texture_loss(textured: torch.Tensor, weights: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """L_texture: L1 between `target` and the un-premultiplied texture, sum_k W T / (sum_k W + 1e-6).
-
-    Args:
-        textured: (H, W, 3), sum_k W T.
-        weights: (H, W, K), W.
-        target: (H, W, 3).
-    """
-    return _computed(photometric_terms(None, textured, weights, target, texture=1.0)[1])
 
 
 def alpha_loss(weights: torch.Tensor) -> torch.Tensor:

@@ -20,11 +20,11 @@ from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, c
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.train.adam import FusedAdam
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.recipe import Config
+from nexwarp.train.relocation import least_contributing
 from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
 from nexwarp.train.step_losses import OwnLoss
@@ -86,10 +86,10 @@ class ParallelTrainer(Trainer):
         ranks.check_same(
             {
                 "settings": hashlib.sha256(json.dumps(config.as_dict(), sort_keys=True).encode()).hexdigest()[:12],
-                "training cameras": self.views.fingerprint()[:12],
-                "scene": self._scene_digest[:12],
+                "training cameras": self.origin.views[:12],
+                "scene": self.origin.scene[:12],
                 "background": str(self.background),
-                "teachers": self._teachers_digest[:12],
+                "teachers": self.origin.teachers[:12],
             }
         )
         # The same already, unless the ranks' processors round differently.
@@ -109,7 +109,7 @@ class ParallelTrainer(Trainer):
     def _next_target(self) -> Target:
         ranks, first = self.ranks, self.iteration
         self.views_a_step = max(1, min(ranks.size, self.config.iterations - first))
-        chosen = [self._next_view(number) for number in range(first + 1, first + 1 + self.views_a_step)]
+        chosen = [self.targets.next_view(number) for number in range(first + 1, first + 1 + self.views_a_step)]
         # Where views of the last step are fewer than ranks, the others repeat one with weight 0.
         self.share = 1.0 / self.views_a_step if ranks.rank < self.views_a_step else 0.0
         mine = ranks.rank % self.views_a_step
@@ -117,7 +117,7 @@ class ParallelTrainer(Trainer):
         for offset, generator in enumerate((self.targets.generator, self.targets.noise)):
             generator.manual_seed(derived_seed(self.config.seed, first + mine + 1, offset))
         upcoming = self.order[-1 - ranks.rank :: -ranks.size][:2]
-        return self._target(chosen[mine], first + mine + 1, upcoming)
+        return self.targets.make(chosen[mine], first + mine + 1, upcoming)
 
     def _run_step(self, target: Target) -> StepResult:
         result = super()._run_step(target)
@@ -129,8 +129,7 @@ class ParallelTrainer(Trainer):
                 self._reduce(errors)
             finally:
                 self.optimizer.zero_grad(set_to_none=True)
-            if isinstance(self.optimizer, FusedAdam) and self.optimizer.grid_loss is not None:
-                result = result._replace(losses=result.losses | {"grid": self.optimizer.grid_loss})
+            result = result._replace(losses=result.losses | self.take_grid_loss())
         return result
 
     def _optimize(self, target: Target) -> StepResult:
@@ -158,6 +157,12 @@ class ParallelTrainer(Trainer):
         if errors is not None and self.share == 0:
             errors = torch.zeros_like(errors)
         super()._update(self.reducer.finish(self._trained(), errors))
+
+    def _unneeded(self) -> torch.Tensor:
+        """Return the surfels that are needed least; the ranks share the cameras out."""
+        ranks, cameras = self.ranks, self.views.refined_cameras(self.poses)
+        mine, share = cameras[ranks.rank :: ranks.size], self.config.densify.relocate
+        return least_contributing(self.model(), mine, share, ranks.largest)
 
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]

@@ -4,18 +4,20 @@ Once the budget is used up, the paper's density control splits a surfel only whe
 so that the surfels stay where the first iterations put them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
 from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.model.model import Model
-from nexwarp.train.ranks.ranks import Ranks
 
 
 @torch.no_grad()
 def least_contributing(
-    model: Model, cameras: Sequence[Camera], share: float, ranks: Ranks | None = None
+    model: Model,
+    cameras: Sequence[Camera],
+    share: float,
+    largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
 ) -> torch.Tensor:
     """Return (N,) bool, True for the share of the surfels that contribute least to any image.
 
@@ -26,16 +28,14 @@ def least_contributing(
         model: its N surfels and options are used.
         cameras: of the training views, on any device.
         share: of the surfels, 0 to 1; rounded down to whole surfels.
-        ranks: which share the cameras out and return the same; None is this process alone.
+        largest: takes the contributions (N,) to these images, and returns the largest of all ranks.
     """
     bare = model.bare()
     most = torch.zeros_like(bare.surfels.logit_opacities)
-    mine = cameras if ranks is None else cameras[ranks.rank :: ranks.size]
-    for camera in mine:
+    for camera in cameras:
         out = bare.render(reduced(camera, max(camera.height // 2, 1)))
         most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
-    if ranks is not None:
-        most = ranks.largest(most)
+    most = largest(most)
     chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
     chosen[most.argsort(stable=True)[: int(share * len(most))]] = True
     return chosen

@@ -5,13 +5,11 @@ from collections.abc import Callable, Mapping
 
 import torch
 
-from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import Rendering
-from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import expose
-from nexwarp.train.losses import depth_loss, training_losses
-from nexwarp.train.recipe import Config
+from nexwarp.train.adam import FusedAdam
+from nexwarp.train.losses import depth_loss, grid_loss, opacity_loss, photo_losses
+from nexwarp.train.state import TrainingState
 from nexwarp.train.surface_losses import normal_loss
 from nexwarp.train.target import Target
 
@@ -59,56 +57,42 @@ def as_taken(out: Rendering, target: Target, *, plain: bool = True) -> Rendering
 
 
 def step_losses(
-    out: Rendering,
-    target: Target,
-    surfels: Surfels,
-    texture: NeuralTexture,
-    config: Config,
-    *,
-    cells_unit: float = 1.0,
-    own: Mapping[str, OwnLoss] | None = None,
-    grid_term: bool = True,
-    poses: PoseCorrections | None = None,
+    out: Rendering, target: Target, state: TrainingState, own: Mapping[str, OwnLoss] | None = None
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
     Args:
         out: the rendering of the target's camera, `as_taken`.
         target: what it is compared with.
-        surfels: whose opacities the sparsity term takes.
-        texture: whose grid the regularisation takes.
-        config: settings.
-        cells_unit: world units in which the grid's loss counts its cells.
+        state: of the training. The grid's term is left out where the optimizer, a `FusedAdam`, computes it.
         own: losses of one's own, added as they are.
-        grid_term: whether to compute the grid's term, which `FusedAdam` does itself.
-        poses: corrections, which have a prior; None where poses stay as given.
 
     Raises:
-        TypeError, ValueError: an own loss returned no scalar; the message names it.
+        TypeError, ValueError: an own loss is no floating scalar tensor on the device.
     """
-    textured, factors = config.max_hits > 0, config.losses
-    grid_term = grid_term and textured and factors.grid > 0
-    losses = training_losses(
-        image=out.image.clamp(0, 1),  # as the authors' code does
-        textured=out.textured,
-        weights=out.weights,
-        target=target.photo,
-        opacities=surfels.opacities,
-        grid=texture.grid if grid_term else None,
-        resolutions=texture.resolutions * cells_unit if grid_term else None,
-        loss_weights=factors,
+    config, texture, factors = state.config, state.texture, state.config.losses
+    losses = photo_losses(
+        out.image.clamp(0, 1),  # as the authors' code does
+        out.textured,
+        out.weights,
+        target.photo,
+        factors,
         mask=target.counts,
         empty=target.empty,
         saturation=None if target.exposure is None else SATURATION,
     )
+    if factors.opacity > 0:
+        losses["opacity"] = factors.opacity * opacity_loss(state.surfels.opacities)
+    if config.max_hits > 0 and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam):
+        losses["grid"] = factors.grid * grid_loss(texture.grid, texture.resolutions * state.cells_unit)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
         losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
     if target.normals > 0:
         losses["normals"] = target.normals * normal_loss(out, target.counts)
-    if poses is not None and target.view is not None:
-        losses["poses"] = POSE_PRIOR * poses.prior(target.view)
+    if state.poses is not None and target.view is not None:
+        losses["poses"] = POSE_PRIOR * state.poses.prior(target.view)
     for name, loss in (own or {}).items():
         losses[name] = _scalar(name, loss(out, target), out.image.device)
     return losses

@@ -8,13 +8,14 @@ from functools import cached_property
 import torch
 
 from nexwarp.cameras.camera import Camera, visible_points
-from nexwarp.data import Scene
+from nexwarp.model.model import Model
 from nexwarp.model.options import Color
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import jitter_factors
-from nexwarp.train.recipe import Config
+from nexwarp.train.exposure import ExposureCalibration
+from nexwarp.train.state import TrainingState
 from nexwarp.train.surface_losses import normals_factor
-from nexwarp.train.views import TrainingViews
+from nexwarp.train.views import TrainingViews, mean_color
 
 
 @dataclass(frozen=True)
@@ -55,45 +56,53 @@ def refined(target: Target, poses: PoseCorrections | None) -> Target:
     return dataclasses.replace(target, camera=poses.camera(target.camera, target.view))
 
 
-class TargetMaker:
-    """Makes the targets of the steps of one training."""
+class TargetSource:
+    """Makes the targets of a training: each of its photos once an epoch, in random order.
 
-    def __init__(
-        self,
-        scene: Scene,
-        config: Config,
-        views: TrainingViews,
-        background: tuple[float, float, float],
-        generator: torch.Generator,
-        noise: torch.Generator,
-        poses: PoseCorrections | None = None,
-    ) -> None:
-        """Take what targets are made of.
+    Attributes:
+        views: the training views on the device.
+        background: the colour behind everything, where it is not random.
+        generator: of random backgrounds, on the CPU.
+        noise: of the depth jitter, on the device.
+        teachers: models that it compares with, too.
+    """
+
+    def __init__(self, state: TrainingState, calibration: ExposureCalibration | None) -> None:
+        """Move the photos to the device.
 
         Args:
-            scene: the scene of the training.
-            config: settings.
-            views: the scene's training views on the device.
-            background: the colour behind everything, where it is not random.
-            generator: of random backgrounds, on the CPU.
-            noise: of the depth jitter, on the device.
-            poses: corrections that are learned; None where poses stay as given.
+            state: of the training, whose order of the views it goes through.
+            calibration: exposures of the photos; None where they have one exposure.
         """
-        self.poses = poses
-        self.scene, self.config, self.views = scene, config, views
-        self.background, self.generator, self.noise = background, generator, noise
-        self.background_tensor = torch.tensor(background, device=views.device)
+        self.state, self.scene, self.config, self.poses = state, state.scene, state.config, state.poses
+        gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
+        self.views = TrainingViews(self.scene.train, state.device, gains, lens)
+        self.background = self.config.background or self.scene.background or mean_color(self.scene.train, calibration)
+        self.background_tensor = torch.tensor(self.background, device=state.device)
+        self.generator, self.noise = state.generator, state.noise
+        self.teachers: list[Model] = []
         self.points: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
 
-    def make(self, index: int, iteration: int, upcoming: list[int]) -> Target:
+    def next_view(self, number: int) -> int:
+        """Return the index of the training view with that number in the training, from 1."""
+        state = self.state
+        if not state.order:
+            state.order = torch.randperm(len(self.views), generator=state.generator).tolist()
+        return state.order.pop()
+
+    def digest(self) -> str:
+        """Return a digest of the teachers, in their order; empty without any."""
+        return ""
+
+    def make(self, index: int, number: int, upcoming: list[int]) -> Target:
         """Make the target of a step.
 
         Args:
             index: of the training view.
-            iteration: of the step, from 1.
+            number: of this view in the training, from 1.
             upcoming: indices of the views to come, the next one first.
         """
-        config = self.config
+        config, iteration = self.config, self.state.iteration
         target = self.with_points(self.from_view(index, upcoming), index)
         target = dataclasses.replace(target, normals=normals_factor(config, iteration))
         if config.depth_jitter > 0 and config.max_hits:

@@ -7,8 +7,9 @@ also in views that no photo has.
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from functools import partial
 
 import torch
 
@@ -18,50 +19,44 @@ from nexwarp.data import Scene
 from nexwarp.machine import derived_seed
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
+from nexwarp.train.exposure import ExposureCalibration
 from nexwarp.train.recipe import Config
-from nexwarp.train.target import Target
+from nexwarp.train.state import TrainingState
+from nexwarp.train.target import Target, TargetSource
 
 EVERY = 2  # the second of so many steps learns from a teacher: the log's lines are of odd steps, which have photos
 SAME_SCALE = 1e-3  # share by which the scale of a teacher's scene may differ from that of the training's
 STREAM = 2  # series of random numbers, as `derived_seed` counts them; those of a view's target are 0 and 1
 
 
-class Teachers:
-    """Trained models of a scene, and the cameras from which a training looks at them.
+class TaughtTargets(TargetSource):
+    """Targets of a training that learns from other models, too: every other step compares with a rendering of one.
 
-    A step with a teacher has one of the training views, each once in a round, a camera on the line through this view's
-    and a neighbour's (`between`), and a teacher drawn at random. All of it follows from the seed and the step's number,
-    so that a checkpoint needs nothing of it.
+    Such a step has one of the training views, each once in a round, a camera on the line through this view's and a
+    neighbour's (`between`), and a teacher drawn at random. All of it follows from the seed and the step's number, so
+    that a checkpoint needs nothing of it.
     """
 
-    def __init__(self, models: Sequence[Model], scene: Scene, config: Config, device: torch.device) -> None:
-        """Check that the models fit; on a GPU their frames share memory from then on.
+    def __init__(
+        self,
+        state: TrainingState,
+        calibration: ExposureCalibration | None,
+        models: Sequence[Model],
+        repeatable: Callable[[Callable[[], Target]], Target],
+    ) -> None:
+        """Move the models to the device; on a GPU their frames share memory from then on.
 
         Args:
-            models: trained ones of the scene, at least one; they are moved to the device.
-            scene: of the training.
-            config: settings of the training.
-            device: of the training.
-
-        Raises:
-            TypeError: one is not a model.
-            ValueError: one is of a scene of another scale, or the training learns poses, which teachers do not follow.
+            state: of the training.
+            calibration: exposures of the photos; None where they have one exposure.
+            models: trained ones of the scene, at least one.
+            repeatable: renders, again with more memory where it does not suffice.
         """
-        if config.refine_poses:
-            raise ValueError("teachers: expected refine_poses=False, for poses that stay as given")
-        for number, model in enumerate(models):
-            if not isinstance(model, Model):
-                raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")
-            scale = model.meta.get("scene_scale")
-            if isinstance(scale, (int, float)) and not math.isclose(scale, scene.scale, rel_tol=SAME_SCALE):
-                raise ValueError(
-                    f"teachers[{number}]: expected a model of {scene.path}, whose scale is {scene.scale:.6g}, "
-                    f"got one of a scene of scale {scale:.6g}"
-                )
-        self.models = [model.to(device) for model in models]
-        if device.type == "cuda":
-            share_graphs([model.surfels for model in self.models])
-        self.cameras, self.seed, self.last = [view.camera for view in scene.train], config.seed, config.iterations
+        super().__init__(state, calibration)
+        self.teachers, self.repeatable = [model.to(state.device) for model in models], repeatable
+        if state.device.type == "cuda":
+            share_graphs([model.surfels for model in self.teachers])
+        self.cameras = [view.camera for view in self.scene.train]
         sizes = {(camera.width, camera.height) for camera in self.cameras}
         self.launches = without_graphs if len(sizes) > MOST_GRAPHS else nullcontext
         self.round = -1
@@ -69,21 +64,30 @@ class Teachers:
 
     def teaches(self, number: int) -> bool:
         """Whether a step, counted from 1, learns from a teacher instead of a photo; the last one does not."""
-        return number % EVERY == 0 and number != self.last
+        return number % EVERY == 0 and number != self.config.iterations
 
     def choice(self, number: int) -> tuple[int, Camera, Model]:
         """Return what a step with a teacher has: index of a training view, a camera near it, and the teacher."""
         round_, place = divmod(number // EVERY - 1, len(self.cameras))
         if round_ != self.round:
-            generator = torch.Generator().manual_seed(derived_seed(self.seed, round_, STREAM))
+            generator = torch.Generator().manual_seed(derived_seed(self.config.seed, round_, STREAM))
             cameras = between(self.cameras, generator)
             order = torch.randperm(len(cameras), generator=generator).tolist()
-            drawn = torch.randint(len(self.models), (len(cameras),), generator=generator).tolist()
-            self.choices = [(index, cameras[index], self.models[k]) for index, k in zip(order, drawn, strict=True)]
+            drawn = torch.randint(len(self.teachers), (len(cameras),), generator=generator).tolist()
+            self.choices = [(index, cameras[index], self.teachers[k]) for index, k in zip(order, drawn, strict=True)]
             self.round = round_
         return self.choices[place]
 
-    def target(self, of_photo: Target, number: int) -> Target:
+    def next_view(self, number: int) -> int:
+        """Return the index of the training view with that number in the training, from 1."""
+        return self.choice(number)[0] if self.teaches(number) else super().next_view(number)
+
+    def make(self, index: int, number: int, upcoming: list[int]) -> Target:
+        """Make the target of a step, with the photo or with a teacher's rendering."""
+        target = super().make(index, number, upcoming)
+        return self.repeatable(partial(self.taught, target, number)) if self.teaches(number) else target
+
+    def taught(self, of_photo: Target, number: int) -> Target:
         """Return the target of a step with a teacher: the teacher's rendering at the photos' mean exposure.
 
         Args:
@@ -105,26 +109,50 @@ class Teachers:
     def digest(self) -> str:
         """Return a digest of the teachers, in their order."""
         digest = hashlib.sha256()
-        for model in self.models:
-            # As 7f7bd6c wrote options, so that its runs resume.
-            digest.update(str(model.options).replace(" clamp_texture", " low_pass=False, clamp_texture").encode())
+        for model in self.teachers:
+            digest.update(str(model.options).encode())
             for name, value in model.state_dict().items():
                 digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
 
-def make_teachers(models: Iterable[Model], scene: Scene, config: Config, device: torch.device) -> Teachers | None:
-    """Return the teachers of a training, None without models; arguments and errors are those of `Teachers`.
+def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> list[Model]:
+    """Return the models that a training learns from as a list.
 
     Raises:
-        ValueError: the settings name a number of teachers, which this training does not train.
+        TypeError: one is not a model.
+        ValueError: the settings name a number of teachers, which one training does not train; one is of a scene of
+            another scale; or the training learns poses, which teachers do not follow.
     """
     if config.teachers:
         raise ValueError(
             f"config.teachers: expected 0 or None, as a Trainer trains one model, got {config.teachers}; "
             "nexwarp.train trains teachers first"
         )
-    if isinstance(models, Model):
+    if isinstance(teachers, Model):
         raise TypeError("teachers: expected a list of models, got one nexwarp.Model")
-    found = list(models)
-    return Teachers(found, scene, config, device) if found else None
+    models = list(teachers)
+    if models and config.refine_poses:
+        raise ValueError("teachers: expected refine_poses=False, for poses that stay as given")
+    for number, model in enumerate(models):
+        if not isinstance(model, Model):
+            raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")
+        scale = model.meta.get("scene_scale")
+        if isinstance(scale, (int, float)) and not math.isclose(scale, scene.scale, rel_tol=SAME_SCALE):
+            raise ValueError(
+                f"teachers[{number}]: expected a model of {scene.path}, whose scale is {scene.scale:.6g}, "
+                f"got one of a scene of scale {scale:.6g}"
+            )
+    return models
+
+
+def make_targets(
+    state: TrainingState,
+    calibration: ExposureCalibration | None,
+    teachers: Sequence[Model],
+    repeatable: Callable[[Callable[[], Target]], Target],
+) -> TargetSource:
+    """Return what the steps of a training compare with: photos, and renderings of teachers where there are any."""
+    if not teachers:
+        return TargetSource(state, calibration)
+    return TaughtTargets(state, calibration, teachers, repeatable)

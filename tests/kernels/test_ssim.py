@@ -5,7 +5,7 @@ import torch
 from torch.autograd import gradcheck
 
 from nexwarp.ops.ssim import weighted_dssim
-from nexwarp.train.losses import training_losses
+from nexwarp.train.losses import photo_losses
 from nexwarp.train.recipe import LossWeights
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
@@ -90,18 +90,10 @@ def test_nan_in_a_corner_does_not_wrap_around(device: torch.device, corner: tupl
     assert int(wrong.sum()) == 11 * 11 * 3
 
 
-def test_training_losses_fold_the_factor_in() -> None:
+def test_photo_losses_fold_the_factor_in() -> None:
     image, target = images(9, 9)
-    terms = training_losses(
-        image=image,
-        textured=torch.zeros_like(target),
-        weights=target.new_zeros(9, 9, 0),
-        target=target,
-        opacities=target.new_zeros(2),
-        grid=None,
-        resolutions=None,
-        loss_weights=LossWeights(dssim=0.3),
-    )
+    nothing = torch.zeros_like(target), target.new_zeros(9, 9, 0)
+    terms = photo_losses(image, *nothing, target, LossWeights(dssim=0.3))
     expected = 0.3 * reference.dssim(image, target)
     assert_close(terms["dssim"], expected, kind="value", name="dssim")
     actual, wanted = (torch.autograd.grad(x, image)[0] for x in (terms["dssim"], expected))

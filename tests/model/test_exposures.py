@@ -31,8 +31,9 @@ from nexwarp.train.exposure import (
     observations,
     solve_gains,
 )
+from nexwarp.train.losses import photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
-from nexwarp.train.step_losses import as_taken, step_losses
+from nexwarp.train.step_losses import SATURATION, as_taken
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews, mean_color
@@ -411,7 +412,8 @@ def test_brighter_than_a_saturated_pixel_is_no_error():
         photo = torch.full_like(image, 0.8 * gain).clamp(max=1.0)
         target = Target(camera, photo, 0.0, torch.tensor([gain] * 3))
         taken = as_taken(dataclasses.replace(out, image=image, textured=textured), target)
-        losses = step_losses(taken, target, surfels, make_texture(), Config(losses=LossWeights(alpha=0.0)))
+        factors = LossWeights(alpha=0.0)
+        losses = photo_losses(taken.image, taken.textured, taken.weights, photo, factors, saturation=SATURATION)
         assert losses["l1"] < 1e-6 and losses["dssim"] < 1e-4
         if gain > 1:
             (gradient,) = torch.autograd.grad(losses["l1"] + losses["dssim"], image)

@@ -11,6 +11,7 @@ from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops import photometric
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.train import losses
+from tests.losses_support import texture_loss
 from tests.narrowing import present, total
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
@@ -165,7 +166,7 @@ def test_inputs_may_be_expanded() -> None:
     target = torch.rand(1, 1, 3, dtype=torch.float64).expand(4, 5, 3)
     weights = torch.full((), 0.25, dtype=torch.float64).expand(4, 5, 2)
     expected = reference.texture(0.4 * target, weights, target)
-    assert_close(losses.texture_loss(0.4 * target, weights, target), expected, kind="value", name="texture")
+    assert_close(texture_loss(0.4 * target, weights, target), expected, kind="value", name="texture")
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1)])
@@ -205,7 +206,7 @@ def test_no_slots(device: torch.device) -> None:
     weights = torch.zeros(3, 4, 0, device=device, requires_grad=True)
     picture = torch.rand(3, 4, 3, device=device)
     assert_close(losses.alpha_loss(weights), torch.ones(()), kind="value", name="alpha")
-    loss = losses.texture_loss(1e-6 * picture, weights, torch.zeros_like(picture))
+    loss = texture_loss(1e-6 * picture, weights, torch.zeros_like(picture))
     assert_close(loss, picture.mean(), kind="value", name="texture")
     assert torch.autograd.grad(loss, weights)[0].shape == (3, 4, 0)
 
@@ -237,7 +238,7 @@ def test_a_target_that_wants_a_gradient_is_refused() -> None:
     target = given["target"].clone().requires_grad_()
     for term in (
         lambda: losses.l1(given["image"], target),
-        lambda: losses.texture_loss(given["textured"], given["weights"], target),
+        lambda: texture_loss(given["textured"], given["weights"], target),
     ):
         with pytest.raises(ValueError, match="target: expected a tensor that needs no gradient"):
             term()

@@ -15,9 +15,9 @@ from nexwarp.cli import main as cli
 from nexwarp.data import Scene, write_demo
 from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
 from nexwarp.machine import needed_memory
-from nexwarp.train import trainer
+from nexwarp.train import state, trainer
 from nexwarp.train.checkpoint import save_checkpoint
-from nexwarp.train.health import LossLog, describe, not_finite
+from nexwarp.train.health import Health, describe, not_finite
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.schedules import make_optimizer
 from nexwarp.train.step_losses import step_losses
@@ -79,7 +79,7 @@ def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Tra
         return optimizer
 
     patch.setattr(Trainer, "__init__", remember)
-    patch.setattr(trainer, "make_optimizer", make)
+    patch.setattr(state, "make_optimizer", make)
     return struck
 
 
@@ -108,7 +108,7 @@ def test_any_value_that_is_not_finite_is_found(device, value, place):
 
 
 def test_losses_are_named_by_the_first_that_is_bad():
-    log = LossLog()
+    log = Health()
     assert log.first_bad() is None
     for iteration in range(1, 50):
         terms = {"l1": torch.tensor(0.1), "grid": torch.tensor(INF if iteration == 30 else 0.2)}
@@ -284,7 +284,7 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     def fail(*_: Any, **__: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has 1 KiB free")
 
-    monkeypatch.setattr("nexwarp.model.model.render", fail)
+    monkeypatch.setattr("nexwarp.train.trainer.draw", fail)
     run = Trainer(scene, dataclasses.replace(SMALL, max_surfels=48), "cpu")
     with pytest.raises(OutOfMemoryError) as caught:
         run.run()

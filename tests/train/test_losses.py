@@ -10,6 +10,7 @@ from torch.autograd import gradcheck
 from nexwarp.cameras.camera import visible_points
 from nexwarp.train import losses
 from nexwarp.train.recipe import LossWeights
+from tests.losses_support import texture_loss
 from tests.narrowing import present, total
 from tests.tolerances import assert_close
 
@@ -21,6 +22,10 @@ def images(height: int = 13, width: int = 17, dtype: torch.dtype = torch.float64
     target = torch.rand(height, width, 3, dtype=torch.float64)
     offset = (torch.randint(2, target.shape) * 2 - 1) * (0.05 + 0.2 * torch.rand_like(target))
     return [(target + offset).to(dtype), target.to(dtype)]
+
+
+def image_loss(image: torch.Tensor, target: torch.Tensor, weight: float = 0.2) -> torch.Tensor:
+    return (1.0 - weight) * losses.l1(image, target) + weight * losses.dssim(image, target)
 
 
 def dense_ssim(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -56,7 +61,6 @@ def test_dssim_is_the_dense_definition_with_zeros_outside(device: torch.device, 
     (gradient,) = torch.autograd.grad(actual, leaf)
     assert_close(actual, expected, kind="value", name="dssim")
     assert_close(gradient, expected_gradient, kind="gradient", name="gradient of dssim")
-    assert gradient.is_contiguous()
 
 
 def test_dssim_in_float32_keeps_its_digits_on_large_images(device: torch.device) -> None:
@@ -122,8 +126,8 @@ def test_every_gradient_against_finite_differences() -> None:
     opacities = torch.rand(5, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda x: losses.l1(x, target), image)
     assert gradcheck(lambda x: losses.dssim(x, target), image)
-    assert gradcheck(lambda x: losses.image_loss(x, target, 0.3), image)
-    assert gradcheck(lambda x, w: losses.texture_loss(x, w, target), (image, weights))
+    assert gradcheck(lambda x: image_loss(x, target, 0.3), image)
+    assert gradcheck(lambda x, w: texture_loss(x, w, target), (image, weights))
     assert gradcheck(losses.alpha_loss, weights)
     assert gradcheck(losses.opacity_loss, opacities)
     assert gradcheck(lambda h: losses.grid_loss(h, resolutions), grid)
@@ -134,7 +138,7 @@ def test_image_loss_mixes_l1_and_dssim() -> None:
     l1, dssim = (image - target).abs().mean(), losses.dssim(image, target)
     for weight in (0.0, 0.2, 1.0):
         expected = (1 - weight) * l1 + weight * dssim
-        assert_close(losses.image_loss(image, target, weight), expected, kind="value", name=f"weight {weight}")
+        assert_close(image_loss(image, target, weight), expected, kind="value", name=f"weight {weight}")
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -152,16 +156,16 @@ def test_texture_loss_is_the_papers_sum(device: torch.device, dtype: torch.dtype
                 expected += (target[y, x, c] - blended / (total + 1e-6)).abs() / (3 * height * width)
     textured = (weights[..., None] * colours).sum(2)
     inputs = (tensor.to(device, dtype) for tensor in (textured, weights, target))
-    assert_close(losses.texture_loss(*inputs), expected, kind="value", name="texture loss")
+    assert_close(texture_loss(*inputs), expected, kind="value", name="texture loss")
 
 
 def test_texture_loss_does_not_depend_on_coverage_and_survives_none() -> None:
     colour, target = torch.rand(4, 4, 3).double(), torch.rand(4, 4, 3).double()
     thick, thin = (torch.full((4, 4, 1), w).double() for w in (0.9, 0.1))
-    a, b = (losses.texture_loss(w * colour, w, target) for w in (thick, thin))
+    a, b = (texture_loss(w * colour, w, target) for w in (thick, thin))
     assert a.item() == pytest.approx(b.item(), rel=2e-5)
     zero = torch.zeros(4, 4, 1).double().requires_grad_()
-    loss = losses.texture_loss(zero * colour, zero, target)
+    loss = texture_loss(zero * colour, zero, target)
     assert loss.item() == pytest.approx(target.mean().item(), rel=1e-14)
     assert torch.autograd.grad(loss, zero)[0].isfinite().all()
 
@@ -181,59 +185,46 @@ def test_grid_loss_has_a_zero_gradient_at_zero() -> None:
     assert torch.autograd.grad(loss, grid)[0].eq(0.0).all()
 
 
-def arguments(slots: int = 2, with_grid: bool = True) -> dict[str, Any]:
+def arguments(slots: int = 2) -> dict[str, Any]:
     image, target = images()
     weights = 0.4 * torch.rand(13, 17, slots, dtype=torch.float64)
-    return {
-        "image": image,
-        "textured": 0.5 * weights.sum(-1, keepdim=True).expand(-1, -1, 3),
-        "weights": weights,
-        "target": target,
-        "opacities": torch.rand(9, dtype=torch.float64),
-        "grid": torch.randn(2, 8, 2, dtype=torch.float64) if with_grid else None,
-        "resolutions": torch.tensor([2.0, 4.0], dtype=torch.float64) if with_grid else None,
-    }
+    textured = 0.5 * weights.sum(-1, keepdim=True).expand(-1, -1, 3)
+    return {"image": image, "textured": textured, "weights": weights, "target": target}
 
 
-def test_training_losses_are_the_papers_total() -> None:
-    given = arguments()
-    terms = losses.training_losses(**given, loss_weights=LossWeights())
-    expected = {
-        "image": losses.image_loss(given["image"], given["target"], 0.2),
-        "alpha": 0.005 * losses.alpha_loss(given["weights"]),
-        "texture": 0.5 * losses.texture_loss(given["textured"], given["weights"], given["target"]),
-        "opacity": 0.01 * losses.opacity_loss(given["opacities"]),
-        "grid": 0.01 * losses.grid_loss(given["grid"], given["resolutions"]),
-    }
-    assert set(terms) == {"l1", "dssim", "texture", "alpha", "opacity", "grid"}
-    assert_close(terms["l1"] + terms["dssim"], expected.pop("image"), kind="value", name="image")
-    for name, value in expected.items():
-        assert_close(terms[name], value, kind="value", name=name)
+def test_photo_losses_are_the_papers_total() -> None:
+    x = arguments()
+    terms = losses.photo_losses(**x, factors=LossWeights())
+    assert set(terms) == {"l1", "dssim", "texture", "alpha"}
+    image = image_loss(x["image"], x["target"], 0.2)
+    assert_close(terms["l1"] + terms["dssim"], image, kind="value", name="image")
+    assert_close(terms["alpha"], 0.005 * losses.alpha_loss(x["weights"]), kind="value", name="alpha")
+    texture = 0.5 * texture_loss(x["textured"], x["weights"], x["target"])
+    assert_close(terms["texture"], texture, kind="value", name="texture")
 
 
 @pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
 def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
     """For the term of the weights alone: the texture's has all of them."""
-    given = arguments(slots)
-    given["weights"].requires_grad_()
-    terms = losses.training_losses(**given, loss_weights=LossWeights())
-    missing = 1 - given["weights"].detach()[..., :counted].sum(-1)
+    x = arguments(slots)
+    x["weights"].requires_grad_()
+    terms = losses.photo_losses(**x, factors=LossWeights())
+    missing = 1 - x["weights"].detach()[..., :counted].sum(-1)
     assert_close(terms["alpha"], 0.005 * missing.mean(), kind="value", name="alpha")
-    (grad,) = torch.autograd.grad(terms["alpha"], given["weights"], retain_graph=True)
+    (grad,) = torch.autograd.grad(terms["alpha"], x["weights"], retain_graph=True)
     assert bool((grad[..., :counted] < 0).all()) and not grad[..., counted:].any()
-    texture = 0.5 * losses.texture_loss(given["textured"], given["weights"], given["target"])
+    texture = 0.5 * texture_loss(x["textured"], x["weights"], x["target"])
     assert_close(terms["texture"], texture, kind="value", name="texture")
 
 
 def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def names(given: dict[str, Any], **weights: Any) -> set[str]:
-        return set(losses.training_losses(**given, loss_weights=LossWeights(**weights)))
+    def names(slots: int = 2, **weights: Any) -> set[str]:
+        return set(losses.photo_losses(**arguments(slots), factors=LossWeights(**weights)))
 
-    assert names(arguments(slots=0)) == {"l1", "dssim", "opacity", "grid"}
-    assert names(arguments(with_grid=False)) == {"l1", "dssim", "texture", "alpha", "opacity"}
-    assert names(arguments(), dssim=1.0) == {"dssim", "texture", "alpha", "opacity", "grid"}
-    monkeypatch.setattr(losses, "dssim", None)
-    assert names(arguments(), dssim=0, alpha=0, texture=0, opacity=0, grid=0) == {"l1"}
+    assert names(slots=0) == {"l1", "dssim"}
+    assert names(dssim=1.0) == {"dssim", "texture", "alpha"}
+    monkeypatch.setattr(losses, "weighted_dssim", None)
+    assert names(dssim=0, alpha=0, texture=0) == {"l1"}
 
 
 def test_wrong_inputs_name_the_argument() -> None:
@@ -252,7 +243,7 @@ def test_wrong_inputs_name_the_argument() -> None:
 
 
 def scene_of_losses() -> dict[str, torch.Tensor]:
-    """Inputs of `training_losses`; leaves but for the target."""
+    """Inputs of `photo_losses`; leaves but for the target."""
     image, target = images()
     shape = image.shape[:2]
     leaves = {"image": image, "textured": 0.6 * image, "weights": torch.rand(*shape, 2, dtype=torch.float64)}
@@ -260,10 +251,7 @@ def scene_of_losses() -> dict[str, torch.Tensor]:
 
 
 def terms_of(tensors: dict[str, torch.Tensor], **options: Any) -> dict[str, torch.Tensor]:
-    factors = LossWeights(opacity=0.0, grid=0.0)
-    rest: dict[str, Any] = {"opacities": torch.rand(5), "grid": None, "resolutions": None}
-    given: dict[str, Any] = {**tensors, **rest, **options}
-    return losses.training_losses(**given, loss_weights=factors)
+    return losses.photo_losses(**tensors, factors=LossWeights(), **options)  # type: ignore[arg-type]
 
 
 def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:

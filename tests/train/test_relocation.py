@@ -63,7 +63,8 @@ def test_ranks_share_the_views(scene: Scene, tmp_path: Path) -> None:
     def work(ranks: Ranks) -> object:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(relocation, "reduced", noted)
-            return least_contributing(model, cameras, 0.3, ranks).tolist(), len(rendered)
+            mine = cameras[ranks.rank :: ranks.size]
+            return least_contributing(model, mine, 0.3, ranks.largest).tolist(), len(rendered)
 
     found = run_ranks(3, work, tmp_path)
     expected = least_contributing(model, cameras, 0.3)
@@ -85,7 +86,7 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
 def test_others_take_their_place(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
-    def first(model, cameras, share, ranks):
+    def first(model, cameras, share):
         removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
         return torch.arange(len(model.surfels)) < share * len(model.surfels)
 

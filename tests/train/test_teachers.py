@@ -16,7 +16,7 @@ from nexwarp.errors import CheckpointError
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.checkpoint import CHECKPOINTS
 from nexwarp.train.recipe import TextureConfig
-from nexwarp.train.teachers import Teachers
+from nexwarp.train.teachers import TaughtTargets
 from tests.ranks_support import alone_as
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -90,21 +90,26 @@ def test_photos_and_cameras_near_each_have_their_turn_once_in_a_round(tiny_scene
     orders = set()
     for round_ in range(3):
         numbers = range(2 * views * round_ + 1, 2 * views * (round_ + 1) + 1)
-        chosen = [student._next_view(number) for number in numbers]
+        chosen = [student.targets.next_view(number) for number in numbers]
         assert sorted(chosen[0::2]) == sorted(chosen[1::2]) == [*range(views)]
         orders.add(tuple(chosen[1::2]))
     assert len(orders) == 3
 
 
 def test_choices_follow_from_seed_and_number_alone(tiny_scene: Scene, teachers: list[Model]) -> None:
-    one, other = (Teachers(teachers, tiny_scene, CONFIG, CPU) for _ in range(2))
+    def targets(seed: int) -> TaughtTargets:
+        made = Trainer(tiny_scene, dataclasses.replace(CONFIG, seed=seed), CPU, teachers=teachers).targets
+        assert isinstance(made, TaughtTargets)
+        return made
+
+    one, other = targets(0), targets(0)
     numbers = [98, 4, 2, 40, 98]
     forward = {number: one.choice(number) for number in sorted(numbers)}
     for number in numbers:
         index, camera, model = other.choice(number)
         assert index == forward[number][0] and model is forward[number][2]
         assert torch.equal(camera.viewmat, forward[number][1].viewmat)
-    seeded = Teachers(teachers, tiny_scene, dataclasses.replace(CONFIG, seed=5), CPU)
+    seeded = targets(5)
     assert any(not torch.equal(seeded.choice(n)[1].viewmat, one.choice(n)[1].viewmat) for n in numbers)
 
 
@@ -203,8 +208,8 @@ def test_what_is_no_list_of_models_is_refused(tiny_scene: Scene, teachers: list[
     for wrong, message in given:
         with pytest.raises(TypeError, match=message):
             Trainer(tiny_scene, CONFIG, CPU, teachers=wrong)
-    assert Trainer(tiny_scene, CONFIG, CPU, teachers=iter(teachers)).teachers is not None
-    assert Trainer(tiny_scene, CONFIG, CPU, teachers=[]).teachers is None
+    assert Trainer(tiny_scene, CONFIG, CPU, teachers=iter(teachers)).targets.teachers
+    assert not Trainer(tiny_scene, CONFIG, CPU, teachers=[]).targets.teachers
 
 
 def test_the_command_learns_from_runs(
