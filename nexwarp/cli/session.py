@@ -235,8 +235,8 @@ class Session:
             "iterations_per_second": iterations / max(seconds, 1e-9),
             "device": torch.cuda.get_device_name(trainer.device) if trainer.device.type == "cuda" else "cpu",
         }
-        if trainer.teachers is not None:
-            facts["teachers"] = len(trainer.teachers.models)
+        if trainer.targets.teachers:
+            facts["teachers"] = len(trainer.targets.teachers)
         return facts
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:

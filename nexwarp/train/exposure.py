@@ -6,7 +6,6 @@ by least squares, reweighted so that highlights and occluders do not count. Prio
 mean gain, and the lens near no falloff.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -67,19 +66,6 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
     log_gains = torch.from_numpy(fit.gains)
     exposures = Exposures.of(log_gains, cameras, (*fit.lens.tolist(), fit.largest))
     return ExposureCalibration(exposures, log_gains.float().exp(), _point_colors(scene, seen, fit))
-
-
-class CalibrateOnce:
-    """Estimates the exposures of a scene for the first of several trainings, and returns copies for the others."""
-
-    def __init__(self) -> None:
-        self.results: list[ExposureCalibration | None] = []
-
-    def __call__(self, scene: Scene, config: Config) -> ExposureCalibration | None:
-        """Return what `calibrate_exposures` returns."""
-        if not self.results:
-            self.results.append(calibrate_exposures(scene, config))
-        return copy.deepcopy(self.results[0])
 
 
 class Observations(NamedTuple):

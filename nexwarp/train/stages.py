@@ -113,43 +113,22 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
     return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels) if count else NO_TEACHERS
 
 
-@dataclass(frozen=True)
-class Stages:
-    """Settings of the trainings of a run, in their order; none of them has teachers of its own.
-
-    Attributes:
-        teachers: settings of the teachers.
-        student: settings of the training whose model is the run's.
-    """
-
-    teachers: tuple[Config, ...]
-    student: Config
-
-    def in_order(self) -> list[Stage]:
-        """Return the stages, the student last."""
-        stages, before = [], 0
-        for number, config in enumerate(self.teachers, 1):
-            stages.append(Stage(config, len(self.teachers), number, before))
-            before += config.iterations
-        return [*stages, Stage(self.student, len(self.teachers), before=before)]
-
-
-def divide(config: Config, own: OwnTeachers) -> Stages:
-    """Return the stages of a run: teachers, and the student, which has the rest of the iterations.
+def divide(config: Config, own: OwnTeachers) -> list[Stage]:
+    """Return the stages of a run: its teachers, and the student, which has the rest of the iterations.
 
     Raises:
         SettingError: nothing is left for the student.
     """
-    taken, surfels = own.count * own.iterations, own.max_surfels or config.max_surfels
+    taken, count, surfels = own.count * own.iterations, own.count, own.max_surfels or config.max_surfels
     if config.iterations <= taken:
         raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
-    # Seeds of settings have 32 bits.
-    seeds = [derived_seed(config.seed, number, STREAM) % 2**32 for number in range(own.count)]
-    teachers = (
-        dataclasses.replace(config, seed=seed, iterations=own.iterations, max_surfels=surfels, teachers=0)
-        for seed in seeds
-    )
-    return Stages(tuple(teachers), dataclasses.replace(config, iterations=config.iterations - taken, teachers=0))
+    stages = []
+    for number in range(count):
+        seed = derived_seed(config.seed, number, STREAM) % 2**32  # seeds of settings have 32 bits
+        settings = dataclasses.replace(config, seed=seed, iterations=own.iterations, max_surfels=surfels, teachers=0)
+        stages.append(Stage(settings, count, number + 1, number * own.iterations))
+    student = dataclasses.replace(config, iterations=config.iterations - taken, teachers=0)
+    return [*stages, Stage(student, count, before=taken)]
 
 
 class StageStore(Protocol):
@@ -213,7 +192,7 @@ class StageRunner:
             OutOfMemoryError: it names the teacher, and says how to train without.
         """
         while self.stage.teacher:
-            with training_teacher(self.stage.number, self.stage.teachers):
+            with _naming(self.stage):
                 self.store.train(self.stage, self.trainer)
             self.models.append(self.store.finish(self.stage, self.trainer))
             del self.trainer  # before the next one takes memory
@@ -230,12 +209,12 @@ class StageRunner:
 
 
 @contextmanager
-def training_teacher(number: int, count: int) -> Iterator[None]:
-    """Name a teacher, counted from 1, in an OutOfMemoryError of its training, and say how to do without."""
+def _naming(stage: Stage) -> Iterator[None]:
+    """Name the teacher in an OutOfMemoryError of its training, and say how to do without."""
     try:
         yield
     except OutOfMemoryError as error:
-        message = f"teacher {number} of {count}: {error}, or do without teachers (--set teachers=0)"
+        message = f"{stage.name}: {error}, or do without teachers (--set teachers=0)"
         raise OutOfMemoryError(message, error.needed) from error
 
 
@@ -302,7 +281,7 @@ def stage_runner(
             return Trainer(scene, settings, device, teachers=learned_from, **options)
         return ParallelTrainer(scene, settings, device, ranks, teachers=learned_from, **options)
 
-    return StageRunner(divide(config, own).in_order(), make, store, models)  # type: ignore[arg-type]
+    return StageRunner(divide(config, own), make, store, models)  # type: ignore[arg-type]
 
 
 def student_trainer(scene: Scene, config: Config, device: torch.device | str, **options: Any) -> Trainer:

@@ -31,9 +31,7 @@ from nexwarp.train.recipe import Config
 from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
-MOMENTS = 2  # tensors that Adam keeps of each parameter
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
-HEADERS = 2**20  # bytes of a checkpoint beside its parameters, at most
 FLOATS = ("surfels.", "texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
 
 

@@ -1,6 +1,5 @@
 """Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
 
-import copy
 import dataclasses
 import pickle
 from typing import Any
@@ -22,7 +21,6 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.exposure import (
     PRIOR,
-    CalibrateOnce,
     ExposureCalibration,
     Observations,
     calibrate_exposures,
@@ -252,29 +250,6 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     seen = Observations(view, point, observed[:, None], np.zeros(count), np.zeros((points, 3)))
     gains = solve_gains(seen, observed, weights, photos)
     np.testing.assert_allclose(gains, expected - expected.mean(), rtol=0, atol=1e-10)
-
-
-def test_trainings_of_a_run_share_one_calibration(tmp_path, monkeypatch):
-    """Each has a copy of its own, whatever the one before does with its exposures."""
-    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
-    results = [present(calibrate_exposures(scene, Config()))]
-    expected = copy.deepcopy(results[0])
-    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", lambda *_: results.pop())
-    calibrate = CalibrateOnce()
-    for seed in range(3):
-        found = present(calibrate(scene, Config(seed=seed)))
-        assert torch.equal(found.gains, expected.gains) and torch.equal(found.colors, expected.colors)
-        state = found.exposures.state_dict()
-        assert all(torch.equal(state[name], x) for name, x in expected.exposures.state_dict().items())
-        for value in (found.gains, found.colors, *state.values()):
-            value.zero_()
-
-
-def test_that_photos_have_one_exposure_is_kept_too(tiny_scene, monkeypatch):
-    results = [None]
-    monkeypatch.setattr(exposure_calibration, "calibrate_exposures", lambda *_: results.pop())
-    calibrate = CalibrateOnce()
-    assert [calibrate(tiny_scene, Config(seed=seed)) for seed in range(3)] == [None] * 3
 
 
 def test_photos_that_share_nothing_keep_their_colours():

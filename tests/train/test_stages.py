@@ -20,7 +20,6 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
 from nexwarp.run.folder import RunRecord, create_run, read_run
-from nexwarp.train import exposure
 from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
@@ -45,6 +44,11 @@ SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS f
 def same(one: Model, other: Model) -> bool:
     theirs = other.state_dict()
     return all(torch.equal(x, theirs[name]) for name, x in one.state_dict().items())
+
+
+def settings_of(config: Config, own: OwnTeachers) -> list[Config]:
+    """The settings of a run's stages, the student's last."""
+    return [stage.config for stage in divide(config, own)]
 
 
 @pytest.mark.parametrize(
@@ -87,13 +91,13 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
         with pytest.raises(SettingError, match="iterations: expected more than the teachers' 8, got 7"):
             divide(config, plan_teachers(config, 20))
         return
-    stages = divide(config, plan_teachers(config, 20))
-    lengths = [each.iterations for each in stages.teachers]
+    *before, student = settings_of(config, plan_teachers(config, 20))
+    lengths = [each.iterations for each in before]
     assert len(set(lengths)) == 1 and min(lengths) >= 1
-    assert sum(lengths) + stages.student.iterations == iterations
+    assert sum(lengths) + student.iterations == iterations
     assert abs(sum(lengths) - 0.4 * iterations) < count or lengths[0] == 1
-    assert len({each.seed for each in (*stages.teachers, stages.student)}) == count + 1 and stages.student.seed == 5
-    for each in (*stages.teachers, stages.student):
+    assert len({each.seed for each in (*before, student)}) == count + 1 and student.seed == 5
+    for each in (*before, student):
         assert each == dataclasses.replace(config, teachers=0, iterations=each.iterations, seed=each.seed)
 
 
@@ -102,15 +106,15 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
 )
 def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> None:
     config = Config(max_surfels=budget, teachers=2)
-    stages = divide(config, plan_teachers(config, 20))
-    assert {each.max_surfels for each in stages.teachers} == {teachers} and stages.student.max_surfels == budget
+    *before, student = settings_of(config, plan_teachers(config, 20))
+    assert {each.max_surfels for each in before} == {teachers} and student.max_surfels == budget
     # As in a run from before.
-    assert {each.max_surfels for each in divide(config, OwnTeachers(2, 10)).teachers} == {budget}
+    assert {each.max_surfels for each in settings_of(config, OwnTeachers(2, 10))[:-1]} == {budget}
 
 
 def test_seeds_of_teachers_follow_from_the_runs() -> None:
     def seeds(seed: int) -> list[int]:
-        return [each.seed for each in divide(Config(seed=seed), OwnTeachers(2, 10)).teachers]
+        return [each.seed for each in settings_of(Config(seed=seed), OwnTeachers(2, 10))[:-1]]
 
     assert seeds(3) == seeds(3) and not set(seeds(3)) & set(seeds(4))
 
@@ -137,11 +141,11 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
 
     found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
     assert seen == [*range(1, 21)]
-    stages = divide(CONFIG, OwnTeachers(2, 4, 240))
-    files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
+    *before, student = settings_of(CONFIG, OwnTeachers(2, 4, 240))
+    files = [nw.train(tiny_scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in before]
     teachers = [nw.load(file) for file in files]
-    assert same(found, nw.train(tiny_scene, stages.student, device=CPU, teachers=teachers))
-    assert not same(found, nw.train(tiny_scene, stages.student, device=CPU))
+    assert same(found, nw.train(tiny_scene, student, device=CPU, teachers=teachers))
+    assert not same(found, nw.train(tiny_scene, student, device=CPU))
     # Models that are given take the place of its own teachers.
     alone = dataclasses.replace(CONFIG, teachers=0)
     given = nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
@@ -165,7 +169,6 @@ def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
         seen.append(config)
         return calibrate_exposures(scene, config)
 
-    monkeypatch.setattr(exposure, "calibrate_exposures", calibrate)
     monkeypatch.setattr(train_stages, "calibrate_exposures", calibrate)
     return seen
 
@@ -175,9 +178,9 @@ def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list
     scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
     found = nw.train(scene, config, device=CPU)
     assert len(calibrations) == 1 and found.exposures is not None
-    stages = divide(config, OwnTeachers(2, 4, 240))
-    files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in stages.teachers]
-    assert same(found, nw.train(scene, stages.student, device=CPU, teachers=map(nw.load, files)))
+    *before, student = settings_of(config, OwnTeachers(2, 4, 240))
+    files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in before]
+    assert same(found, nw.train(scene, student, device=CPU, teachers=map(nw.load, files)))
 
 
 def test_the_command_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
