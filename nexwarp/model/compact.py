@@ -90,18 +90,18 @@ def decode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     Raises:
         ValueError: a tensor that decodes another is missing, or does not fit to it.
     """
-    found = {name: x for name, x in tensors.items() if not name.endswith(CODE)}
-    for name, tensor in found.items():
+    full = {name: x for name, x in tensors.items() if not name.endswith(CODE)}
+    for name, tensor in full.items():
         if name in ROUNDED or name == QUATS:
-            found[name] = tensor.float()
+            full[name] = tensor.float()
         elif name in DTYPES:
             rows = 3 if name in CURVED else 1 if name in SQUARED else 2
             if name + CODE not in tensors:
                 raise ValueError(f"expected the tensor {name + CODE}, found none")
             code = tensors[name + CODE]
             check_tensors({name + CODE: (code, (rows, *_columns(name, tensor.shape)))}, dtype=torch.float32)
-            found[name] = _decoded(name, tensor.double(), code.double()).float()
-    return found
+            full[name] = _decoded(name, tensor.double(), code.double()).float()
+    return full
 
 
 def _columns(name: str, shape: torch.Size) -> tuple[int, ...]:

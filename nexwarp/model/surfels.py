@@ -173,9 +173,9 @@ def check_coefficients(name: str, count: int) -> None:
     """Raise ValueError unless `count` is the number of coefficients of an SH degree, 0 to 3."""
     if count not in COEFFICIENTS:
         *most, last = COEFFICIENTS
-        told = f"{', '.join(map(str, most))} or {last}"
+        counts = f"{', '.join(map(str, most))} or {last}"
         removed = "; SH degrees above 3 were removed" if count in (25, 36, 49) else ""
-        raise ValueError(f"{name}: expected {told} spherical harmonics coefficients, got {count}{removed}")
+        raise ValueError(f"{name}: expected {counts} spherical harmonics coefficients, got {count}{removed}")
 
 
 def _check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:

@@ -7,6 +7,7 @@ from typing import TypedDict
 
 import torch
 from torch import nn
+from typing_extensions import Unpack
 
 from nexwarp import ops
 from nexwarp.errors import check_range, check_tensors
@@ -22,7 +23,14 @@ LARGEST_RESOLUTION = 1e9
 FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
 
 
-class TextureShape(TypedDict):
+class TextureFlags(TypedDict, total=False):
+    """Arguments of `NeuralTexture` that files of nexwarp 0.1 do not have."""
+
+    residual: bool
+    down_weighting: bool
+
+
+class TextureShape(TextureFlags):
     """Arguments of `NeuralTexture`, as a model file keeps them."""
 
     levels: int
@@ -33,8 +41,6 @@ class TextureShape(TypedDict):
     width: int
     hidden_layers: int
     sh_degree: int
-    residual: bool
-    down_weighting: bool
 
 
 class NeuralTexture(nn.Module):
@@ -64,8 +70,7 @@ class NeuralTexture(nn.Module):
         width: int = 64,
         hidden_layers: int = 2,
         sh_degree: int = 3,
-        residual: bool = False,
-        down_weighting: bool = True,
+        **flags: Unpack[TextureFlags],
     ) -> None:
         """Make a field with initial values.
 
@@ -78,17 +83,25 @@ class NeuralTexture(nn.Module):
             width: width of the hidden layers.
             hidden_layers: number of hidden layers.
             sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
-            residual: add the texture's colours to the surfels' plain colours instead of replacing them. Where no photo
-                trained the field it is 0, and the plain colours remain.
-            down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
+            flags: residual: add the texture's colours to the surfels' plain colours instead of replacing them; where no
+                photo trained the field it is 0, and the plain colours remain; False by default. down_weighting:
+                down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4); True by default.
 
         Raises:
             TypeError, ValueError: the message names the argument.
         """
         super().__init__()
         check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
-        _check_resolutions(min_resolution, max_resolution)
-        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+        for name, value, low in (
+            ("min_resolution", min_resolution, 1e-30),
+            ("max_resolution", max_resolution, min_resolution),
+        ):
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+            check_range(name, value, low, LARGEST_RESOLUTION)
+        for name, flag in flags.items():
+            if name not in TextureFlags.__annotations__:
+                raise TypeError(f"{name}: expected an argument of NeuralTexture")
             if not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected True or False, got {flag!r}")
         self.config: TextureShape = {
@@ -100,11 +113,11 @@ class NeuralTexture(nn.Module):
             "width": width,
             "hidden_layers": hidden_layers,
             "sh_degree": sh_degree,
-            "residual": residual,
-            "down_weighting": down_weighting,
+            "residual": flags.get("residual", False),
+            "down_weighting": flags.get("down_weighting", True),
         }
         self.sh_degree = sh_degree
-        self.residual, self.down_weighting = residual, down_weighting
+        self.residual, self.down_weighting = self.config["residual"], self.config["down_weighting"]
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
         self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
@@ -121,13 +134,10 @@ class NeuralTexture(nn.Module):
         return self.grid.device
 
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
-        """Return how many values an evaluation keeps for each point, at least, and their dtype.
+        """Return how many values an evaluation up to an SH degree keeps for each point, at least, and their dtype.
 
         Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone.
         Without gradients, those keep nothing, nor does a CPU, which evaluates part of the points at a time.
-
-        Args:
-            sh_degree: SH degree of the evaluation.
         """
         *hidden, last = self.mlp.parameters()
         features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
@@ -251,6 +261,7 @@ def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_
     for name, value, low, high in (
         ("levels", levels, 1, 64),
         ("table_size", table_size, 1, 2**30),
+        ("features", features, 1, 8),
         ("width", width, 1, 4096),
         ("hidden_layers", hidden_layers, 0, 64),
         ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
@@ -260,16 +271,5 @@ def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_
         check_range(name, value, low, high)
     if table_size & (table_size - 1):
         raise ValueError(f"table_size: expected a power of two, got {table_size}")
-    if isinstance(features, bool) or not isinstance(features, int):
-        raise TypeError(f"features: expected an int, got {type(features).__name__}")
     if features not in (1, 2, 4, 8):
         raise ValueError(f"features: expected 1, 2, 4 or 8, got {features}")
-
-
-def _check_resolutions(min_resolution: float, max_resolution: float) -> None:
-    """Raise TypeError or ValueError unless the resolutions are numbers in their ranges."""
-    for name, value in (("min_resolution", min_resolution), ("max_resolution", max_resolution)):
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    check_range("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
-    check_range("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
