@@ -20,14 +20,14 @@ SETS = ("train", "test")
 def save_cameras(
     path: Path,
     cameras: Mapping[str, Mapping[str, Camera]],
-    given: Mapping[str, Mapping[str, Camera]] | None = None,
+    before: Mapping[str, Mapping[str, Camera]] | None = None,
 ) -> None:
     """Write cameras as JSON: set ("train", "test") -> name -> camera.
 
     Args:
         path: file to write.
         cameras: the cameras.
-        given: the same cameras before their poses were refined; those that differ are written, too.
+        before: the same cameras before their poses were refined; those that differ are written, too.
 
     Raises:
         OSError: `path` cannot be written.
@@ -40,7 +40,7 @@ def save_cameras(
                 "width": camera.width,
                 "height": camera.height,
                 "near": camera.near,
-                **_given(camera, None if given is None else given[group][name]),
+                **_pose_before(camera, None if before is None else before[group][name]),
             }
             for name, camera in members.items()
         }
@@ -49,11 +49,10 @@ def save_cameras(
     write_json(path, data)
 
 
-def _given(camera: Camera, given: Camera | None) -> dict[str, list[list[float]]]:
-    """Return the entry of the given pose of a camera whose pose was refined; nothing for any other camera."""
-    if given is None or torch.equal(given.viewmat.cpu(), camera.viewmat.cpu()):
+def _pose_before(camera: Camera, before: Camera | None) -> dict[str, list[list[float]]]:
+    if before is None or torch.equal(before.viewmat.cpu(), camera.viewmat.cpu()):
         return {}
-    return {"given_viewmat": given.viewmat.tolist()}
+    return {"given_viewmat": before.viewmat.tolist()}
 
 
 def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:

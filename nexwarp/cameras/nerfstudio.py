@@ -11,6 +11,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -165,8 +166,8 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
     if "camera_path" not in data:
         if "frames" in data:
             return CameraPath(list(_frames(path, data, near).values()), None)
-        found = ", ".join(sorted(data)[:8]) or "none"
-        raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(found)}")
+        keys = ", ".join(sorted(data)[:8]) or "none"
+        raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(keys)}")
     if data.get("camera_type", "perspective") != "perspective":
         raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
@@ -182,7 +183,7 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
             fov = _number(where, entry, "fov", above=0.0, below=180.0)
             fx = fy = height / (2 * math.tan(math.radians(fov) / 2))
             cx, cy = width / 2, height / 2
-        cameras.append(_camera(where, pose, (fx, fy, cx, cy), width, height, near))
+        cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near))
     return CameraPath(cameras, fps)
 
 
@@ -201,21 +202,11 @@ def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
         pose[:3, 3] /= scale
         values = {**data, **frame}
         width, height = (_size(where, values, key) for key in ("w", "h"))
-        if "fl_x" in values or "fl_y" in values:
-            # A single focal length holds for both axes.
-            fx, fy = (
-                _number(where, values, key if key in values else other)
-                for key, other in (("fl_x", "fl_y"), ("fl_y", "fl_x"))
-            )
-        else:
-            fx = _focal(where, values, "camera_angle_x", width)
-            fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
-        cx = _number(where, values, "cx") if "cx" in values else width / 2
-        cy = _number(where, values, "cy") if "cy" in values else height / 2
+        intrinsics = _intrinsics_of(where, values, width, height)
         name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
-        cameras[name] = _camera(where, undo @ pose, (fx, fy, cx, cy), width, height, near)
+        cameras[name] = _camera(where, undo @ pose, intrinsics, (width, height), near)
     return cameras
 
 
@@ -228,13 +219,25 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     return dict(zip(INTRINSICS, (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
 
 
+def _intrinsics_of(where: str, values: Mapping[str, Json], width: int, height: int) -> tuple[float, ...]:
+    if "fl_x" in values or "fl_y" in values:  # a single focal length holds for both axes
+        fx = _number(where, values, "fl_x" if "fl_x" in values else "fl_y")
+        fy = _number(where, values, "fl_y" if "fl_y" in values else "fl_x")
+    else:
+        fx = _focal(where, values, "camera_angle_x", width)
+        fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
+    cx = _number(where, values, "cx") if "cx" in values else width / 2
+    cy = _number(where, values, "cy") if "cy" in values else height / 2
+    return fx, fy, cx, cy
+
+
 def _camera(
-    where: str, pose: torch.Tensor, intrinsics: tuple[float, ...], width: int, height: int, near: float
+    where: str, pose: torch.Tensor, intrinsics: tuple[float, ...], size: tuple[int, int], near: float
 ) -> Camera:
     fx, fy, cx, cy = intrinsics
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     try:
-        return Camera(torch.linalg.inv(pose @ FLIP).float(), K, width, height, near)
+        return Camera(torch.linalg.inv(pose @ FLIP).float(), K, *size, near)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
@@ -260,12 +263,10 @@ def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
         raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
     if len(entries) > MAX_CAMERAS:
         raise FormatError(f"{path}: {key}: expected at most {MAX_CAMERAS:,} cameras, got {len(entries):,}")
-    objects = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
-        objects.append(entry)
-    return objects
+    return cast(list[JsonObject], entries)
 
 
 def _number(

@@ -1,4 +1,4 @@
-"""Camera paths for videos: an ellipse, a spiral, or an interpolation from view to view."""
+"""Cameras made of others: paths for videos, random cameras between those of a scene, and a ring around points."""
 
 import math
 from collections.abc import Sequence
@@ -14,6 +14,16 @@ DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as
 ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral
 SPREAD = 0.9  # share of the cameras that a spiral spans along each axis
 FRAMES_PER_KEY = 10
+
+NEIGHBORS = 4  # nearest cameras of a similar direction, from which the neighbour of `between` is drawn
+ALIKE = math.cos(math.radians(60.0))
+BEYOND = 0.5  # how far beyond either camera a new one may lie, as a share of their distance
+
+RING_WIDTH, RING_HEIGHT = 1280, 720  # pixels, of `surrounding`
+RING_FOV = 0.9  # vertical, radians
+RING_DISTANCE = 3.0  # of the cameras from the middle, in median distances of the points from there
+RING_RISE = 0.3  # height of the ring above the middle, as a fraction of its radius
+RING_UP = (0.0, -1.0, 0.0)  # of most COLMAP models
 
 
 def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
@@ -120,6 +130,66 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
     rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
     placed = zip(torch.from_numpy(rotations), torch.from_numpy(positions), strict=True)
     return [with_pose(cameras[0], rotation, position) for rotation, position in placed]
+
+
+def between(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera]:
+    """Draw for each camera a new one on the line through it and a neighbour.
+
+    The new camera lies between the two or beyond either by at most half their distance. The neighbour is drawn from the
+    4 nearest cameras whose optical axes are within 60 degrees of the camera's; without any, the pose stays. Position
+    and rotation are interpolated linearly; intrinsics, size, near, dtype and device are the camera's. The result is
+    equivariant under rigid motions and scaling of all cameras.
+
+    Args:
+        cameras: at least one.
+        generator: CPU generator of all random numbers.
+
+    Returns:
+        One camera for each given one, in their order.
+
+    Raises:
+        ValueError: no cameras.
+    """
+    from scipy.spatial.transform import Rotation
+
+    viewmats, centres = camera_poses(cameras)
+    drawn, places = torch.rand(2, len(cameras), generator=generator, dtype=torch.float64)
+    distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
+    axes = viewmats[:, 2, :3]
+    distances = distances.where(axes @ axes.mT >= ALIKE, torch.inf).fill_diagonal_(torch.inf)
+    nearest = distances.topk(min(NEIGHBORS, len(cameras)), largest=False)
+    choices = nearest.values.isfinite().sum(dim=1)
+    chosen = (drawn * choices).long()[:, None]
+    others = nearest.indices.gather(1, chosen)[:, 0].where(choices > 0, torch.arange(len(cameras)))
+    places = places * (1 + 2 * BEYOND) - BEYOND
+    turned = Rotation.from_matrix(viewmats[:, :3, :3].numpy())
+    turns = (turned[others.numpy()] * turned.inv()).as_rotvec() * places[:, None].numpy()
+    rotations = torch.from_numpy((Rotation.from_rotvec(turns) * turned).as_matrix())
+    positions = torch.lerp(centres, centres[others], places[:, None])
+    return [with_pose(*each) for each in zip(cameras, rotations, positions, strict=True)]
+
+
+def surrounding(points: torch.Tensor, near: float, count: int = 12) -> list[Camera]:
+    """Return cameras on a ring around the median of points (N, 3), which they look at, with up direction -y.
+
+    The radius is three times the median distance of the points from their median. The cameras have 1280 x 720 pixels, a
+    vertical field of view of 0.9 rad and the near depth `near`, float32 on the CPU.
+    """
+    positions = points.detach().double().cpu()
+    middle = positions.median(dim=0).values if len(positions) else torch.zeros(3, dtype=torch.float64)
+    spread = (positions - middle).norm(dim=1).median().item() if len(positions) else 1.0
+    radius = RING_DISTANCE * (spread or 1.0)
+    up = torch.tensor(RING_UP, dtype=torch.float64)
+    focal = 0.5 * RING_HEIGHT / math.tan(0.5 * RING_FOV)
+    K = torch.tensor([[focal, 0.0, RING_WIDTH / 2], [0.0, focal, RING_HEIGHT / 2], [0.0, 0.0, 1.0]])
+    cameras: list[Camera] = []
+    for index in range(count):
+        angle = 2.0 * math.pi * index / count
+        offset = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=torch.float64) + RING_RISE * up
+        cameras.append(
+            Camera(look_at(middle + radius * offset, middle, up).float(), K.clone(), RING_WIDTH, RING_HEIGHT, near)
+        )
+    return cameras
 
 
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from nexwarp.cameras.around import surrounding
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
+from nexwarp.cameras.paths import surrounding
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.model.detail import ORDERED

@@ -13,8 +13,8 @@ from functools import partial
 
 import torch
 
-from nexwarp.cameras.between import between
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import between
 from nexwarp.data import Scene
 from nexwarp.machine import derived_seed
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs

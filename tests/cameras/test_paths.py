@@ -6,9 +6,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nexwarp.cameras.between import between
 from nexwarp.cameras.camera import Camera, reduced, resized
-from nexwarp.cameras.paths import ellipse, focus, interpolate, look_at, spiral
+from nexwarp.cameras.paths import between, ellipse, focus, interpolate, look_at, spiral
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -111,26 +110,6 @@ def test_path_starts_beside_the_first_camera_and_turns_one_way() -> None:
         assert (torch.linalg.cross(spokes, spokes.roll(-1, 0))[:, 2] > 0).all()
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
-def test_path_moves_and_scales_with_the_cameras(scale: float) -> None:
-    cameras, motion = ring(), similarity(scale)
-    expected = [moved(each, motion) for each in ellipse(cameras, 17)]
-    actual = ellipse([moved(each, motion) for each in cameras], 17)
-    for mine, theirs in zip(actual, expected, strict=True):
-        assert_close(mine.viewmat, theirs.viewmat, kind="value", name="viewmat")
-
-
-def test_path_takes_the_rest_from_the_first_camera(device: torch.device) -> None:
-    cameras = [each.to(device, torch.float32) for each in ring()]
-    path = ellipse(cameras, 5)
-    assert len(path) == 5
-    for each in path:
-        assert each.viewmat.dtype == torch.float32 and each.device == cameras[0].device
-        assert each.K.equal(cameras[0].K)
-        assert (each.width, each.height, each.near) == (64, 48, 0.2)
-    assert len(ellipse(cameras)) == 120
-
-
 def test_an_upright_wall_of_cameras_gives_an_upright_ellipse() -> None:
     target = torch.tensor([0.0, 4.0, 0.0])
     places = [torch.tensor([float(x), 0.0, float(z)]) for x in range(-3, 4) for z in range(-1, 2)]
@@ -200,19 +179,19 @@ def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
             assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
 
 
-@pytest.mark.parametrize("make", [spiral, interpolate])
+@pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
 @pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
-def test_the_other_paths_move_and_scale_with_the_cameras(make, scale: float) -> None:
-    cameras, motion = row(), similarity(scale)
+def test_paths_move_and_scale_with_the_cameras(make, cameras_of, scale: float) -> None:
+    cameras, motion = cameras_of(), similarity(scale)
     expected = [moved(each, motion) for each in make(cameras, 23)]
     actual = make([moved(each, motion) for each in cameras], 23)
     for mine, theirs in zip(actual, expected, strict=True):
         assert (mine.viewmat - theirs.viewmat).abs().max() < 1e-7 * max(scale, 1.0)
 
 
-@pytest.mark.parametrize("make", [spiral, interpolate])
-def test_the_other_paths_take_the_rest_from_the_first_camera(make, device: torch.device) -> None:
-    path = make([each.to(device, torch.float32) for each in row()], 5)
+@pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
+def test_paths_take_the_rest_from_the_first_camera(make, cameras_of, device: torch.device) -> None:
+    path = make([each.to(device, torch.float32) for each in cameras_of()], 5)
     assert len(path) == 5
     for each in path:
         assert each.viewmat.dtype == torch.float32 and each.device.type == device.type

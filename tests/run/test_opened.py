@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras.around import surrounding
+from nexwarp.cameras.paths import surrounding
 from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
 from nexwarp.run.evaluate import evaluate
