@@ -41,7 +41,7 @@ def test_a_pinhole_given_as_rays_is_the_pinhole(device, seed, max_hits):
             assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name, allow_flips=FLIPS)
 
 
-def everywhere(surfels, reaches, keys, rays):
+def everywhere(surfels, keys, rays):
     """Lists that cull nothing."""
     order = torch.sort(keys.float(), stable=True).indices.int()
     columns, rows = -(-rays.shape[1] // 16), -(-rays.shape[0] // 16)
