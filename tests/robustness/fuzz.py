@@ -54,14 +54,7 @@ class Failure:
 
 @dataclass
 class Result:
-    """Outcomes of a target's inputs.
-
-    Attributes:
-        inputs: how many ran.
-        loaded: how many of them loaded; the others were refused.
-        refusals: count of each documented exception.
-        failures: one for each input that failed.
-    """
+    """Outcomes of a target's inputs: those that did not load were refused with a documented exception, or failed."""
 
     inputs: int = 0
     loaded: int = 0
@@ -100,13 +93,7 @@ def _causes(error: BaseException) -> list[BaseException]:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A target's inputs.
-
-    Attributes:
-        target: the reader and its valid inputs.
-        seed: of the inputs.
-        failed: folder for inputs that failed.
-    """
+    """A target's inputs; those that fail are kept in the folder `failed`."""
 
     target: FuzzTarget
     seed: int

@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,15 +23,13 @@ from nexwarp.data.ply import read_ply, write_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.export.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
-from nexwarp.io.json_files import read_object, write_json
+from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
-from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.run.log import keep_lines
 from nexwarp.train.recipe import Config
-from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
 from tests.robustness.fuzz_inputs import Files
 from tests.robustness.fuzz_models import (
@@ -264,29 +261,6 @@ def _read_log(folder: Path) -> None:
         raise ValueError(f"{file}: expected two lines up to iteration 3, got {len(before)} bytes of others")
 
 
-def _options(folder: Path) -> list[Files]:
-    render = {"max_hits": 2, "background": [0.1, 0.2, 0.3], "sh_degree": 1, "low_pass": False, "clamp_texture": True}
-    render |= {"exposure": "photos", "detail_limits": False}
-    settings = ["skybox=10", "texture.levels=4", "rates.means=[1e-4, 1e-6]", "mask_mode=background", "background=null"]
-    write_json(folder / "options.json", {"render": render, "settings": settings})
-    return [_files(folder)]
-
-
-def _read_options(folder: Path) -> None:
-    """Make options of a rendering and settings of a training; their errors name no file."""
-    try:
-        data: Any = read_object(folder / "options.json")
-        render: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in dict(data["render"]).items()}
-        options = RenderOptions().changed(**render)
-        with_settings(Config(), parse_settings(str(x) for x in data["settings"]))
-    except KeyError as error:
-        raise ValueError(f"{folder}: {error}") from None
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"{folder}: {error}") from None
-    full = some_model()
-    check_rendering(Model(full.surfels, full.texture, full.exposures, full.detail_limits, options))
-
-
 def _read_cameras(folder: Path) -> None:
     for members in load_cameras(folder / "cameras.json").values():
         for camera in members.values():
@@ -397,7 +371,6 @@ TARGETS = {
         FuzzTarget("checkpoint", _checkpoint, _read_checkpoint, (".json", ".safetensors")),
         FuzzTarget("metrics", _metrics, read_metrics, (".json",)),
         FuzzTarget("log", _log, _read_log, (".jsonl",)),
-        FuzzTarget("options", _options, _read_options, (".json",)),
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
         FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),

@@ -27,17 +27,7 @@ from tests.trainer_support import assert_same_state, small
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
-FLAGS = [
-    "--iterations",
-    "3",
-    "--max-surfels",
-    "24",
-    "--checkpoint-every",
-    "1",
-    "--deterministic",
-    "--set",
-    "cuda_graphs=false",
-]
+FLAGS = "--iterations 3 --max-surfels 24 --checkpoint-every 1 --deterministic --set cuda_graphs=false".split()
 STEPS = 4  # of a training that lacks memory: a round of density control is the third
 FAULTS = [
     "CUDA error: device-side assert triggered\nCUDA kernel errors might be asynchronously reported",
@@ -129,36 +119,6 @@ def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scen
             run.run(until=STEPS)
         assert_same_state(run, expected)
     assert failed > 5
-
-
-@pytest.mark.parametrize(
-    ("error", "repeated"),
-    [(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True),
-     (OutOfMemoryError("out of memory", "2.00 GiB"), True),
-     (step_graphs.UpdateError("out of memory", "2.00 GiB"), False),
-     (RuntimeError("shape mismatch"), False)],
-)  # fmt: skip
-def test_a_step_is_repeated_without_graphs_only_if_it_has_updated_nothing(monkeypatch, error, repeated):
-    done: list[str] = []
-    graphs = object.__new__(step_graphs.StepGraphs)
-    graphs.chances, graphs.keeper = 3, object()  # type: ignore[assignment]  # stands for a graph
-
-    def fail(*_: Any) -> NoReturn:
-        raise error
-
-    def work(target: Any) -> Any:
-        done.append(target)
-        return target
-
-    monkeypatch.setattr(graphs, "_run", fail)
-    monkeypatch.setattr(graphs, "clear", lambda: done.append("cleared"))
-    if repeated:
-        assert graphs.run("target", work, None) == "target"  # type: ignore[arg-type]
-        assert done == ["cleared", "target"] and graphs.chances == 2
-    else:
-        with pytest.raises(type(error)):
-            graphs.run("target", work, None)  # type: ignore[arg-type]
-        assert not done
 
 
 def test_an_update_that_lacks_memory_is_told_apart(tiny_scene, monkeypatch, device):

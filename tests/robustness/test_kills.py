@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,13 @@ from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.run.contents import CONFIG_FILE
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
-from tests.robustness.kills import kill_and_resume
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]
@@ -83,42 +82,30 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, device: str, count:
     flags = ["--device", device, *(["--deterministic"] if device == "cuda" else [])]
     arguments = ["train", str(scene), *FLAGS, *flags]
     command = [sys.executable, "-c", "from tests.robustness.test_kills import main; main()", *arguments]
-    processes: list[subprocess.Popen[bytes]] = []
-
-    def start(run: Path, moment: Moment) -> subprocess.Popen[bytes]:
-        environment = os.environ | python_path(ROOT)
-        if isinstance(moment, tuple):
-            environment[KILL_AT] = f"{moment[1]} {moment[0]}"
-        silent = subprocess.DEVNULL
-        processes.append(subprocess.Popen([*command, "--run", str(run)], env=environment, stdout=silent, stderr=silent))
-        return processes[-1]
-
-    def resume(run: Path, moment: Moment) -> int:
-        if isinstance(moment, tuple):
-            assert processes[-1].returncode == -signal.SIGKILL, moment
-            assert not (run / MODEL_FILE).exists() and has_checkpoint(run), moment
-        return cli.main(["train", str(scene), "--run", str(run), "--device", device, "--resume"])
-
+    silent = subprocess.DEVNULL
     begun = time.perf_counter()
     assert cli.main([*arguments, "--run", str(tmp_path / "whole")]) == 0
     expected, length = (tmp_path / "whole" / MODEL_FILE).read_bytes(), time.perf_counter() - begun
-    kills = []
+    in_stages = 0
     for number, moment in enumerate(moments(count)):
-        seconds = math.inf if isinstance(moment, tuple) else moment * length
-        run = tmp_path / f"run{number}"
-        starting, resuming = partial(start, moment=moment), partial(resume, moment=moment)
-        kills.append(kill_and_resume(starting, resuming, run, seconds, expected))
-    assert all(kill.same for kill in kills), kills
-    assert sum(kill.seconds == math.inf for kill in kills) == min((count + 1) // 2, len(STAGES) * len(VIEWS))
-
-
-def test_a_kill_is_waited_for(tmp_path):
-    """A training that ends before its moment is an error only when it began nothing."""
-
-    def start(run: Path) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
-
-    begun = time.perf_counter()
-    with pytest.raises(RuntimeError, match="ended by itself, with exit code 7"):
-        kill_and_resume(start, lambda _: 0, tmp_path / "run", 60.0, b"")
-    assert time.perf_counter() - begun < 30
+        run, environment, seconds = tmp_path / f"run{number}", os.environ | python_path(ROOT), math.inf
+        if isinstance(moment, tuple):
+            environment[KILL_AT] = f"{moment[1]} {moment[0]}"
+        else:
+            seconds = moment * length
+        process = subprocess.Popen([*command, "--run", str(run)], env=environment, stdout=silent, stderr=silent)
+        while not (run / CONFIG_FILE).is_file():
+            assert process.poll() is None, "the training ended by itself"
+            time.sleep(0.002)
+        begun = time.perf_counter()
+        while process.poll() is None and time.perf_counter() - begun < seconds:
+            time.sleep(0.002)
+        process.kill()
+        process.wait()
+        if isinstance(moment, tuple):
+            assert process.returncode == -signal.SIGKILL, moment
+            assert not (run / MODEL_FILE).exists() and has_checkpoint(run), moment
+            in_stages += 1
+        assert cli.main(["train", str(scene), "--run", str(run), "--device", device, "--resume"]) == 0, moment
+        assert (run / MODEL_FILE).read_bytes() == expected, moment
+    assert in_stages == min((count + 1) // 2, len(STAGES) * len(VIEWS))
