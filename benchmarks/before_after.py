@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 Values = dict[tuple[str, str, str], float]  # (name, scene, unit) -> value of one repetition
 
@@ -34,9 +35,9 @@ def measure(root: Path, options: list[str]) -> Values:
     return values | peaks
 
 
-def compare(before: list[Values], after: list[Values]) -> list[dict[str, object]]:
+def compare(before: list[Values], after: list[Values]) -> list[dict[str, Any]]:
     """Return a row for each figure that both checkouts have."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for key in before[0]:
         if all(key in values for values in (*before, *after)):
             sides = {"before": [values[key] for values in before], "after": [values[key] for values in after]}

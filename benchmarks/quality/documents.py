@@ -58,7 +58,8 @@ def figures(cell: Cell) -> str:
 def readme(results: Results) -> str:
     """Return the README's table: 40,000 primitives beside the best gsplat row of each scene."""
     metrics = {"psnr": 2, "ssim": 4, "flip": 4, "megabytes": 1}
-    lines, shown = [], []
+    lines: list[list[str]] = []
+    shown: list[Mapping[str, Any]] = []
     for scene in SCENES:
         cells = [scene]
         for cell in (cell_of(results, scene, DEFAULT.name, SIZE), best_peer(results, scene, SIZE)):

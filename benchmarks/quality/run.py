@@ -50,10 +50,8 @@ def run_job(
     image, facts = train(job, row, scene, device, models)
     seconds = facts.pop("end") - begin
     views = _compare(job, scene, image, pictures)
-    means = {
-        name: statistics.fmean(values) if (values := [v[name] for v in views.values() if v[name] is not None]) else None
-        for name in METRICS
-    }
+    known = {name: [x for v in views.values() if (x := v[name]) is not None] for name in METRICS}
+    means = {name: statistics.fmean(values) if values else None for name, values in known.items()}
     if device.type == "cuda":
         facts["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
     return {

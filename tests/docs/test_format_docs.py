@@ -19,7 +19,9 @@ from nexwarp.cli import main as cli
 from nexwarp.data import write_demo
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
-from tests.docs.test_docs import DOCS, ROOT, SYMBOLS
+from nexwarp.train.recipe import Config
+from nexwarp.train.settings import setting_names
+from tests.docs.test_docs import DOCS, ROOT
 from tests.exposed import expose_photos
 
 
@@ -155,7 +157,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
 def test_json_files(run):
     config = json.loads((run / "config.json").read_text())
     assert flat(config, "scene") == set(named(section("config.json")))
-    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(SYMBOLS)
+    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names(Config()))
     cameras = json.loads((run / "cameras.json").read_text())
     assert set(cameras) == {"train", "test"}
     for camera in [*cameras["train"].values(), *cameras["test"].values()]:
