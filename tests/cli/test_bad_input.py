@@ -31,15 +31,35 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
     return check
 
 
-def test_missing_folder(tmp_path, refuses):
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--max-surfels", "15"], ["max_surfels", "expected at least 16", "got 15"]),
+        (["--preset", "papr"], ["preset", "expected one of default, paper", "'papr'"]),
+        (["--max-hits", "9"], ["max-hits", "expected 0 to 8", "got 9"]),
+        (["--max-hits", "-1"], ["max-hits", "expected 0 to 8", "got -1"]),
+        (["--downscale", "0"], ["downscale", "expected at least 1", "got 0"]),
+        (["--downscale", "37"], ["downscale", "expected at most", "got 37"]),
+        (["--iterations", "0"], ["iterations", "expected at least 1", "got 0"]),
+        (["--device", "gpu"], ["--device", "expected cuda or cpu", "'gpu'"]),
+        (["--background", "pink"], ["background: expected white, black, random or three numbers", "'pink'"]),
+        (["--masks", "absent"], ["masks: no folder 'absent'"]),
+        (["--points", "nowhere.ply"], ["nowhere.ply: no such file, expected a PLY file"]),
+        (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
+    ],
+)
+def test_flags_that_cannot_be(scene, refuses, flags, words):
+    refuses(scene, flags, *words)
+
+
+def test_folders_without_a_scene(tmp_path, refuses):
     refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a scene")
-
-
-def test_folder_without_a_model(tmp_path, refuses):
     (tmp_path / "empty").mkdir()
-    refuses(
-        tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "expected a COLMAP model", "transforms.json"
-    )
+    refuses(tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "a COLMAP model", "transforms.json")
+    folder = make_scene(tmp_path / "no photos", names=[])
+    refuses(folder, [], str(folder), "no registered images")
+    folder = make_scene(tmp_path / "no points", points=np.zeros((0, 3)))
+    refuses(folder, [], str(folder), "no 3D points", "expected at least one")
 
 
 def test_no_images_folder(tmp_path, refuses):
@@ -47,11 +67,6 @@ def test_no_images_folder(tmp_path, refuses):
     shutil.rmtree(folder / "images")
     refuses(folder, [], "images", str(folder))
     refuses(folder, ["--images", "images_4"], "images_4", str(folder))
-
-
-def test_no_registered_images(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene", names=[])
-    refuses(folder, [], str(folder), "no registered images")
 
 
 def test_absent_photo(tmp_path, refuses):
@@ -74,38 +89,6 @@ def test_lens_that_is_no_number(tmp_path, refuses):
     params = (40.0, 40.0, 24.0, 18.0, float("nan"), 0.0, 0.0, 0.0)
     folder = make_scene(tmp_path / "scene", model="OPENCV", params=params)
     refuses(folder, [], "00.png", "OPENCV", "expected finite parameters")
-
-
-def test_zero_points(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene", points=np.zeros((0, 3)))
-    refuses(folder, [], str(folder), "no 3D points", "expected at least one")
-
-
-@pytest.mark.parametrize("budget", ["15", "0", "-3"])
-def test_budget_below_the_minimum(scene, refuses, budget):
-    refuses(scene, ["--max-surfels", budget], "max_surfels", "expected at least 16", f"got {budget}")
-
-
-def test_unknown_preset(scene, refuses):
-    refuses(scene, ["--preset", "papr"], "preset", "expected one of default, paper", "'papr'")
-
-
-@pytest.mark.parametrize("hits", ["9", "-1"])
-def test_too_many_hits(scene, refuses, hits):
-    refuses(scene, ["--max-hits", hits], "max-hits", "expected 0 to 8", f"got {hits}")
-
-
-@pytest.mark.parametrize(("factor", "expected"), [("0", "at least 1"), ("-2", "at least 1"), ("37", "at most")])
-def test_impossible_downscale(scene, refuses, factor, expected):
-    refuses(scene, ["--downscale", factor], "downscale", f"expected {expected}", f"got {factor}")
-
-
-def test_no_iterations(scene, refuses):
-    refuses(scene, ["--iterations", "0"], "iterations", "expected at least 1", "got 0")
-
-
-def test_unknown_device(scene, refuses):
-    refuses(scene, ["--device", "gpu"], "--device", "expected cuda or cpu", "'gpu'")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -138,10 +121,6 @@ def test_damaged_files_of_a_run(finished, capsys):
         refused(capsys, [command, str(finished)], "model.safetensors", "expected a safetensors file")
 
 
-def test_negative_frames(finished, capsys):
-    refused(capsys, ["render", str(finished), "--frames", "-1"], "--frames", "expected at least 0", "got -1")
-
-
 @pytest.mark.parametrize("columns", [40, 80, 200])
 @pytest.mark.parametrize(
     ("arguments", "words"),
@@ -170,14 +149,6 @@ def test_wrong_arguments(arguments, words, columns, capsys, monkeypatch):
     assert all(word in err.lower() for word in words), err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["render", "--help"]])
-def test_help(arguments, capsys):
-    with pytest.raises(SystemExit) as exited:
-        cli.main(arguments)
-    out, err = capsys.readouterr()
-    assert exited.value.code == 0 and "usage: nexwarp" in out and err == ""
-
-
 def test_python_dash_m(tmp_path):
     """`python -m nexwarp` is the same program; of a mistake, one line is all that reaches the terminal."""
     command = [sys.executable, "-m", "nexwarp", "train", str(tmp_path / "no"), "--device", "cpu"]
@@ -190,16 +161,3 @@ def test_python_dash_m(tmp_path):
         == f"nexwarp: error: {tmp_path / 'no'}: no such folder, expected a scene: COLMAP, nerfstudio or Blender\n"
     )
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--background", "pink"], ["background: expected white, black, random or three numbers", "'pink'"]),
-        (["--masks", "absent"], ["masks: no folder 'absent'"]),
-        (["--points", "nowhere.ply"], ["nowhere.ply: no such file, expected a PLY file"]),
-        (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
-    ],
-)
-def test_flags_of_scenes_that_cannot_be(scene, refuses, flags, words):
-    refuses(scene, flags, *words)

@@ -86,19 +86,6 @@ def test_strips_show_photo_render_and_error(tmp_path, model):
     assert files == sorted(os.path.join(folder, f"{stem}.png") for folder in ("test", "compare") for stem in stems)
 
 
-def test_without_a_folder_the_figures_are_the_same(tmp_path, monkeypatch, model):
-    views = views_of(model)
-    monkeypatch.chdir(tmp_path)
-    plain = evaluate(model, views)
-    assert os.listdir(tmp_path) == []
-    assert plain == evaluate(model, views, renders=tmp_path / "renders")
-
-
-def test_nothing_learns_from_an_evaluation(model):
-    evaluate(model, views_of(model))
-    assert all(p.grad is None for p in model.parameters())
-
-
 def test_no_views(model):
     with pytest.raises(ValueError, match=r"^views: expected at least one view"):
         evaluate(model, [])

@@ -162,12 +162,6 @@ def test_damaged_lines_are_dropped(tmp_path, damage):
     assert [line["iteration"] for line in lines(tmp_path)] == [1]
 
 
-def test_no_log_is_no_lines(tmp_path):
-    """A run of before there was a log can be resumed."""
-    keep_lines(tmp_path / LOG_FILE, 5)
-    assert not any(tmp_path.iterdir())
-
-
 def test_what_is_not_finite_is_null(trainer, tmp_path):
     nothing = torch.full((2, 2, 3), math.nan)
     losses = {"image": torch.tensor(math.nan), "grid": torch.tensor(math.inf), "alpha": torch.tensor(1.0)}
@@ -233,14 +227,6 @@ def test_a_missing_package_is_one_line(tmp_path, capsys, monkeypatch, package):
     err = capsys.readouterr().err
     assert f"--{package}" in err and f"pip install 'nexwarp[{package}]'" in err and err.count("\n") == 1
     assert not run.parent.exists()
-
-
-def test_the_command_line_writes_it(scene, tmp_path):
-    pytest.importorskip("tensorboard", reason="tensorboard is not installed (pip install 'nexwarp[tensorboard]')")
-    run = tmp_path / "run"
-    flags = ["--iterations", "3", "--max-surfels", "40", "--device", "cpu", "--set", "texture.table_size=256"]
-    assert cli.main(["train", str(scene.path), "--run", str(run), *flags, "--tensorboard"]) == 0
-    assert [line["iteration"] for line in lines(run)] == [1, 2, 3] == list(events(run)["train/psnr"])
 
 
 # Weights & Biases

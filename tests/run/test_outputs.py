@@ -232,21 +232,6 @@ def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
 
 
-def test_exported_splats_end_at_degree_3(run: Path) -> None:
-    model = nw.load(run)
-    raw = model.surfels.state_dict()
-    generator = torch.Generator().manual_seed(0)
-    model.surfels = nw.Surfels(raw | {"shN": torch.randn(len(model.surfels), 48, 3, generator=generator)})
-    exported = []
-    for degree in (6, 3):
-        model.options = model.options.changed(sh_degree=degree)
-        model.save(run)
-        assert command("export", run) == 0
-        exported.append((run / "export" / "splats.ply").read_bytes())
-    assert exported[0] == exported[1]
-    assert load_surfels_ply(run / "export" / "surfels.ply").shN.shape[1] == 48
-
-
 def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def exported(*options: str) -> bytes:
         assert command("export", run, *options) == 0
@@ -368,10 +353,3 @@ def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) ->
     refuses(["export"], "model.safetensors")
     (run / "config.json").unlink()
     refuses(["export"], "expected a run folder or a model, found no config.json")
-
-
-@pytest.mark.parametrize("words", [["render"], ["export"]])
-def test_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as exited:
-        cli.main([*words, "--help"])
-    assert exited.value.code == 0 and "docs/outputs.md" in capsys.readouterr().out

@@ -150,7 +150,7 @@ class RunFolders(RuleBasedStateMachine):
             return
 
         def work(run: Path) -> None:
-            command = [sys.executable, "-c", "from tests.run.test_run_machine import main; main()"]
+            command = [sys.executable, "-c", "from tests.robustness.test_run_machine import main; main()"]
             process = subprocess.Popen(
                 [*command, str(self.scene), str(run), str(seed), flag],
                 env=os.environ | python_path(ROOT),
