@@ -56,7 +56,8 @@ class Eval:
                 scene = source.load(progress)
             if not scene.test:
                 raise SceneError(f"{scene.path}: expected test views, found none")
-            views, facts = scene.test, read_metrics(opened.folder)
+            views = scene.test
+            facts = read_metrics(opened.folder)
             facts.pop("test_poses", None)  # of an earlier evaluation
             if self.refine_poses:
                 with display.counting(console, "fitting test poses", len(views)) as done:

@@ -206,16 +206,17 @@ class Session:
 
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures."""
-        folder, given = self._folder(stage), trainer.scene.cameras
+        folder = self._folder(stage)
+        scene_cameras = trainer.scene.cameras
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)
-        cameras = given
+        cameras = scene_cameras
         if trainer.poses is not None:
             refined = trainer.views.refined_cameras(trainer.poses)
-            cameras = given | {TRAIN: dict(zip(given[TRAIN], refined, strict=True))}
-        save_cameras(folder / CAMERAS_FILE, cameras, given)
+            cameras = scene_cameras | {TRAIN: dict(zip(scene_cameras[TRAIN], refined, strict=True))}
+        save_cameras(folder / CAMERAS_FILE, cameras, scene_cameras)
         facts = self._facts(stage, trainer)
         facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
         if stage.teacher:
@@ -241,7 +242,8 @@ class Session:
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
         """Evaluate the run's model on the test views, if there are any, and print the figures."""
-        scene, run = trainer.scene, self.run
+        scene = trainer.scene
+        run = self.run
         rows = {}
         if scene.test:
             mask_mode = trainer.config.mask_mode

@@ -155,7 +155,8 @@ class Train:
 
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[RunRecord, bool]:
         """Claim the run folder, on rank 0; return the run, the same on all ranks, and whether to resume it."""
-        record, resume = None, False
+        record = None
+        resume = False
         if ranks.first:
             self._check()
             flags = self._folder_flags(run, ranks)
@@ -219,10 +220,11 @@ class Train:
         """Return the run to resume. Its scene may have moved, and --iterations may be larger; the rest must agree."""
         flags = self._flags()
         settings = self._settings(flags)
-        given = self.scene.absolute()
+        scene = self.scene.absolute()
         for field in dataclasses.fields(SceneSource):
-            if field.name != "path" and getattr(given, field.name) != field.default:
-                _check_same(_flag(field.name), getattr(old.source, field.name), getattr(given, field.name))
+            value = getattr(scene, field.name)
+            if field.name != "path" and value != field.default:
+                _check_same(_flag(field.name), getattr(old.source, field.name), value)
         if self.preset != "default":
             _check_same("--preset", old.config.preset, self.preset)
         config = old.config

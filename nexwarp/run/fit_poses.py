@@ -63,24 +63,25 @@ def fit_poses(
 
 def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
     """Return a view's camera on the CPU, at the pose of the smallest L1 error that the descent has met."""
-    given = view.camera.to(model.device)
+    start = view.camera.to(model.device)
     photo = view.image.to(model.device).float() / 255
-    whole = (given, photo, torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo))
-    half = _halved(*whole) if min(given.width, given.height) > 1 else whole
+    whole = (start, photo, torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo))
+    half = _halved(*whole) if min(start.width, start.height) > 1 else whole
     twist = torch.zeros(6, device=model.device, requires_grad=True)
     units = torch.tensor([1.0] * 3 + [unit] * 3, device=model.device)
     optimizer = torch.optim.Adam([twist], lr=RATE)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / steps))
-    pivot = _middle_depth(model, given, unit)
-    best, least = given, float("inf")
+    pivot = _middle_depth(model, start, unit)
+    best = start
+    least = float("inf")
     for step in range(steps + 1):
         aim = half if 0 < step < steps // 2 else whole  # the given pose is judged at full size
         camera, target, counts = aim
-        moved = _at(camera, corrected(given.viewmat, units * twist, pivot))
+        moved = _at(camera, corrected(start.viewmat, units * twist, pivot))
         errors = (model.render(moved).image.clamp(0, 1) - target).abs().mean(-1)
         error = (errors * counts).sum() / counts.sum().clamp(min=1)
         if aim is whole and error.item() < least:
-            best = _at(given, moved.viewmat.detach())
+            best = _at(start, moved.viewmat.detach())
             least = error.item()
         optimizer.zero_grad()
         error.backward()

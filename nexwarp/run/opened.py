@@ -92,7 +92,8 @@ def near_depth(model: Model) -> float:
 
 def open_model(path: Path) -> OpenedModel:
     """Open a run folder, a folder with a model, or a model's file; the model itself is read on first use."""
-    folder, file = path, path / MODEL_FILE
+    folder = path
+    file = path / MODEL_FILE
     if path.is_file() and path.suffix == SUFFIX:
         folder, file = (path.parent if path.name == MODEL_FILE else path.with_suffix("")), path
         if path.name != MODEL_FILE and ((folder / CONFIG_FILE).is_file() or (folder / MODEL_FILE).is_file()):

@@ -192,7 +192,8 @@ class RenderOrder:
 
     def _scaled(self, camera: Camera) -> Camera:
         """Resize an image by --scale; a panorama's pixels are as large as the photos', a fisheye image is a square."""
-        width, height = camera.width, camera.height
+        width = camera.width
+        height = camera.height
         if self.camera == "panorama":
             height = max(min(round(math.pi * camera.focal), MAX_SIDE // 2), 2)
             width = 2 * height
