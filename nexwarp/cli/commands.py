@@ -35,7 +35,7 @@ class Render:
 
     run: Run_
     """Run folder, or a model's folder or .safetensors file."""
-    order: tyro.conf.OmitArgPrefixes[RenderOrder] = dataclasses.field(default_factory=RenderOrder)
+    pictures: tyro.conf.OmitArgPrefixes[RenderOrder] = dataclasses.field(default_factory=RenderOrder)
     detail: Annotated[float, option("SHARE")] = 1.0
     """Share of the surfels to render with, above 0 to 1 (docs/detail.md)."""
     device: Device_ = None
@@ -45,15 +45,15 @@ class Render:
         """Render."""
         device = pick_device(self.device)
         check_detail("--detail", self.detail)
-        self.order.check()
+        self.pictures.check()
         opened = open_model(self.run)
         model = opened.model_at(self.detail, device)
-        job = self.order.prepare(opened)
+        job = self.pictures.prepare(opened)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
         console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}", soft_wrap=True)
-        if self.order.video is not None:
-            console.print(f"{job.seconds:.2f} s of video in {self.order.video}", soft_wrap=True)
+        if self.pictures.video is not None:
+            console.print(f"{job.seconds:.2f} s of video in {self.pictures.video}", soft_wrap=True)
 
 
 @dataclass
@@ -68,21 +68,21 @@ class Export:
 
     run: Run_
     """Run folder, or a model's folder or .safetensors file."""
-    order: tyro.conf.OmitArgPrefixes[ExportOrder] = dataclasses.field(default_factory=ExportOrder)
+    files: tyro.conf.OmitArgPrefixes[ExportOrder] = dataclasses.field(default_factory=ExportOrder)
     device: Device_ = None
     """Device for mesh, web and glb, which render."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        self.order.check()
+        self.files.check()
         opened = open_model(self.run)
         device = pick_device(self.device)
-        if self.order.format == "mesh":
+        if self.files.format == "mesh":
             with display.stages(console) as observe:
-                files = export_run(opened, self.order, device, observe)
+                files = export_run(opened, self.files, device, observe)
         else:
             with console.status("exporting"):
-                files = export_run(opened, self.order, device)
+                files = export_run(opened, self.files, device)
         for file in files:
             console.print(str(file), soft_wrap=True)
 

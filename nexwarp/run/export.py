@@ -27,8 +27,8 @@ from nexwarp.run.opened import OpenedModel
 class ExportOrder:
     """What `nexwarp export` writes."""
 
-    format: Annotated[str, arg(metavar="{ply,mesh,compact,cameras,web,glb,spz}")] = "ply"
-    """Files to write."""
+    format: Annotated[str, arg(metavar="NAME")] = "ply"
+    """ply, mesh, compact, cameras, web, glb or spz."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/export)")] = None
     """Output folder; with --format web also NAME.html, for one file with everything."""
     quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"

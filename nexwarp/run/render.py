@@ -66,8 +66,8 @@ class RenderOrder:
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
-    camera: Annotated[str, arg(metavar="{pinhole,panorama,fisheye,orthographic}")] = PINHOLE
-    """Projection; pictures other than pinhole ones go to RUN/renders/CAMERA (docs/cameras.md)."""
+    camera: Annotated[str, arg(metavar="NAME")] = PINHOLE
+    """pinhole, panorama, fisheye or orthographic (docs/cameras.md)."""
     fov: Annotated[float, arg(metavar="DEGREES")] = 180.0
     """Angle that the smaller side of a fisheye image shows."""
     exposure: Annotated[str | None, arg(metavar="{photos,mean}", help_behavior_hint="(default: that of the model)")] = (

@@ -157,10 +157,10 @@ fails if the two disagree. [Settings](options.md) has the same options as tables
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def help_text(*command: str) -> str:
-    """What --help of a command prints, 100 columns wide."""
+def help_text(*command: str, width: int = 100) -> str:
+    """What --help of a command prints."""
     out, columns = io.StringIO(), os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100"
+    os.environ["COLUMNS"] = str(width)
     try:
         with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
             cli.main([*command, "--help"])
@@ -179,6 +179,11 @@ def commands_page() -> str:
     for command in ([], *([name] for name in cli.COMMANDS)):
         page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
     return "\n".join(page)
+
+
+def test_the_help_of_train_fits_a_screen():
+    lines = help_text("train", width=80).splitlines()
+    assert sum(len(textwrap.wrap(line, 80) or [""]) for line in lines) <= 50
 
 
 def test_the_commands_page_is_that_of_the_code():
