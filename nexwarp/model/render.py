@@ -207,7 +207,7 @@ def render(
     if texture is not None and not isinstance(texture, NeuralTexture):
         raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
     options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)
-    return draw(surfels, texture, camera, options, background=color_tensor(background, surfels.means))
+    return draw(surfels, texture, camera, options, background=background)
 
 
 def draw(
@@ -241,12 +241,13 @@ def draw(
         TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
         OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
+    _check_device(surfels)
     exposures = exposures if options.exposure == "photos" else None
     limits = limits if options.detail_limits and len(surfels) else None
-    color = color_tensor(options.background if background is None else background, surfels.means)
     differentiable = torch.is_grad_enabled() and isinstance(camera, Camera)
     try:
         with torch.autocast(surfels.device.type, enabled=False), torch.set_grad_enabled(differentiable):
+            color = color_tensor(options.background if background is None else background, surfels.means)
             _check(surfels, texture, camera, options, color, limits, jitter)
             shape = antialiased(surfels.activated(), camera, limits)
             eye = _eye(shape.means, camera)
@@ -279,6 +280,19 @@ def draw(
     raise OutOfMemoryError.of(task, needed)
 
 
+def _check_device(surfels: Surfels) -> None:
+    """Check the surfels' dtype and device, and get the device ready."""
+    dtype, device = surfels.means.dtype, surfels.device
+    if dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"surfels: expected float32 or float64 parameters, got {dtype}")
+    if device.type == "cuda":
+        torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
+    elif device.type == "cpu":
+        keep_freed_memory()
+    else:
+        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {device}")
+
+
 def _check(
     surfels: Surfels,
     texture: NeuralTexture | None,
@@ -290,14 +304,6 @@ def _check(
 ) -> None:
     """Check shapes, dtypes, devices and the memory of the image; checking values would wait for the GPU."""
     dtype, device = surfels.means.dtype, surfels.device
-    if dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"surfels: expected float32 or float64 parameters, got {dtype}")
-    if device.type == "cuda":
-        torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
-    elif device.type == "cpu":
-        keep_freed_memory()
-    else:
-        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {device}")
     if options.clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
     expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
@@ -306,8 +312,6 @@ def _check(
     }
     if isinstance(camera, RayCamera):
         expected["camera.rays"] = (camera.rays, (camera.height, camera.width, 3))
-    elif camera.K.device != device:  # of any dtype
-        raise ValueError(f"camera.K: expected a tensor on {device}, got one on {camera.K.device}")
     if texture is not None:
         expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
     if jitter is not None:
@@ -316,6 +320,8 @@ def _check(
         expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
         expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
     check_tensors(expected, dtype=dtype, device=device)
+    if isinstance(camera, Camera) and camera.K.device != device:  # of any dtype
+        raise ValueError(f"camera.K: expected a tensor on {device}, got one on {camera.K.device}")
     stored = (0, dtype) if texture is None else texture.stored_per_point(options.sh_degree)
     ops.check_image(camera.width, camera.height, options.max_hits, dtype, device, texture=stored)
 

@@ -11,6 +11,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
 from nexwarp.data import Scene, View, write_demo
 from nexwarp.model.surfels import Surfels
+from nexwarp.train.finish import sh_smoothing
 from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
 from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig, preset
 from nexwarp.train.trainer import Trainer
@@ -171,8 +172,8 @@ def test_many_surfels_are_seen_and_solved_in_parts(device: torch.device, monkeyp
     told: list[tuple[int, int]] = []
     whole = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
     assert told == [(1, 2), (2, 2)]
-    monkeypatch.setattr("nexwarp.train.finish.sh_smoothing.SOLVED", 7 * 16**2)
-    monkeypatch.setattr("nexwarp.train.finish.sh_smoothing.PRODUCTS", 20 * 16 * 17 // 2)
+    monkeypatch.setattr(sh_smoothing, "SOLVED", 7 * 16**2)
+    monkeypatch.setattr(sh_smoothing, "PRODUCTS", 20 * 16 * 17 // 2)
     told.clear()
     parts = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
     assert told == [(done, 6) for done in range(1, 7)]  # 20, 20 and 10 surfels
