@@ -12,7 +12,6 @@ from nexwarp.export.splats import Pieces, split_large
 from nexwarp.export.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.metrics import psnr
-from tests.gsplat_support import draw
 from tests.reference import ewa
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_surfels, random_scene
@@ -84,7 +83,7 @@ def test_surfel_properties_as_another_program_sees_them(tmp_path: Path) -> None:
     assert_close(stack(columns, "nx", "ny", "nz"), axes[..., 2], kind="value", name="normal")
 
 
-@pytest.mark.parametrize("given", [0, 1, 3, 5])
+@pytest.mark.parametrize("given", [0, 1, 3])
 @pytest.mark.parametrize("kept", [0, 2, 3])
 def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> None:
     scene = random_scene(sh_degree=given)
@@ -207,6 +206,29 @@ def small_surfels(count: int, device: torch.device) -> nw.Surfels:
     return nw.Surfels.from_activated(*(x.to(device) for x in values))
 
 
+def drawn_by_gsplat(path: Path, camera: nw.Camera, background: tuple[float, float, float]) -> torch.Tensor:
+    """A PLY of Gaussians, rendered by gsplat on the camera's device: (H, W, 3)."""
+    import gsplat
+
+    columns = {name: x.to(camera.viewmat.device) for name, x in read(path).items()}
+    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15).mT
+    with torch.no_grad():
+        return gsplat.rasterization(
+            stack(columns, *"xyz"),
+            stack(columns, *numbered("rot", 4)),
+            stack(columns, *numbered("scale", 3)).exp(),
+            columns["opacity"].sigmoid(),
+            torch.cat([stack(columns, *numbered("f_dc", 3))[:, None], rest], dim=1).contiguous(),
+            camera.viewmat[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            sh_degree=3,
+            packed=False,  # packed, gsplat 1.5.3 takes no backgrounds
+            backgrounds=torch.tensor([background], device=camera.viewmat.device),
+        )[0][0]
+
+
 @pytest.mark.cuda
 def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> None:
     """Against our render without texture at gamma = 1."""
@@ -222,7 +244,7 @@ def test_gsplat_renders_the_splats_as_we_do(tmp_path: Path, record_property) -> 
         camera = nw.Camera(viewmat, K, size, size)
         with torch.no_grad():
             mine = nw.render(surfels, None, camera, background=background).image
-        found = float(psnr(to_uint8(draw(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
+        found = float(psnr(to_uint8(drawn_by_gsplat(tmp_path / "splats.ply", camera, background)), to_uint8(mine)))
         record_property(f"psnr from {position}", found)
         assert mine.std() > 0.1
         assert found >= 35.0

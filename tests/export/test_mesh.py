@@ -11,7 +11,6 @@ from nexwarp.errors import RunError, SettingError
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
 from nexwarp.ops.tsdf import DistanceField
 from tests import scenes
-from tests.mesh_support import read_mesh, sample
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -102,10 +101,18 @@ def test_crumbs_go_and_the_rest_stays(sphere):
 
 def test_files_are_read_back(sphere, tmp_path):
     save_mesh(tmp_path / "mesh.ply", sphere)
-    read = read_mesh(tmp_path / "mesh.ply")
-    for name in ("vertices", "normals", "colors", "triangles"):
-        assert np.array_equal(read[name], getattr(sphere, name)), name
-    assert np.abs(np.linalg.norm(sample(read, 1000)["vertices"], axis=1) - RADIUS).max() < VOXEL
+    data = (tmp_path / "mesh.ply").read_bytes()
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    vertex, color = ["x", "y", "z", "nx", "ny", "nz"], ["red", "green", "blue"]
+    rows = np.frombuffer(
+        data, [*((name, "<f4") for name in vertex), *((name, "u1") for name in color)], len(sphere.vertices), end
+    )
+    faces = np.frombuffer(data, [("count", "u1"), ("corners", "<i4", 3)], offset=end + rows.nbytes)
+    for names, expected in ((vertex[:3], sphere.vertices), (vertex[3:], sphere.normals), (color, sphere.colors)):
+        assert np.array_equal(np.stack([rows[name] for name in names], 1), expected), names
+    assert (faces["count"] == 3).all() and np.array_equal(faces["corners"], sphere.triangles)
+    for line in ("element vertex", "property float nx", "property uchar red", "property list uchar int vertex_indices"):
+        assert line.encode() in data[:end]
 
 
 def test_what_cannot_be_a_mesh_is_named(monkeypatch):

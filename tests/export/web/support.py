@@ -1,11 +1,8 @@
-"""A model for the web renderer, a browser with WebGPU, and a server of a folder."""
+"""A model for the web renderer, and a server of a page's files."""
 
-import functools
-import http.server
 import shutil
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +13,9 @@ from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from tests.scenes import make_camera, make_surfels, random_scene
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = ["--no-sandbox", "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
+KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 
 
 def web_model(
@@ -73,20 +71,33 @@ def psnr(actual: np.ndarray, expected: np.ndarray) -> float:
     return float(-10 * np.log10(max(np.mean((actual.astype(np.float64) - expected) ** 2), 1e-20)))
 
 
-@contextmanager
-def serving(folder: Path) -> Iterator[str]:
-    """Serve a folder over HTTP; yields the URL."""
+class Site:
+    """A page's files on a server of its own; tests change them."""
 
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, format: str, *args: object) -> None:
-            pass
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = files
+        site = self
 
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                name = self.path.partition("?")[0].lstrip("/") or "index.html"
+                content = site.files.get(name)
+                self.send_response(200 if content is not None else 404)
+                self.send_header("Content-Type", KINDS.get(Path(name).suffix, "application/octet-stream"))
+                self.send_header("Content-Length", str(len(content or b"")))
+                self.end_headers()
+                self.wfile.write(content or b"")
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_port}/"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def __enter__(self) -> "Site":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.server.shutdown()
+        self.server.server_close()

@@ -2,11 +2,8 @@
 
 import functools
 import json
-import shutil
 import struct
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +20,10 @@ from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from tests.export.web.baked_support import ring
 from tests.export.web.scene_reader import as_stored, read_sections
+from tests.export.web.support import CHROMIUM, WEBGPU, Site
 from tests.scenes import make_surfels, make_texture, random_scene
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
-KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
 FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
 DRAW = """async camera => {
@@ -45,31 +40,6 @@ pytestmark = [
     pytest.mark.usefixtures("one_torch_thread"),
     pytest.mark.timeout(300),
 ]
-
-
-class Site:
-    """A page's files on a server of its own; tests change them."""
-
-    def __init__(self, files: dict[str, bytes]) -> None:
-        self.files = files
-        site = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                name = self.path.partition("?")[0].lstrip("/") or "index.html"
-                content = site.files.get(name)
-                self.send_response(200 if content is not None else 404)
-                self.send_header("Content-Type", KINDS.get(Path(name).suffix, "application/octet-stream"))
-                self.send_header("Content-Length", str(len(content or b"")))
-                self.end_headers()
-                self.wfile.write(content or b"")
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +65,8 @@ def site(model, cameras) -> Iterator[Site]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(atlas, "bake_model", functools.partial(bake_model, steps=10))
         site = Site(page_files(model, cameras, title="Two & <three>"))
-    yield site
-    site.server.shutdown()
-    site.server.server_close()
+    with site:
+        yield site
 
 
 @pytest.fixture(scope="module")
@@ -322,21 +291,17 @@ def test_the_live_demo_of_the_documentation(tab):
     folder = Path(__file__).parents[3] / "docs" / "demo_page"
     files = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert sum(map(len, files.values())) < 3e6
-    site = Site({**static_files(), **files})
-    tab.open(f"{site.url}?renderer=baked")
-    assert tab.picture().std() > 0.1 and not tab.errors
-    header, _ = read_sections(files[SCENE_FILE])
-    assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
-    site.server.shutdown()
-    site.server.server_close()
+    with Site({**static_files(), **files}) as site:
+        tab.open(f"{site.url}?renderer=baked")
+        assert tab.picture().std() > 0.1 and not tab.errors
+        header, _ = read_sections(files[SCENE_FILE])
+        assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
 
 
 @pytest.mark.slow
-def test_the_exact_renderer_in_the_page(site):
-    api = pytest.importorskip("playwright.sync_api")
-    with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *WEBGPU])
-        tab = Tab(browser, 160, 120)
+def test_the_exact_renderer_in_the_page(browser, site):
+    with browser.browser_type.launch(executable_path=CHROMIUM, args=[*FLAGS, *WEBGPU]) as other:
+        tab = Tab(other, 160, 120)
         tab.open(f"{site.url}?renderer=webgpu")
         assert "exact" in tab.page.inner_text("#status")
         image = tab.picture()
@@ -347,4 +312,3 @@ def test_the_exact_renderer_in_the_page(site):
         # Software draws the baked scene faster: without a wish, the page takes it.
         tab.open(site.url)
         assert "baked" in tab.page.inner_text("#status")
-        browser.close()

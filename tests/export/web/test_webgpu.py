@@ -4,7 +4,6 @@ import base64
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import encode_scene
 from nexwarp.model.options import RenderOptions
 from nexwarp.viewer.modes import facing_normals, id_colours
-from tests.export.web.support import CHROMIUM, FLAGS, named_cameras, psnr, serving, web_model
+from tests.export.web.support import CHROMIUM, WEBGPU, Site, named_cameras, psnr, web_model
 from tests.export.web.test_scene_file import damaged
 from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
 
@@ -76,15 +75,15 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass
 class Tab:
-    """A browser's page with the modules, the folder that it is served from, and its errors."""
+    """A browser's page with the modules, the site that serves it, and its errors."""
 
     page: Any
-    folder: Path
+    site: Site
     errors: list[str]
 
     def load(self, content: bytes, *, canvas: bool = False, **settings: Any) -> None:
         """Load a scene file's content into a new renderer."""
-        (self.folder / "scene.nxw").write_bytes(content)
+        self.site.files["scene.nxw"] = content
         self.page.evaluate(OPEN, ["scene.nxw", settings, canvas])
 
     def render(self, camera: nw.Camera, *names: str, **options: Any) -> tuple[int, dict[str, torch.Tensor]]:
@@ -102,22 +101,17 @@ class Tab:
 
 
 @pytest.fixture(scope="module")
-def tab(tmp_path_factory) -> Iterator[Tab]:
+def tab() -> Iterator[Tab]:
     api = pytest.importorskip("playwright.sync_api", reason="drives Chromium (extra `dev`)")
-    folder = tmp_path_factory.mktemp("page")
-    (folder / "shaders").mkdir()
-    for name, content in static_files().items():
-        (folder / name).write_bytes(content)
-    (folder / "index.html").write_text(PAGE)
     errors: list[str] = []
-    with serving(folder) as url, api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with Site({**static_files(), "index.html": PAGE.encode()}) as site, api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *WEBGPU])
         page = browser.new_page()
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(url)
+        page.goto(site.url)
         page.wait_for_function("window.nexwarp")
-        yield Tab(page, folder, errors)
+        yield Tab(page, site, errors)
         browser.close()
 
 
@@ -264,6 +258,6 @@ def test_half_precision_numbers_are_those_of_numpy(tab):
 
 def test_damaged_files_give_one_line(tab):
     for name, content in damaged().items():
-        (tab.folder / "damaged.nxw").write_bytes(content)
+        tab.site.files["damaged.nxw"] = content
         message = tab.page.evaluate(READ, f"damaged.nxw?{json.dumps(name)}")
         assert message.startswith("SceneError: scene file: ") and "\n" not in message, (name, message)
