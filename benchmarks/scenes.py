@@ -91,7 +91,7 @@ class Geometry:
 
     def tiles(self, projection: ops.Projection) -> ops.Tiles:
         """List the surfels of each tile."""
-        return ops.intersect_tiles(*self.shape, projection, self.viewmat, self.pinhole)
+        return ops.intersect_tiles(self.shape, projection, self.viewmat, self.pinhole)
 
     def collect(self, projection: ops.Projection, tiles: ops.Tiles, max_hits: int = 2) -> ops.Hits:
         """Walk the lists."""

@@ -18,8 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.shape import alpha_at, far_outside
-from nexwarp.kernels.surfel import hit
+from nexwarp.kernels.surfel import hit, hit_alpha
 from nexwarp.kernels.types import TileLists, types
 from nexwarp.kernels.walk import PIXELS, block_of, overflowed, pixel_of, stage, walk
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
@@ -29,10 +28,18 @@ from nexwarp.native.warp import any_in_warp, lane_index, warp_size
 
 @functools.cache
 def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
-    """Make the types `reals` and `integers` of the K-buffer, registers of static length, and its `insert`."""
+    """Make the types `reals` and `integers` of the K-buffer, registers of static length, and its functions."""
     slots = max(max_hits, 1)  # one unused slot for K = 0
     reals = wp.types.vector(length=slots, dtype=real)
     integers = wp.types.vector(length=slots, dtype=wp.int32)
+
+    @wp.func
+    def empty():
+        """(ids, weights) of an empty buffer."""
+        ids = integers()
+        for j in range(wp.static(max_hits)):
+            ids[j] = -1
+        return ids, reals()
 
     @wp.func
     def insert(ids: integers, weights: reals, i: wp.int32, weight: real):
@@ -52,7 +59,7 @@ def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
             i = wp.where(displaced, i_, i)
         return ids, weights, i, weight
 
-    return SimpleNamespace(reals=reals, integers=integers, insert=insert)
+    return SimpleNamespace(reals=reals, integers=integers, empty=empty, insert=insert)
 
 
 @functools.cache
@@ -81,10 +88,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
         if not inside:
             transmittance = real(0.0)
         color = vec3()
-        ids = buffer.integers()
-        weights = buffer.reals()
-        for j in range(wp.static(max_hits)):
-            ids[j] = -1
+        ids, weights = buffer.empty()
         overflow = overflowed(lists)
         bounds = walk(thread // PIXELS, lists, overflow)
         stop = int(bounds[0])
@@ -99,10 +103,8 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
                 i = name[0]
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                alpha = real(0.0)
                 # On a GPU some lane nearly always needs the exponentials.
-                if width > 1 or not far_outside(u, v, surfels.limits[i]):
-                    alpha = alpha_at(u, v, a[3], b[3], n[3])
+                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], width > 1)
                 if alpha >= ALPHA_MIN and depth > view.near and transmittance >= TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)

@@ -29,8 +29,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.collect import hit_buffer
-from nexwarp.kernels.shape import alpha_at, far_outside
-from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
+from nexwarp.kernels.surfel import hit, hit_alpha, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
 from nexwarp.kernels.walk import PIXELS, block_of, overflowed, pixel_of, stage, walk
 from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
@@ -91,20 +90,42 @@ def add_function(real: type, fixed_point: bool, by_place: bool) -> wp.Function:
 
 
 @functools.cache
-def add_error_function(real: type, fixed_point: bool) -> wp.Function:
-    """Make the function that adds the sum of errors over a warp to a slot."""
+def add_error_function(real: type, fixed_point: bool, with_errors: bool) -> wp.Function:
+    """Make the function that adds the sum of errors over a warp to a slot, where they are asked for."""
     Sums = gradient_types(real, fixed_point).Sums
 
     @wp.func
     def add_error(sums: Sums, slot: wp.int32, error: real):
-        total = warp_sum(error)
-        if lane_index() == 0:
-            if wp.static(fixed_point):
-                fixed_point_add(sums.errors, slot, total, sums.bad)
-            else:
-                wp.atomic_add(sums.errors, slot, total)
+        if wp.static(with_errors):
+            total = warp_sum(error)
+            if lane_index() == 0:
+                if wp.static(fixed_point):
+                    fixed_point_add(sums.errors, slot, total, sums.bad)
+                else:
+                    wp.atomic_add(sums.errors, slot, total)
 
     return add_error
+
+
+@functools.cache
+def buffered_gradients_function(real: type, max_hits: int) -> wp.Function:
+    """Make the function that returns the gradients of a hit's weight and depth, and whether the buffer holds it."""
+    buffer = hit_buffer(real, max_hits)
+    reals, integers = buffer.reals, buffer.integers
+
+    @wp.func
+    def buffered_gradients(i: wp.int32, ids: integers, grad_weights: reals, grad_depths: reals):
+        grad_weight = real(0.0)
+        grad_depth = real(0.0)
+        buffered = bool(False)
+        for j in range(wp.static(max_hits)):
+            if i == ids[j]:
+                grad_weight = grad_weights[j]
+                grad_depth = grad_depths[j]
+                buffered = True
+        return grad_weight, grad_depth, buffered
+
+    return buffered_gradients
 
 
 @functools.cache
@@ -154,8 +175,8 @@ def collect_backward_kernel(
     t = types(real)
     vec4 = t.vec4
     g = gradient_types(real, fixed_point)
-    buffer = hit_buffer(real, max_hits)
-    add, add_error = add_function(real, fixed_point, by_place), add_error_function(real, fixed_point)
+    buffer, buffered_gradients = hit_buffer(real, max_hits), buffered_gradients_function(real, max_hits)
+    add, add_error = add_function(real, fixed_point, by_place), add_error_function(real, fixed_point, with_errors)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -211,10 +232,8 @@ def collect_backward_kernel(
                 k = name[1]
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                alpha = real(0.0)
                 # Straight on, so that the compiler can use the exponentials again for the derivative.
-                if width > 1 or not far_outside(u, v, surfels.limits[i]):
-                    alpha = alpha_at(u, v, a[3], b[3], n[3])
+                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], width > 1)
                 if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
                     alpha = ZERO
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
@@ -222,13 +241,10 @@ def collect_backward_kernel(
                     weight = alpha * transmittance
                     grad_color = grad_plain
                     if alpha > ZERO:
-                        q = grad_total
-                        grad_depth = real(0.0)
-                        for j in range(wp.static(max_hits)):
-                            if i == ids[j]:
-                                q += grad_weights[j]
-                                grad_depth = grad_depths[j]
-                                grad_color = grad_base
+                        grad_weight, grad_depth, buffered = buffered_gradients(i, ids, grad_weights, grad_depths)
+                        if buffered:
+                            grad_color = grad_base
+                        q = grad_total + grad_weight
                         q += grad_color[0] * c[0] + grad_color[1] * c[1] + grad_color[2] * c[2]
                         rest -= q * weight
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
@@ -237,7 +253,6 @@ def collect_backward_kernel(
                     row_a, row_b, row_n = record_gradients(grad, d)
                     row_c = vec4(grad_color[0] * weight, grad_color[1] * weight, grad_color[2] * weight, grad[3])
                     target = add(sums, i, k, row_a, row_b, row_n, row_c)
-                    if wp.static(with_errors):
-                        add_error(sums, target, weight * error)
+                    add_error(sums, target, weight * error)
 
     return collect_backward

@@ -18,7 +18,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.collect import hit_buffer
-from nexwarp.kernels.shape import alpha_at, far_outside, reach
+from nexwarp.kernels.shape import reach
+from nexwarp.kernels.surfel import hit_alpha
 from nexwarp.kernels.types import TILE_SIZE, Mat33, Vec2, Vec3, Vec4, types
 from nexwarp.kernels.walk import PIXELS
 from nexwarp.native.vector_loads import load_record, record_row
@@ -46,10 +47,10 @@ def beyond(side: Vec3, across: Vec3, middle: Vec2, half: Vec2):
 
 
 @functools.cache
-def ray_list_kernel(real: type) -> SimpleNamespace:
-    """Make the kernel `lists`, which counts or emits entries, one thread a surfel in depth order, and its struct."""
+def bound_functions(real: type) -> SimpleNamespace:
+    """Make the struct of the bounds of blocks of rays, and the function that tests a surfel against one."""
     t = types(real)
-    vec2, vec3, vec4, mat33, ZERO = t.vec2, t.vec3, t.vec4, t.mat33, t.ZERO
+    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
 
     @wp.struct
     class Bounds:
@@ -76,6 +77,17 @@ def ray_list_kernel(real: type) -> SimpleNamespace:
         out = out or beyond(b, v, middle, half) or beyond(-b, v, middle, half)
         # Behind the rays altogether: n . ray never has the sign of a hit.
         return out or beyond(-n, vec3(), middle, half)
+
+    return SimpleNamespace(Bounds=Bounds, misses=misses)
+
+
+@functools.cache
+def ray_list_kernel(real: type) -> SimpleNamespace:
+    """Make the kernel `lists`, which counts or emits entries, one thread a surfel in depth order, and its struct."""
+    t = types(real)
+    vec2, vec4, ZERO = t.vec2, t.vec4, t.ZERO
+    bounds = bound_functions(real)
+    Bounds, misses = bounds.Bounds, bounds.misses
 
     @wp.kernel(enable_backward=False, module="unique")
     def ray_lists(
@@ -130,16 +142,10 @@ def product(row: Vec4, ray: Vec3):
 
 
 @functools.cache
-def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
-    """Make the collection kernel `collect` and its struct of surfels: a thread is a pixel, and walks its tile's list.
-
-    Written is what `collect` writes but `stops`, and what `surface` writes, of the same hits in the same way: depths
-    are t, and a normal faces the ray.
-    """
+def ray_functions(real: type) -> SimpleNamespace:
+    """Make the struct of the surfels as rays read them, and the functions of a hit."""
     t = types(real)
-    vec3, vec4 = t.vec3, t.vec4
-    buffer = hit_buffer(real, max_hits)
-    ALPHA_MIN, TRANSMITTANCE_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ZERO, t.HALF, t.ONE
+    vec3, vec4, ZERO, ONE = t.vec3, t.vec4, t.ZERO, t.ONE
 
     @wp.struct
     class RaySurfels:
@@ -169,6 +175,22 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             return -n
         return n
 
+    return SimpleNamespace(Surfels=RaySurfels, hit=ray_hit, normal=facing_normal)
+
+
+@functools.cache
+def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
+    """Make the collection kernel `collect` and its struct of surfels: a thread is a pixel, and walks its tile's list.
+
+    Written is what `collect` writes but `stops`, and what `surface` writes, of the same hits in the same way: depths
+    are t, and a normal faces the ray.
+    """
+    t = types(real)
+    vec3 = t.vec3
+    buffer = hit_buffer(real, max_hits)
+    r = ray_functions(real)
+    ALPHA_MIN, TRANSMITTANCE_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ZERO, t.HALF, t.ONE
+
     @wp.kernel(
         enable_backward=False,
         grid_stride=False,
@@ -177,7 +199,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
     )
     def collect_rays(
         first: wp.int32,
-        surfels: RaySurfels,
+        surfels: r.Surfels,
         surfel_ids: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int64),
         rays: wp.array(dtype=vec3),
@@ -196,10 +218,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
         ray = rays[p]
         transmittance = real(1.0)
         color = vec3()
-        ids = buffer.integers()
-        weights = buffer.reals()
-        for j in range(wp.static(max_hits)):
-            ids[j] = -1
+        ids, weights = buffer.empty()
         total = real(0.0)
         depths = real(0.0)
         median = real(0.0)
@@ -214,10 +233,8 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             i = surfel_ids[k]
             k += wp.int64(1)
             a, b, n, c = load_record(surfels.records, i)
-            u, v, depth = ray_hit(surfels, i, a, b, n, c[3], ray)
-            alpha = real(0.0)
-            if not far_outside(u, v, surfels.limits[i]):
-                alpha = alpha_at(u, v, a[3], b[3], n[3])
+            u, v, depth = r.hit(surfels, i, a, b, n, c[3], ray)
+            alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
             if alpha >= ALPHA_MIN and depth > view.near:
                 weight = alpha * transmittance
                 if transmittance > HALF:
@@ -225,7 +242,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
                 if weight > heaviest:
                     heaviest = weight
                     top = depth
-                normals += facing_normal(surfels, i, ray) * weight
+                normals += r.normal(surfels, i, ray) * weight
                 total += weight
                 depths += weight * depth
                 transmittance = transmittance * (ONE - alpha)
@@ -241,7 +258,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             if i >= 0:
                 a, b, n, c = load_record(surfels.records, i)
                 base += vec3(c[0], c[1], c[2]) * weights[j]
-                u, v, depth = ray_hit(surfels, i, a, b, n, c[3], ray)
+                u, v, depth = r.hit(surfels, i, a, b, n, c[3], ray)
             hits.ids[p, j] = i
             hits.depths[p, j] = depth
             hits.weights[p, j] = weights[j]
@@ -253,4 +270,4 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
         surface.top[p] = top
         surface.normals[p] = normals
 
-    return SimpleNamespace(collect=collect_rays, Surfels=RaySurfels)
+    return SimpleNamespace(collect=collect_rays, Surfels=r.Surfels)

@@ -17,8 +17,7 @@ import functools
 
 import warp as wp
 
-from nexwarp.kernels.shape import alpha_at, far_outside
-from nexwarp.kernels.surfel import hit
+from nexwarp.kernels.surfel import facing_side, hit, hit_alpha
 from nexwarp.kernels.types import TileLists, types
 from nexwarp.kernels.walk import PIXELS, block_of, candidate, overflowed, pixel_of, walk
 from nexwarp.native.vector_loads import load_record
@@ -75,9 +74,7 @@ def surface_kernel(real: type) -> wp.Kernel:
                 if batch + source < stop:
                     a, b, n, c = load_record(surfels.records, i)
                     u, v, depth = hit(a, b, n, c[3], d)
-                    alpha = real(0.0)
-                    if not far_outside(u, v, surfels.limits[i]):
-                        alpha = alpha_at(u, v, a[3], b[3], n[3])
+                    alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
                     if alpha >= ALPHA_MIN and depth > view.near:
                         weight = alpha * transmittance
                         if transmittance > HALF:
@@ -87,10 +84,7 @@ def surface_kernel(real: type) -> wp.Kernel:
                             heaviest = weight
                             top_depth = depth
                             pick[1] = batch + source
-                        normal = vec3(n[0], n[1], n[2])
-                        if normal[0] * d[0] + normal[1] * d[1] + normal[2] > ZERO:
-                            normal = -normal
-                        normals += normal * weight
+                        normals += vec3(n[0], n[1], n[2]) * (facing_side(n, d) * weight)
                         total += weight
                         depths += weight * depth
                         transmittance = transmittance * (ONE - alpha)

@@ -18,8 +18,7 @@ import functools
 import warp as wp
 
 from nexwarp.kernels.collect_backward import add_function, gradient_types
-from nexwarp.kernels.shape import alpha_at, far_outside
-from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
+from nexwarp.kernels.surfel import facing_side, hit, hit_alpha, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
 from nexwarp.kernels.walk import PIXELS, block_of, candidate, overflowed, pixel_of, walk
 from nexwarp.native.vector_loads import load_record
@@ -90,9 +89,7 @@ def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: boo
                 k = batch + source
                 a, b, n, c = load_record(surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                alpha = real(0.0)
-                if not far_outside(u, v, surfels.limits[i]):
-                    alpha = alpha_at(u, v, a[3], b[3], n[3])
+                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
                 if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
                     alpha = ZERO
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
@@ -101,9 +98,7 @@ def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: boo
                     if alpha > ZERO:
                         weight = alpha * transmittance
                         normal = vec3(n[0], n[1], n[2])
-                        facing = ONE
-                        if normal[0] * d[0] + normal[1] * d[1] + normal[2] > ZERO:
-                            facing = -ONE
+                        facing = facing_side(n, d)
                         grad_normal = grad_normals * (facing * weight)
                         q = grad_mean * (depth - mean) + facing * wp.dot(grad_normals, normal)
                         grad_depth = grad_mean * weight

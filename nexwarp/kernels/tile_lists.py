@@ -48,14 +48,8 @@ def list_threads(surfels: int, on_gpu: bool) -> int:
 
 
 @functools.cache
-def list_kernels(real: type) -> SimpleNamespace:
-    """Make the kernels that count and emit (tile, surfel) entries, a thread a surfel in depth order.
-
-    `count` gives each surfel's entries. `emit` reads the sums of these along the order, `totals`, and repeats them as
-    `ends`, where a number that an int32 cannot hold is the largest int32. `entries` gets each entry's own index, and
-    `surfels` its surfel; without `surfels`, a null array, `entries` gets the surfel. Places of the lists behind the
-    last entry get the tile `no_tile`.
-    """
+def row_functions(real: type) -> SimpleNamespace:
+    """Make the functions that share out the tile rows of a warp's surfels among its lanes."""
     t = types(real)
     span = span_function(real)
 
@@ -93,6 +87,15 @@ def list_kernels(real: type) -> SimpleNamespace:
             rows = wp.max(shape[2] - shape[1] + 1, 0)
         return i, rows
 
+    return SimpleNamespace(shared_row=shared_row, rows_of=rows_of)
+
+
+@functools.cache
+def count_kernel(real: type) -> wp.Kernel:
+    """Make the kernel that counts each surfel's entries, a thread a surfel in depth order."""
+    t, functions = types(real), row_functions(real)
+    shared_row, rows_of = functions.shared_row, functions.rows_of
+
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
     def count(
         first: wp.int32,
@@ -123,6 +126,21 @@ def list_kernels(real: type) -> SimpleNamespace:
                     total -= before
         if thread < order.shape[0]:
             counts[thread] = wp.int64(total)
+
+    return count
+
+
+@functools.cache
+def emit_kernel(real: type) -> wp.Kernel:
+    """Make the kernel that emits (tile, surfel) entries, a thread a surfel in depth order.
+
+    It reads the sums of the counts along the order, `totals`, and repeats them as `ends`, where a number that an int32
+    cannot hold is the largest int32. `entries` gets each entry's own index, and `surfels` its surfel; without
+    `surfels`, a null array, `entries` gets the surfel. Places of the lists behind the last entry get the tile
+    `no_tile`.
+    """
+    t, functions = types(real), row_functions(real)
+    shared_row, rows_of = functions.shared_row, functions.rows_of
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
     def emit(
@@ -185,7 +203,7 @@ def list_kernels(real: type) -> SimpleNamespace:
             tiles[at] = no_tile
             entries[at] = 0
 
-    return SimpleNamespace(count=count, emit=emit)
+    return emit
 
 
 @wp.kernel(enable_backward=False, module="unique")

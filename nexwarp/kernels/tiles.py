@@ -22,6 +22,7 @@ from nexwarp.native.vector_loads import load_pair
 MARGIN = 0.01
 RELATIVE_MARGIN = 1e-6
 LARGEST = 1e30
+SHORT_OF_NEAR = wp.constant(wp.float64(0.999))
 # Of a quad that one plane clips.
 MAX_CORNERS = 5
 LARGEST_INT = 2**31 - 1
@@ -59,25 +60,23 @@ def tile_index(x: Real, count: int):
     return int(wp.clamp(wp.floor(x), type(x)(-1.0), type(x)(float(count))))
 
 
-@functools.cache
-def tile_polygon_kernel(real: type) -> wp.Kernel:
-    """Make the kernel that projects supports to polygons, one thread a surfel."""
-    t = types(real)
-    vec2, vec3, vec4, mat33, mat44 = t.vec2, t.vec3, t.vec4, t.mat33, t.mat44
-    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
-    ZERO, HALF, ONE = t.ZERO, t.HALF, t.ONE
-    HUGE = wp.constant(real(LARGEST))
-    SIZE = wp.constant(real(TILE_SIZE))
-    RELATIVE = wp.constant(real(RELATIVE_MARGIN))
+@wp.func
+def near_plane(near: Real, center: Vec3):
+    """Depth at which supports are clipped."""
+    plane = near * type(near)(SHORT_OF_NEAR)
+    if not (plane > type(near)(0.0)):
+        # With near = 0, hits closer than a millionth of the surfel's distance are given up: nothing bounds where.
+        plane = wp.length(center) * type(near)(1.0e-6)
+    return plane
 
-    @wp.func
-    def near_plane(near: real, center: vec3):
-        """Depth at which supports are clipped."""
-        plane = near * real(0.999)
-        if not (plane > ZERO):
-            # With near = 0, hits closer than a millionth of the surfel's distance are given up: nothing bounds where.
-            plane = wp.length(center) * real(1.0e-6)
-        return plane
+
+@functools.cache
+def clip_function(real: type) -> wp.Function:
+    """Make the function that clips and projects a support."""
+    t = types(real)
+    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+    HUGE = wp.constant(real(LARGEST))
 
     @wp.func
     def clip(i: int, quad: mat43, plane: real, intrinsics: vec4, corners: wp.array2d(dtype=vec2)):
@@ -109,6 +108,21 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
                     low = wp.min(low, x)
                     high = wp.max(high, x)
         return count, low, high, nearest
+
+    return clip
+
+
+@functools.cache
+def tile_polygon_kernel(real: type) -> wp.Kernel:
+    """Make the kernel that projects supports to polygons, one thread a surfel."""
+    t = types(real)
+    vec2, vec3, vec4, mat33, mat44 = t.vec2, t.vec3, t.vec4, t.mat33, t.mat44
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+    ZERO, HALF, ONE = t.ZERO, t.HALF, t.ONE
+    HUGE = wp.constant(real(LARGEST))
+    SIZE = wp.constant(real(TILE_SIZE))
+    clip = clip_function(real)
+    RELATIVE = wp.constant(real(RELATIVE_MARGIN))
 
     @wp.kernel(enable_backward=False, module="unique")
     def tile_polygon(

@@ -257,7 +257,7 @@ def draw(
                 hits: ops.Hits | RayHits = _ray_hits(shape, projection, camera, options)
             else:
                 pinhole = _pinhole(camera, shape.means)
-                tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, blending=options.order)
+                tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, blending=options.order)
                 hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
             texels = None if texture is None else _texels(texture, camera, hits, options, limits, jitter)
             residual = texture is not None and texture.residual

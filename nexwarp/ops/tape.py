@@ -24,8 +24,9 @@ from nexwarp.kernels.sh import plain_colors_kernels, textured_colors_kernels
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.tile_lists import (
+    count_kernel,
     depth_keys_kernel,
-    list_kernels,
+    emit_kernel,
     list_threads,
     surfel_ids_kernel,
     tile_offsets_kernel,
@@ -218,7 +219,6 @@ def intersect_tiles(
     polygons.margins = reals(count, real)
     surfels = [means, quats, scales, opacities, gammas, viewmat, image.matrices(means), image.near, rows]
     _silent(tile_polygon_kernel(real), count, surfels, [reaches, polygons])
-    kernels = list_kernels(real)
     arguments = [order[:count], polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.device.is_cuda)
     totals = integers(count, wp.int64)
@@ -226,14 +226,14 @@ def intersect_tiles(
     if count:
         _silent(depth_keys_kernel(real), count, [centers], [keys, order])
         wp.utils.radix_sort_pairs(keys, order, count)
-        _silent(kernels.count, threads, arguments, [totals])
+        _silent(count_kernel(real), threads, arguments, [totals])
         wp.utils.array_scan(totals, totals, inclusive=True)
         total = check_entries(int(totals[count - 1 :].numpy()[0]), count, columns * rows)
     tiles, entries, emitted, ids = (integers(2 * total, d) for d in (wp.uint32, wp.int32, wp.int32, wp.int32))
     if total:
         tile_ids = tiles.view(wp.int32)
         listed = [ends, tile_ids[:total], entries[:total], emitted[:total]]
-        _silent(kernels.emit, threads, [*arguments, totals, threads, columns * rows], listed)
+        _silent(emit_kernel(real), threads, [*arguments, totals, threads, columns * rows], listed)
         wp.utils.radix_sort_pairs(tiles, entries, total, end_bit=(columns * rows).bit_length())
         _silent(surfel_ids_kernel, total, [entries, emitted], [ids])
     offsets = integers(columns * rows + 1)

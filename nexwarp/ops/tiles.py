@@ -1,5 +1,6 @@
 """Tile lists: which surfels may be seen in which tile of the image, near to far."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -7,8 +8,9 @@ import torch
 import warp as wp
 
 from nexwarp.kernels.tile_lists import (
+    count_kernel,
     depth_keys_kernel,
-    list_kernels,
+    emit_kernel,
     list_threads,
     surfel_ids_kernel,
     tile_offsets_kernel,
@@ -84,11 +86,7 @@ class Tiles:
 
 
 def intersect_tiles(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
+    surfels: Sequence[torch.Tensor],
     projection: Projection,
     viewmat: torch.Tensor,
     camera: Pinhole,
@@ -99,11 +97,8 @@ def intersect_tiles(
     """List, for each tile, the surfels whose support touches it.
 
     Args:
-        means: (N, 3) world.
-        quats: (N, 4) unit, wxyz, surfel to world.
-        scales: (N, 2) world units.
-        opacities: (N,).
-        gammas: (N, 2).
+        surfels: means (N, 3), world; quats (N, 4), unit, wxyz, surfel to world; scales (N, 2), world units;
+            opacities (N,); gammas (N, 2).
         projection: of the same surfels.
         viewmat: (4, 4) world to camera.
         camera: the image plane.
@@ -115,23 +110,26 @@ def intersect_tiles(
         ValueError, OutOfMemoryError: there are more than MAX_ENTRIES entries, or more than memory holds; on CUDA only
             when that is noticed without a wait.
     """
-    tensors = [x.detach().contiguous() for x in (means, quats, scales, opacities, gammas)]
+    tensors = [x.detach().contiguous() for x in surfels]
+    means = tensors[0]
     real, count = real_of(means), len(means)
     columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
     order = _depth_order(projection.centers.detach(), blending)
-    kernels, kind = list_kernels(real), (columns, rows)
+    kind = (columns, rows)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
     arguments = [array(order, wp.int32), polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
-    launch(means, kernels.count, threads, arguments, [array(totals, wp.int64)], even=False)
+    launch(means, count_kernel(real), threads, arguments, [array(totals, wp.int64)], even=False)
     _scan(totals)
     learns = room is None and means.is_cuda
     exact = room is None and not learns
     if room is None:
         room = _total(totals, columns * rows) if exact else _room(totals, kind)
     emission = [*arguments, array(totals, wp.int64), threads, columns * rows]
-    surfel_ids, entries, tile_ids = _sorted_entries(ends, kernels.emit, emission, threads, room, columns * rows, exact)
+    surfel_ids, entries, tile_ids = _sorted_entries(
+        ends, emit_kernel(real), emission, threads, room, columns * rows, exact
+    )
     if learns:
         _ask(ends, kind)
     offsets = order.new_empty(columns * rows + 1)

@@ -235,7 +235,7 @@ def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     shape = detached_shape(surfels)
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=1000)
+    tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, room=1000)
     assert int(tiles.ends[-1]) == LARGEST_INT > len(tiles.surfel_ids) == 1000  # so the walk goes over all surfels
     assert len(tiles.entries) == 0
     assert ((tiles.surfel_ids >= 0) & (tiles.surfel_ids < count)).all()

@@ -160,7 +160,7 @@ def test_surface_of_short_lists(device: torch.device) -> None:
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat.detach())
     found = []
     for room in (None, 3):
-        tiles = ops.intersect_tiles(*shape, projection, camera.viewmat.detach(), pinhole, room=room)
+        tiles = ops.intersect_tiles(shape, projection, camera.viewmat.detach(), pinhole, room=room)
         hits = ops.collect(projection, tiles, pinhole)
         found.append(ops.surface(projection, tiles, hits, pinhole, camera.viewmat.detach()))
     for name in BUFFERS:

@@ -244,7 +244,7 @@ def test_short_lists_have_the_same_gradients(device: torch.device) -> None:
         pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
         shape = surfels.activated()
         projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
-        tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=room)
+        tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, room=room)
         hits = ops.collect(projection, tiles, pinhole)
         loss(ops.surface(projection, tiles, hits, pinhole, camera.viewmat)).backward()
         found.append([x.grad for name, x in surfels.named_parameters() if not name.startswith("sh")])

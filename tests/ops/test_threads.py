@@ -38,7 +38,7 @@ class Passes:
         sh = leaf(surfels.sh)
         self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
         self.projection = ops.project(*shape, self.colors, viewmat)
-        self.tiles = ops.intersect_tiles(*shape, self.projection, viewmat, self.pinhole)
+        self.tiles = ops.intersect_tiles(shape, self.projection, viewmat, self.pinhole)
         self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits)
         names = ("means", "quats", "scales", "opacities", "gammas", "sh", "viewmat")
         self.leaves = dict(zip(names, (*shape, sh, viewmat), strict=True))

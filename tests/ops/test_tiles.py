@@ -29,7 +29,7 @@ def passes(scene: Scene, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[to
     shape = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
     colors = ops.plain_colors(surfels.sh, surfels.means, camera.position, 3)
     projection = ops.project(*shape, colors, camera.viewmat)
-    tiles = ops.intersect_tiles(*shape, projection, camera.viewmat, pinhole, room=room)
+    tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, room=room)
     hits = ops.collect(projection, tiles, pinhole)
     total = hits.plain.square().sum() + hits.weights.sum() + hits.depths.sum() + hits.alpha.square().sum()
     return tiles, hits, list(torch.autograd.grad(total, list(surfels.parameters()), allow_unused=True))
