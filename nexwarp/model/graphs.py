@@ -586,7 +586,8 @@ class StepGraphs(Generic[S]):
 
     def _can_repeat(self, error: Exception) -> bool:
         """Whether failed work can be repeated: it lacked memory, of which graphs keep some, and it updated nothing."""
-        return needed_memory(error) is not None and self.keeper is not None and not isinstance(error, UpdateError)
+        held = self.keeper is not None or any(graphs.frames for graphs in list(_graphs.values()))
+        return held and needed_memory(error) is not None and not isinstance(error, UpdateError)
 
     def clear(self) -> None:
         """Drop all graphs, those of frames too, and free their memory."""

@@ -1,6 +1,7 @@
 """The model: `Model.render` is what `nexwarp render` writes, rendering changes nothing, and files hold all of it."""
 
 import dataclasses
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,19 @@ def test_surfels_hold_parameters_only() -> None:
         "exposures",
         "detail_limits",
     }
+
+
+def test_four_functions_lead_to_the_first_op(monkeypatch: pytest.MonkeyPatch) -> None:
+    package, activate, paths = Path(nw.__file__).parent, ops.activate, []
+
+    def spy(*arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        ours = [f.function for f in inspect.stack()[1:] if package in Path(f.filename).parents]
+        paths.append(ours)
+        return activate(*arguments)
+
+    monkeypatch.setattr(ops, "activate", spy)
+    full_model().render(cameras_of()[0])
+    assert paths == [["activated", "draw", "launched", "render"]]
 
 
 def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:
