@@ -8,6 +8,7 @@ channel whose target is at least `saturation` has a difference of 0 from any bri
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -16,36 +17,44 @@ from nexwarp.kernels.types import types
 WEIGHT_EPSILON = 1e-6  # keeps the un-premultiplied texture finite where nothing is textured
 
 
+@wp.func
+def sign(x: Any):
+    """1, 0 or -1; 0 for NaN."""
+    zero = type(x)(0.0)
+    return wp.where(x > zero, type(x)(1.0), wp.where(x < zero, type(x)(-1.0), zero))
+
+
+@wp.func
+def signs(x: Any):
+    return type(x)(sign(x[0]), sign(x[1]), sign(x[2]))
+
+
+@wp.func
+def channel_difference(x: Any, y: Any, saturation: Any):
+    """X - y, or 0 where y is saturated and x brighter."""
+    return wp.where(y >= saturation and x > y, type(x)(0.0), x - y)
+
+
+@wp.func
+def difference(x: Any, y: Any, saturation: Any):
+    return type(x)(
+        channel_difference(x[0], y[0], saturation),
+        channel_difference(x[1], y[1], saturation),
+        channel_difference(x[2], y[2], saturation),
+    )
+
+
+@wp.func
+def distance(x: Any):
+    return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+
+
 @functools.cache
 def photometric_kernels(real: type) -> SimpleNamespace:
     """Make the forward and backward kernels; `scales` are those of the terms in order."""
     t = types(real)
     vec3 = t.vec3
-    ONE, ZERO, EPS = t.ONE, t.ZERO, wp.constant(real(WEIGHT_EPSILON))
-
-    @wp.func
-    def sign(x: real):
-        return wp.where(x > ZERO, ONE, wp.where(x < ZERO, -ONE, ZERO))
-
-    @wp.func
-    def signs(x: vec3):
-        return vec3(sign(x[0]), sign(x[1]), sign(x[2]))
-
-    @wp.func
-    def channel_difference(x: real, y: real, saturation: real):
-        return wp.where(y >= saturation and x > y, ZERO, x - y)
-
-    @wp.func
-    def difference(x: vec3, y: vec3, saturation: real):
-        return vec3(
-            channel_difference(x[0], y[0], saturation),
-            channel_difference(x[1], y[1], saturation),
-            channel_difference(x[2], y[2], saturation),
-        )
-
-    @wp.func
-    def distance(x: vec3):
-        return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+    ONE, EPS = t.ONE, wp.constant(real(WEIGHT_EPSILON))
 
     @wp.func
     def total(weights: wp.array2d(dtype=real), p: wp.int32):

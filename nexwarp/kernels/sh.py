@@ -225,10 +225,7 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
         b = basis(direction)
         grad = grad_colors[i]
         if wp.static(clamp):
-            color = color_of(coefficients, i, b, offset)
-            for c in range(3):
-                if not (color[c] > real(0.0)):
-                    grad[c] = real(0.0)
+            grad = unclamped(grad, color_of(coefficients, i, b, offset))
         for k in range(wp.static(count)):
             for c in range(3):
                 grad_coefficients[3 * k + c, i] = storage(grad[c] * b[k] * scale[0])

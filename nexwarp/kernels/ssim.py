@@ -13,9 +13,7 @@ either side, down the rows; the result goes to shared memory, from where a threa
 along a row; and what comes of that goes through shared memory again, so that neighbouring threads write neighbours.
 """
 
-import functools
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -75,199 +73,221 @@ def blocks_of(height: int, width: int) -> int:
     return -(-width // COLUMNS) * -(-height // ROWS)
 
 
-@functools.cache
-def ssim_kernels() -> SimpleNamespace:
-    """Make the kernels `score` of the forward pass and `gradient` of the backward pass, for blocks of THREADS."""
-    rows = wp.types.vector(length=ROWS, dtype=wp.float32)
-    group = wp.types.vector(length=GROUP, dtype=wp.float32)
-    HALF_C1, HALF_C2 = wp.constant(C1 / 2.0), wp.constant(C2 / 2.0)
+Rows = wp.types.vector(length=ROWS, dtype=wp.float32)
+Group = wp.types.vector(length=GROUP, dtype=wp.float32)
+HALF_C1, HALF_C2 = wp.constant(C1 / 2.0), wp.constant(C2 / 2.0)
 
-    @wp.func
-    def place(thread: wp.int32, width: wp.int32):
-        """(thread of its block, left column, top row) of the block's strip."""
-        block = thread // THREADS
-        strips = (width + COLUMNS - 1) // COLUMNS
-        return wp.vec3i(thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS)
 
-    @wp.func
-    def put(plane: wp.int32, lane: wp.int32, values: rows):
-        """Share a column's values."""
-        for j in range(wp.static(ROWS)):
-            cell(True, (plane * ROWS + j) * THREADS + lane, values[j])
+@wp.func
+def place(thread: wp.int32, width: wp.int32):
+    """(thread of its block, left column, top row) of the block's strip."""
+    block = thread // THREADS
+    strips = (width + COLUMNS - 1) // COLUMNS
+    return wp.vec3i(thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS)
 
-    @wp.func
-    def put_group(plane: wp.int32, lane: wp.int32, values: group):
-        """Share a group's values, at the columns that they are for."""
+
+@wp.func
+def put(plane: wp.int32, lane: wp.int32, values: Rows):
+    """Share a column's values."""
+    for j in range(wp.static(ROWS)):
+        cell(True, (plane * ROWS + j) * THREADS + lane, values[j])
+
+
+@wp.func
+def put_group(plane: wp.int32, lane: wp.int32, values: Group):
+    """Share a group's values, at the columns that they are for."""
+    for o in range(wp.static(GROUP)):
+        cell(True, plane * wp.static(ROWS * THREADS) + group_start(lane) + 3 * o, values[o])
+
+
+@wp.func
+def group_start(lane: wp.int32):
+    """Where in a plane a thread's group begins: a row, and a column relative to the strip's left."""
+    return (lane // wp.static(COLUMNS // GROUP)) * THREADS + group_column(lane)
+
+
+@wp.func
+def group_column(lane: wp.int32):
+    return lane % 3 + (lane // 3) % wp.static(PIXELS // GROUP) * wp.static(3 * GROUP)
+
+
+@wp.func
+def blur(plane: wp.int32, lane: wp.int32):
+    """Blur a thread's group of a plane along its row."""
+    start = plane * wp.static(ROWS * THREADS) + group_start(lane)
+    sums = Group()
+    for i in range(wp.static(GROUP + 2 * REACH)):
+        x = cell(False, start + 3 * i, 0.0)
         for o in range(wp.static(GROUP)):
-            cell(True, plane * wp.static(ROWS * THREADS) + group_start(lane) + 3 * o, values[o])
+            if wp.static(tap(i - o) > 0.0):
+                sums[o] += x * wp.static(wp.float32(tap(i - o)))
+    return sums
 
-    @wp.func
-    def group_start(lane: wp.int32):
-        """Where in a plane a thread's group begins: a row, and a column relative to the strip's left."""
-        return (lane // wp.static(COLUMNS // GROUP)) * THREADS + group_column(lane)
 
-    @wp.func
-    def group_column(lane: wp.int32):
-        return lane % 3 + (lane // 3) % wp.static(PIXELS // GROUP) * wp.static(3 * GROUP)
+@wp.func
+def write_columns(
+    derivatives: wp.array2d(dtype=wp.float32),
+    lane: wp.int32,
+    column: wp.int32,
+    top: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+):
+    """Write a thread's column of the three shared planes to the maps."""
+    if lane < COLUMNS and column < width:
+        for j in range(wp.static(ROWS)):
+            row = top + j
+            if row < height:
+                for k in range(wp.static(3)):
+                    derivatives[k, row * width + column] = cell(False, (k * ROWS + j) * THREADS + lane, 0.0)
 
-    @wp.func
-    def blur(plane: wp.int32, lane: wp.int32):
-        """Blur a thread's group of a plane along its row."""
-        start = plane * wp.static(ROWS * THREADS) + group_start(lane)
-        sums = group()
-        for i in range(wp.static(GROUP + 2 * REACH)):
-            x = cell(False, start + 3 * i, 0.0)
-            for o in range(wp.static(GROUP)):
-                if wp.static(tap(i - o) > 0.0):
-                    sums[o] += x * wp.static(wp.float32(tap(i - o)))
-        return sums
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-    def score(
-        first: wp.int32,
-        image: wp.array(dtype=wp.float32),
-        target: wp.array(dtype=wp.float32),
-        height: wp.int32,
-        width: wp.int32,
-        scale: wp.float32,
-        # outputs
-        losses: wp.array(dtype=wp.float32),
-        derivatives: wp.array2d(dtype=wp.float32),
-    ):
-        """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
-        thread = first + wp.tid()
-        at = place(thread, width)
-        lane = at[0]
-        column = at[1] - 3 * REACH + lane
-        mx = rows()
-        my = rows()
-        q = rows()
-        p = rows()
-        if column >= 0 and column < width:
-            for i in range(wp.static(ROWS + 2 * REACH)):
-                row = at[2] + i - REACH
-                x = float(0.0)
-                y = float(0.0)
-                if row >= 0 and row < height:
-                    x = image[row * width + column]
-                    y = target[row * width + column]
-                xy = x * y
-                square = 0.5 * (x * x + y * y)
-                for j in range(wp.static(ROWS)):
-                    if wp.static(tap(i - j) > 0.0):
-                        mx[j] += x * wp.static(wp.float32(tap(i - j)))
-                        my[j] += y * wp.static(wp.float32(tap(i - j)))
-                        q[j] += square * wp.static(wp.float32(tap(i - j)))
-                        p[j] += xy * wp.static(wp.float32(tap(i - j)))
-        put(0, lane, mx)
-        put(1, lane, my)
-        put(2, lane, q)
-        put(3, lane, p)
-        sync_block()
-        total = float(0.0)
-        ds_dmx = group()
-        ds_dq = group()
-        ds_dp = group()
-        if lane < COLUMNS:
-            gx = blur(0, lane)
-            gy = blur(1, lane)
-            gq = blur(2, lane)
-            gp = blur(3, lane)
-            row = at[2] + lane // wp.static(COLUMNS // GROUP)
-            for o in range(wp.static(GROUP)):
-                product = gx[o] * gy[o]
-                mean = 0.5 * (gx[o] * gx[o] + gy[o] * gy[o])
-                variance = gq[o] - mean
-                variance = wp.where(variance < 0.0, 0.0, variance)  # rounding; wp.max would hide NaN
-                a = product + HALF_C1
-                b = gp[o] - product + HALF_C2
-                c = mean + HALF_C1
-                d = variance + HALF_C2
-                inverse = 1.0 / (c * d)
-                s = a * b * inverse
-                ds_dmx[o] = (b - a) * inverse * gy[o] + (s / d - s / c) * gx[o]
-                ds_dq[o] = -s / d
-                ds_dp[o] = a * inverse
-                if row < height and at[1] + group_column(lane) + 3 * o < width:
-                    total += (1.0 - s) * scale
-        losses[thread] = total
-        if not derivatives:
-            return
-        sync_block()
-        if lane < COLUMNS:
-            put_group(0, lane, ds_dmx)
-            put_group(1, lane, ds_dq)
-            put_group(2, lane, ds_dp)
-        sync_block()
-        column = at[1] + lane
-        if lane < COLUMNS and column < width:
+@wp.func
+def ssim(mx: wp.float32, my: wp.float32, q: wp.float32, p: wp.float32):
+    """(s, ds/dmx, ds/dq, ds/dp)."""
+    product = mx * my
+    mean = 0.5 * (mx * mx + my * my)
+    variance = q - mean
+    variance = wp.where(variance < 0.0, 0.0, variance)  # rounding; wp.max would hide NaN
+    a = product + HALF_C1
+    b = p - product + HALF_C2
+    c = mean + HALF_C1
+    d = variance + HALF_C2
+    inverse = 1.0 / (c * d)
+    s = a * b * inverse
+    return wp.vec4(s, (b - a) * inverse * my + (s / d - s / c) * mx, -s / d, a * inverse)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
+def score(
+    first: wp.int32,
+    image: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    scale: wp.float32,
+    # outputs
+    losses: wp.array(dtype=wp.float32),
+    derivatives: wp.array2d(dtype=wp.float32),
+):
+    """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
+    thread = first + wp.tid()
+    at = place(thread, width)
+    lane = at[0]
+    column = at[1] - 3 * REACH + lane
+    mx = Rows()
+    my = Rows()
+    q = Rows()
+    p = Rows()
+    if column >= 0 and column < width:
+        for i in range(wp.static(ROWS + 2 * REACH)):
+            row = at[2] + i - REACH
+            x = float(0.0)
+            y = float(0.0)
+            if row >= 0 and row < height:
+                x = image[row * width + column]
+                y = target[row * width + column]
+            xy = x * y
+            square = 0.5 * (x * x + y * y)
             for j in range(wp.static(ROWS)):
-                row = at[2] + j
-                if row < height:
-                    for k in range(wp.static(3)):
-                        derivatives[k, row * width + column] = cell(False, (k * ROWS + j) * THREADS + lane, 0.0)
+                if wp.static(tap(i - j) > 0.0):
+                    mx[j] += x * wp.static(wp.float32(tap(i - j)))
+                    my[j] += y * wp.static(wp.float32(tap(i - j)))
+                    q[j] += square * wp.static(wp.float32(tap(i - j)))
+                    p[j] += xy * wp.static(wp.float32(tap(i - j)))
+    put(0, lane, mx)
+    put(1, lane, my)
+    put(2, lane, q)
+    put(3, lane, p)
+    sync_block()
+    total = float(0.0)
+    ds_dmx = Group()
+    ds_dq = Group()
+    ds_dp = Group()
+    if lane < COLUMNS:
+        gx = blur(0, lane)
+        gy = blur(1, lane)
+        gq = blur(2, lane)
+        gp = blur(3, lane)
+        row = at[2] + lane // wp.static(COLUMNS // GROUP)
+        for o in range(wp.static(GROUP)):
+            s = ssim(gx[o], gy[o], gq[o], gp[o])
+            ds_dmx[o] = s[1]
+            ds_dq[o] = s[2]
+            ds_dp[o] = s[3]
+            if row < height and at[1] + group_column(lane) + 3 * o < width:
+                total += (1.0 - s[0]) * scale
+    losses[thread] = total
+    if not derivatives:
+        return
+    sync_block()
+    if lane < COLUMNS:
+        put_group(0, lane, ds_dmx)
+        put_group(1, lane, ds_dq)
+        put_group(2, lane, ds_dp)
+    sync_block()
+    write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-    def gradient(
-        first: wp.int32,
-        derivatives: wp.array2d(dtype=wp.float32),
-        image: wp.array(dtype=wp.float32),
-        target: wp.array(dtype=wp.float32),
-        height: wp.int32,
-        width: wp.int32,
-        scale: wp.float32,
-        grad_loss: wp.array(dtype=wp.float32),
-        # outputs
-        grad_image: wp.array(dtype=wp.float32),
-    ):
-        at = place(first + wp.tid(), width)
-        lane = at[0]
-        column = at[1] - 3 * REACH + lane
-        dmx = rows()
-        dq = rows()
-        dp = rows()
-        if column >= 0 and column < width:
-            for i in range(wp.static(ROWS + 2 * REACH)):
-                row = at[2] + i - REACH
-                x = float(0.0)
-                y = float(0.0)
-                z = float(0.0)
-                if row >= 0 and row < height:
-                    x = derivatives[0, row * width + column]
-                    y = derivatives[1, row * width + column]
-                    z = derivatives[2, row * width + column]
-                for j in range(wp.static(ROWS)):
-                    if wp.static(tap(i - j) > 0.0):
-                        dmx[j] += x * wp.static(wp.float32(tap(i - j)))
-                        dq[j] += y * wp.static(wp.float32(tap(i - j)))
-                        dp[j] += z * wp.static(wp.float32(tap(i - j)))
-        put(0, lane, dmx)
-        put(1, lane, dq)
-        put(2, lane, dp)
-        sync_block()
-        gmx = group()
-        gq = group()
-        gp = group()
-        if lane < COLUMNS:
-            gmx = blur(0, lane)
-            gq = blur(1, lane)
-            gp = blur(2, lane)
-        sync_block()
-        if lane < COLUMNS:
-            put_group(0, lane, gmx)
-            put_group(1, lane, gq)
-            put_group(2, lane, gp)
-        sync_block()
-        column = at[1] + lane
-        if lane < COLUMNS and column < width:
-            factor = -scale * grad_loss[0]
+
+@wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
+def gradient(
+    first: wp.int32,
+    derivatives: wp.array2d(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    scale: wp.float32,
+    grad_loss: wp.array(dtype=wp.float32),
+    # outputs
+    grad_image: wp.array(dtype=wp.float32),
+):
+    at = place(first + wp.tid(), width)
+    lane = at[0]
+    column = at[1] - 3 * REACH + lane
+    dmx = Rows()
+    dq = Rows()
+    dp = Rows()
+    if column >= 0 and column < width:
+        for i in range(wp.static(ROWS + 2 * REACH)):
+            row = at[2] + i - REACH
+            x = float(0.0)
+            y = float(0.0)
+            z = float(0.0)
+            if row >= 0 and row < height:
+                x = derivatives[0, row * width + column]
+                y = derivatives[1, row * width + column]
+                z = derivatives[2, row * width + column]
             for j in range(wp.static(ROWS)):
-                row = at[2] + j
-                if row < height:
-                    k = row * width + column
-                    cells = j * THREADS + lane
-                    change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
-                    change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
-                    grad_image[k] = change * factor
-
-    return SimpleNamespace(score=score, gradient=gradient)
+                if wp.static(tap(i - j) > 0.0):
+                    dmx[j] += x * wp.static(wp.float32(tap(i - j)))
+                    dq[j] += y * wp.static(wp.float32(tap(i - j)))
+                    dp[j] += z * wp.static(wp.float32(tap(i - j)))
+    put(0, lane, dmx)
+    put(1, lane, dq)
+    put(2, lane, dp)
+    sync_block()
+    gmx = Group()
+    gq = Group()
+    gp = Group()
+    if lane < COLUMNS:
+        gmx = blur(0, lane)
+        gq = blur(1, lane)
+        gp = blur(2, lane)
+    sync_block()
+    if lane < COLUMNS:
+        put_group(0, lane, gmx)
+        put_group(1, lane, gq)
+        put_group(2, lane, gp)
+    sync_block()
+    column = at[1] + lane
+    if lane < COLUMNS and column < width:
+        factor = -scale * grad_loss[0]
+        for j in range(wp.static(ROWS)):
+            row = at[2] + j
+            if row < height:
+                k = row * width + column
+                cells = j * THREADS + lane
+                change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
+                change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
+                grad_image[k] = change * factor
