@@ -24,6 +24,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import Rendering, render
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
+from nexwarp.ops import tape as tape
 from nexwarp.train.api import train
 from nexwarp.train.recipe import Config, preset
 from nexwarp.train.report import StepReport

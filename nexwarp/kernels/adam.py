@@ -129,7 +129,7 @@ def adam_kernel() -> wp.Kernel:
     """Make the kernel; parameters and moments are flat float32, on CUDA from addresses that are multiples of 16."""
 
     @wp.func_native(_STEP)
-    def update(
+    def update(  # noqa: PLR0913  # the body of a kernel entry point
         thread: wp.int32,
         values: Real,
         grads: Real,
@@ -148,7 +148,7 @@ def adam_kernel() -> wp.Kernel:
     ) -> wp.float32: ...
 
     @wp.kernel(enable_backward=False, module="unique")
-    def adam(
+    def adam(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         grads: Real,
         factors: Real,

@@ -51,7 +51,7 @@ def expose_kernels(real: type) -> SimpleNamespace:
         exposed_colors[p] = wp.cw_mul(textured[p], e)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def expose_backward(
+    def expose_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         image: wp.array(dtype=vec3),
         exposure: wp.array(dtype=vec3),

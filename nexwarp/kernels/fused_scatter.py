@@ -257,7 +257,7 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
     text = text.replace("MERGE", _merge(features))
 
     @wp.func_native(PRELUDE + f"    constexpr int F = {features};\n" + text)
-    def scatter(
+    def scatter(  # noqa: PLR0913  # the body of a kernel entry point
         thread: wp.int32,
         table: Halves,
         positions: wp.array(dtype=wp.vec3),
@@ -280,7 +280,7 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(SCATTER_THREADS, SCATTER_BLOCKS)
     )
-    def fused_scatter(
+    def fused_scatter(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         table: Halves,
         positions: wp.array(dtype=wp.vec3),

@@ -107,7 +107,7 @@ def fused_kernels(features: int) -> SimpleNamespace:
     """
 
     @wp.func_native(forward_text(features))
-    def forward(
+    def forward(  # noqa: PLR0913  # the body of a kernel entry point
         thread: wp.int32,
         threads: wp.int32,
         table: Half,
@@ -129,7 +129,7 @@ def fused_kernels(features: int) -> SimpleNamespace:
     ): ...
 
     @wp.func_native(backward_text(features))
-    def backward(
+    def backward(  # noqa: PLR0913  # the body of a kernel entry point
         thread: wp.int32,
         threads: wp.int32,
         encoded: Word,
@@ -149,7 +149,7 @@ def fused_kernels(features: int) -> SimpleNamespace:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
     )
-    def fused_forward(
+    def fused_forward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         threads: wp.int32,
         table: Half,
@@ -194,7 +194,7 @@ def fused_kernels(features: int) -> SimpleNamespace:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
     )
-    def fused_backward(
+    def fused_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         threads: wp.int32,
         encoded: Word,

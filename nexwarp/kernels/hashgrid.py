@@ -32,6 +32,9 @@ INVERSE_TWO_PI = wp.constant(wp.float64(1.0 / (2.0 * math.pi)))
 
 # Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
 _ADD = """
+    bool there = false;
+    for (int k = 0; k < FEATURES; ++k) there = there || value[k] != 0.0f;
+    if (!there) return;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     atomicAdd(reinterpret_cast<floatFEATURES*>(&wp::index(table, level, slot)), make_floatFEATURES(VALUES));
 #else
@@ -70,7 +73,7 @@ _MERGE = """
 
 
 @functools.cache
-def scatter_functions(features: int) -> SimpleNamespace:
+def merge_functions(features: int) -> SimpleNamespace:
     """Make `merge_cells` and `add_row` for tables of rows of 2 or 4 floats."""
     row = wp.types.vector(length=features, dtype=wp.float32)
     corners = wp.types.matrix(shape=(8, features), dtype=wp.float32)
@@ -86,7 +89,7 @@ def scatter_functions(features: int) -> SimpleNamespace:
 
     @wp.func_native(filled(_ADD))
     def add_row(table: wp.array2d(dtype=row), level: wp.int32, slot: wp.int32, value: row):
-        """Add to table[level, slot] atomically."""
+        """Add to table[level, slot] atomically, unless there is nothing to add."""
         ...
 
     return SimpleNamespace(merge_cells=merge_cells, add_row=add_row)
@@ -105,6 +108,12 @@ def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
     y = map_positive(corner[1] + ((j >> 1) & 1)) * PRIME_Y
     z = map_positive(corner[2] + (j >> 2)) * PRIME_Z
     return wp.int32((x ^ y ^ z) & mask)
+
+
+@wp.func
+def floor_of(x: Any):
+    """The corner of a point's cell with the lowest coordinates."""
+    return type(x)(wp.floor(x[0]), wp.floor(x[1]), wp.floor(x[2]))
 
 
 @wp.func
@@ -130,6 +139,78 @@ def interpolate_dot(fraction: Any, corners: Any, scale: Any, depth: Any, focal: 
 
 
 @functools.cache
+def gather_function(real: type, storage: type, features: int) -> wp.Function:
+    """Make the function that reads the rows of a cell's eight corners."""
+    row = wp.types.vector(length=features, dtype=storage)
+    mat = wp.types.matrix(shape=(8, features), dtype=real)
+    load = load_function(features, storage)
+
+    @wp.func
+    def gather(table: wp.array2d(dtype=row), level: int, corner: wp.vec3i, mask: wp.uint32):
+        corners = mat()
+        for j in range(8):
+            value = load(table, level, hash_slot(corner, j, mask))
+            for k in range(wp.static(features)):
+                corners[j, k] = real(value[k])
+        return corners
+
+    return gather
+
+
+@functools.cache
+def scatter_function(real: type, features: int, fixed_point: bool) -> wp.Function:
+    """Make the function that adds gradients to the rows of a cell's eight corners; in fixed point to their integers."""
+    vec = wp.types.vector(length=features, dtype=real)
+    mat = wp.types.matrix(shape=(8, features), dtype=real)
+    if fixed_point:
+        # The lanes of a cell do not add up theirs first: which ones come together may change.
+
+        @wp.func
+        def scatter(
+            sums: wp.array2d(dtype=wp.int64),
+            level: int,
+            corner: wp.vec3i,
+            mask: wp.uint32,
+            grads: mat,
+            units: wp.array(dtype=wp.float64),
+            bad: wp.array(dtype=wp.int32),
+        ):
+            for j in range(8):
+                first = int(hash_slot(corner, j, mask)) * wp.static(features)
+                for k in range(wp.static(features)):
+                    fixed_point_units(sums, level, first + k, grads[j, k], units[0], bad)
+
+        return scatter
+    merged = features in (2, 4) and real is wp.float32
+    merge = merge_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
+    merge_cells, add_row = merge.merge_cells, merge.add_row
+
+    @wp.func
+    def scatter(
+        sums: wp.array2d(dtype=vec),
+        level: int,
+        corner: wp.vec3i,
+        mask: wp.uint32,
+        grads: mat,
+        units: wp.array(dtype=wp.float64),
+        bad: wp.array(dtype=wp.int32),
+    ):
+        total = grads
+        if wp.static(merged):
+            total = merge_cells(corner[0], corner[1], corner[2], grads)
+        for j in range(8):
+            part = vec()
+            for k in range(wp.static(features)):
+                part[k] = total[j, k]
+            if wp.static(merged):
+                add_row(sums, level, hash_slot(corner, j, mask), part)
+            else:
+                wp.atomic_add(sums, level, hash_slot(corner, j, mask), part)
+
+    return scatter
+
+
+@functools.cache
 def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool = False) -> SimpleNamespace:
     """Make the forward and backward kernels.
 
@@ -143,28 +224,11 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
     vec3, vec4 = t.vec3, t.vec4
     row = wp.types.vector(length=features, dtype=storage)
     vec = wp.types.vector(length=features, dtype=real)
-    mat = wp.types.matrix(shape=(8, features), dtype=real)
     ZERO = t.ZERO
-    load = load_function(features, storage)
+    gather = gather_function(real, storage, features)
+    scatter = scatter_function(real, features, fixed_point)
     options = {"fast_math": real is wp.float32}
-    # In fixed point the lanes of a cell do not add up theirs first: which ones come together may change.
-    merged = features in (2, 4) and real is wp.float32 and not fixed_point
-    scatter = scatter_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
-    merge_cells, add_row = scatter.merge_cells, scatter.add_row
     table_of_sums = wp.array2d(dtype=wp.int64) if fixed_point else wp.array2d(dtype=vec)
-
-    @wp.func
-    def cell(x: vec3):
-        return vec3(wp.floor(x[0]), wp.floor(x[1]), wp.floor(x[2]))
-
-    @wp.func
-    def gather(table: wp.array2d(dtype=row), level: int, corner: wp.vec3i, mask: wp.uint32):
-        corners = mat()
-        for j in range(8):
-            value = load(table, level, hash_slot(corner, j, mask))
-            for k in range(wp.static(features)):
-                corners[j, k] = real(value[k])
-        return corners
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def hashgrid(
@@ -185,7 +249,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
         if depth > ZERO:
             scale = resolutions[level]
             x = positions[p] * scale
-            base = cell(x)
+            base = floor_of(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
             x -= base
             value = interpolate(x, gather(table, level, corner, mask), scale, depth, focal[0])
@@ -193,7 +257,7 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
             encoded[level * features + k, p] = storage(value[k])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options)
-    def hashgrid_backward(
+    def hashgrid_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         table: wp.array2d(dtype=row),
         positions: wp.array(dtype=vec3),
@@ -225,32 +289,13 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
                 grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
             scale = resolutions[level]
             x = positions[p] * scale
-            base = cell(x)
+            base = floor_of(x)
             corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
             x -= base
             gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
                 x, gather(table, level, corner, mask), scale, depth, focal[0], grad
             )
-            if wp.static(merged):
-                gc = merge_cells(corner[0], corner[1], corner[2], gc)
-            for j in range(8):
-                if wp.static(fixed_point):
-                    first_sum = int(hash_slot(corner, j, mask)) * wp.static(features)
-                    for k in range(wp.static(features)):
-                        fixed_point_units(grad_table, level, first_sum + k, gc[j, k], units[0], bad)
-                else:
-                    part = vec()
-                    for k in range(wp.static(features)):
-                        part[k] = gc[j, k]
-                    if wp.static(merged):
-                        nonzero = int(0)
-                        for k in range(wp.static(features)):
-                            if part[k] != ZERO:
-                                nonzero = 1
-                        if nonzero != 0:
-                            add_row(grad_table, level, hash_slot(corner, j, mask), part)
-                    else:
-                        wp.atomic_add(grad_table, level, hash_slot(corner, j, mask), part)
+            scatter(grad_table, level, corner, mask, gc, units, bad)
             total += vec4(gx[0] * scale, gx[1] * scale, gx[2] * scale, gd)
         if grad_points.shape[0] > 0:
             grad_points[run, p] = total

@@ -49,6 +49,14 @@ def distance(x: Any):
     return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
 
 
+@wp.func
+def total(weights: wp.array2d(dtype=Any), p: wp.int32):
+    result = weights.dtype(0.0)
+    for h in range(weights.shape[1]):
+        result += weights[p, h]
+    return result
+
+
 @functools.cache
 def photometric_kernels(real: type) -> SimpleNamespace:
     """Make the forward and backward kernels; `scales` are those of the terms in order."""
@@ -56,15 +64,8 @@ def photometric_kernels(real: type) -> SimpleNamespace:
     vec3 = t.vec3
     ONE, EPS = t.ONE, wp.constant(real(WEIGHT_EPSILON))
 
-    @wp.func
-    def total(weights: wp.array2d(dtype=real), p: wp.int32):
-        result = real(0.0)
-        for h in range(weights.shape[1]):
-            result += weights[p, h]
-        return result
-
     @wp.kernel(enable_backward=False, module="unique")
-    def photometric(
+    def photometric(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         image: wp.array(dtype=vec3),
         textured: wp.array(dtype=vec3),
@@ -87,7 +88,7 @@ def photometric_kernels(real: type) -> SimpleNamespace:
             alpha[p] = (ONE - weight) * scales[2]
 
     @wp.kernel(enable_backward=False, module="unique")
-    def photometric_backward(
+    def photometric_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         image: wp.array(dtype=vec3),
         textured: wp.array(dtype=vec3),

@@ -208,7 +208,7 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
         colors[i] = color
 
     @wp.kernel(enable_backward=False, module="unique")
-    def textured_colors_backward(
+    def textured_colors_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         coefficients: wp.array2d(dtype=storage),
         directions: wp.array(dtype=vec3),

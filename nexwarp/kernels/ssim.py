@@ -230,7 +230,7 @@ def score(
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-def gradient(
+def gradient(  # noqa: PLR0913  # a kernel entry point
     first: wp.int32,
     derivatives: wp.array2d(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
