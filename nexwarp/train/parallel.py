@@ -7,8 +7,9 @@ change, so that all ranks change them alike. `Config.iterations` and all schedul
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -17,17 +18,13 @@ from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.machine import derived_seed, needed_memory
 from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
-from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.ranks.reducer import GradientReducer
 from nexwarp.train.recipe import Config
 from nexwarp.train.relocation import least_contributing
-from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.state import Snapshot
-from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 
@@ -52,11 +49,8 @@ class ParallelTrainer(Trainer):
         device: torch.device | str,
         ranks: Ranks,
         *,
-        losses: Mapping[str, OwnLoss] | None = None,
-        optimizer: OptimizerMaker | None = None,
-        teachers: Iterable[Model] = (),
-        calibrate: Calibrate = calibrate_exposures,
         beside: bool | None = None,
+        **options: Any,
     ) -> None:
         """Make the same initial surfels and texture on all ranks.
 
@@ -65,23 +59,19 @@ class ParallelTrainer(Trainer):
             config: settings, the same on all ranks.
             device: of this rank.
             ranks: all ranks.
-            losses: see `Trainer`.
-            optimizer: see `Trainer`.
-            teachers: see `Trainer`; the same on all ranks.
-            calibrate: see `Trainer`.
             beside: sum gradients after a CUDA graph instead of inside; None decides by `sums_beside`.
+            options: of `Trainer`, the same on all ranks.
 
         Raises:
             SceneError: there are fewer training views than ranks.
             RankError: scene or settings differ between ranks.
         """
-        if len(scene.train) < ranks.size:
+        views = len(scene.train)
+        if views < ranks.size:
             raise SceneError(
-                f"{scene.path}: expected at most as many ranks as training views, {len(scene.train)}, got {ranks.size}"
+                f"{scene.path}: expected at most as many ranks as training views, {views}, got {ranks.size}"
             )
-        super().__init__(
-            scene, config, device, losses=losses, optimizer=optimizer, teachers=teachers, calibrate=calibrate
-        )
+        super().__init__(scene, config, device, **options)
         self.ranks = ranks
         ranks.check_same(
             {
@@ -140,9 +130,9 @@ class ParallelTrainer(Trainer):
             needed = needed_memory(error)
             if sent is None or needed is None or capturing(self.device):
                 raise
-            told = f"out of memory while gradients were sent: needed {needed}"
+            message = f"out of memory while gradients were sent: needed {needed}"
         # The other ranks have part of the step: it cannot be repeated here.
-        raise UpdateError(told, needed)
+        raise UpdateError(message, needed)
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss * self.share
@@ -184,14 +174,11 @@ class ParallelTrainer(Trainer):
             fault = error
         sums = [x.detach().view(torch.int32).sum(dtype=torch.int64) for _, x in self._named_parameters()]
         mine = {"fault": None if fault is None else [str(fault), fault.report], "sums": torch.stack(sums).tolist()}
-        told = self.ranks.gather(mine)
-        sums_of_first: object = None
-        for rank, theirs in enumerate(told):
-            assert isinstance(theirs, dict)
-            sums_of_first = theirs["sums"] if rank == 0 else sums_of_first
-            if theirs["fault"] is not None:
-                raise DivergedError(*theirs["fault"])
-            if theirs["sums"] != sums_of_first:
+        records: list[Any] = self.ranks.gather(mine)
+        for rank, record in enumerate(records):
+            if record["fault"] is not None:
+                raise DivergedError(*record["fault"])
+            if record["sums"] != records[0]["sums"]:
                 raise RankError(
                     f"rank {rank}: its parameters at iteration {self.iteration:,} differ from those of rank 0"
                 )

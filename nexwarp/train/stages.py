@@ -4,7 +4,7 @@ Not in the paper. What a student learns from teachers is in `nexwarp.train.teach
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -21,8 +21,6 @@ from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker
-from nexwarp.train.step_losses import OwnLoss
 from nexwarp.train.trainer import Trainer
 
 # Where a run decides, it has teachers if photos are few and surfels many for them. With 18 to 37 photos and 417 surfels
@@ -257,16 +255,22 @@ def stage_runner(
     *,
     own: OwnTeachers | None = None,
     ranks: Ranks | None = None,
-    losses: Mapping[str, OwnLoss] | None = None,
-    optimizer: OptimizerMaker | None = None,
     teachers: Iterable[Model] = (),
+    **extensions: Any,
 ) -> StageRunner:
-    """Return the runner of a training; what is not said here is as of `nexwarp.train`.
+    """Return the runner of a training.
 
-    `store` decides what is kept. `own` are the teachers that the run trains; None plans them, or none where `teachers`
-    are given. `ranks` are the processes that train together; None is this one alone.
+    Args:
+        scene: what to learn from.
+        config: settings of the run.
+        device: where to train.
+        store: what is kept of the stages.
+        own: teachers that the run trains; None plans them, or none where `teachers` are given.
+        ranks: the processes that train together; None is this one alone.
+        teachers: models that the student learns from instead of the run's own.
+        extensions: `losses` and `optimizer`, see `nexwarp.train`.
     """
-    models = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with a model
+    models: Any = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with it
     if own is None:
         own = NO_TEACHERS if models else plan_teachers(config, len(scene.train))
 
@@ -274,14 +278,13 @@ def stage_runner(
     def calibration() -> ExposureCalibration | None:
         return calibrate_exposures(scene, config)
 
-    options = {"losses": losses, "optimizer": optimizer, "calibrate": lambda *_: calibration()}
-
     def make(settings: Config, learned_from: Sequence[Model]) -> Trainer:
+        options = extensions | {"teachers": learned_from, "calibrate": lambda *_: calibration()}
         if ranks is None or ranks.size == 1:
-            return Trainer(scene, settings, device, teachers=learned_from, **options)
-        return ParallelTrainer(scene, settings, device, ranks, teachers=learned_from, **options)
+            return Trainer(scene, settings, device, **options)
+        return ParallelTrainer(scene, settings, device, ranks, **options)
 
-    return StageRunner(divide(config, own), make, store, models)  # type: ignore[arg-type]
+    return StageRunner(divide(config, own), make, store, models)
 
 
 def student_trainer(scene: Scene, config: Config, device: torch.device | str, **options: Any) -> Trainer:
