@@ -16,9 +16,10 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.data import Scene, write_demo
+from nexwarp.data import Scene
 from nexwarp.kernels import launch
 from nexwarp.train import recipe
+from tests.scene_writers import write_demo
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
 

@@ -1,21 +1,19 @@
-"""Writers of the demo in each input format: COLMAP text, nerfstudio, Blender, and through distorted lenses."""
+"""Writers of the demo: smaller, in each input format, and through distorted lenses."""
 
 import json
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from nexwarp.data.capture import Cloud
-from nexwarp.data.demo_room import LAMP, build_room
-from nexwarp.data.images import image_size
+from nexwarp.data.demo import demo_folder
 from nexwarp.data.lens import Lens, pycolmap_module
 from nexwarp.data.ply import write_ply
-from nexwarp.data.raytrace import first_hits, shade
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # As nerfstudio turns a COLMAP world: z up.
@@ -34,34 +32,67 @@ def reconstruction_of(scene: Path):
     return pycolmap_module().Reconstruction(str(scene / "sparse" / "0"))
 
 
-def photograph(room, viewmat: np.ndarray, lens: Lens, samples: int = 4) -> np.ndarray:
-    """(H, W, 3) uint8 of the demo's room, each pixel the mean of samples x samples distorted rays."""
+def write_demo(folder: Path, width: int, height: int, views: int, points: int) -> Path:
+    """Write a smaller copy of the demo: `views` of its photos, reduced to PNG files, and at most `points` points."""
+    pycolmap = pycolmap_module()
+    whole = reconstruction_of(demo_folder())
+    camera = whole.camera(1)
+    scale = np.array([width / camera.width, height / camera.height])
+    camera.rescale(width, height)
+    small = pycolmap.Reconstruction()
+    small.add_camera_with_trivial_rig(camera)
+    every = sorted(whole.reg_image_ids(), key=lambda number: whole.image(number).name)
+    chosen = [every[int(index)] for index in np.linspace(0, len(every), views, endpoint=False)]
+    keypoints: dict[int, list[np.ndarray]] = {number: [] for number in chosen}
+    kept = []
+    for _, point in sorted(whole.points3D.items()):
+        seen = [element for element in point.track.elements if element.image_id in keypoints]
+        if len(seen) >= 2 and len(kept) < points:
+            track = pycolmap.Track()
+            for element in seen:
+                track.add_element(element.image_id, len(keypoints[element.image_id]))
+                keypoints[element.image_id].append(whole.image(element.image_id).points2D[element.point2D_idx].xy)
+            kept.append((point, track))
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    for index, number in enumerate(chosen):
+        pixels = np.array(keypoints[number]).reshape(-1, 2) * scale
+        image = pycolmap.Image(name=f"view_{index:03d}.png", keypoints=pixels, camera_id=1, image_id=number)
+        small.add_image_with_trivial_frame(image, whole.image(number).cam_from_world())
+        with Image.open(demo_folder() / "images" / whole.image(number).name) as photo:
+            photo.resize((width, height), Image.Resampling.BOX).save(folder / "images" / image.name)
+    for point, track in kept:
+        small.add_point3D(point.xyz, track, point.color)
+    small.update_point_3d_errors()
+    small.write_binary(str(folder / "sparse" / "0"))
+    return folder
+
+
+def photograph(photo: np.ndarray, pinhole: Lens, lens: Lens, samples: int = 3) -> np.ndarray:
+    """(H, W, 3) uint8 of a wall that shows `photo`, which `pinhole` took, and goes on with its edges' colours."""
     x, y = ((np.arange(side * samples) + 0.5) / samples for side in (lens.width, lens.height))
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    rays = lens.unproject(pixels.reshape(-1, 2)).reshape(*pixels.shape[:2], 3)
-    rotation = viewmat[:3, :3]
-    start = -rotation.T @ viewmat[:3, 3]
-    hits = first_hits(room, start, (rays @ rotation).astype(np.float32))
-    fine = shade(room, hits, start, LAMP)
-    mean = fine.reshape(lens.height, samples, lens.width, samples, 3).mean(axis=(1, 3))
-    return np.floor(mean * 255.0 + 0.5).astype(np.uint8)
+    column, row = pinhole.project(lens.unproject(pixels.reshape(-1, 2))).T - 0.5
+    planes = [
+        map_coordinates(photo[..., c].astype(np.float64), (row, column), order=1, mode="nearest") for c in range(3)
+    ]
+    fine = np.stack(planes, axis=-1).reshape(lens.height, samples, lens.width, samples, 3)
+    return np.floor(fine.mean(axis=(1, 3)) + 0.5).astype(np.uint8)
 
 
-def write_distorted(demo: Path, folder: Path, lens: Lens, samples: int = 4) -> Path:
+def write_distorted(demo: Path, folder: Path, lens: Lens) -> Path:
     """Write the demo as a COLMAP scene whose photos are taken through `lens`."""
     model = reconstruction_of(demo)
     camera = model.camera(1)
+    pinhole = demo_lens(demo, "PINHOLE", ())
+    (folder / "images").mkdir(parents=True)
+    for number in model.reg_image_ids():
+        name = model.image(number).name
+        photo = np.array(Image.open(demo / "images" / name))
+        Image.fromarray(photograph(photo, pinhole, lens)).save(folder / "images" / name)
     camera.model = lens.model
     camera.params = list(lens.params)
     camera.width, camera.height = lens.width, lens.height
-    images = [model.image(index) for index in model.reg_image_ids()]
-    room = build_room(image_size(demo / "images" / images[0].name)[0])
-    viewmats = [np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images]
-    (folder / "images").mkdir(parents=True)
-    with ThreadPoolExecutor(2) as pool:
-        photos = pool.map(lambda viewmat: photograph(room, viewmat, lens, samples), viewmats)
-        for image, photo in zip(images, photos, strict=True):
-            Image.fromarray(photo).save(folder / "images" / image.name)
     (folder / "sparse" / "0").mkdir(parents=True)
     model.write_binary(str(folder / "sparse" / "0"))
     return folder

@@ -15,7 +15,7 @@ from benchmarks.quality.documents import MISSING, blocks, fill
 from benchmarks.quality.jobs import FOLDS, PEERS, ROWS, TABLES, TrainingJob, scene_of, table_jobs
 from benchmarks.quality.results import Results, drop_unfinished, read_results, table
 from benchmarks.timing import ROOT
-from nexwarp.data.demo import write_demo
+from tests.scene_writers import write_demo
 
 EXAMPLE, EXPOSED = PEERS[0].name, PEERS[2].name
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.train import recipe
 from tests.cli.support import FLAGS, SMALL
+from tests.scene_writers import write_demo
 
 
 @pytest.fixture(scope="module")

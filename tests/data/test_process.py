@@ -154,19 +154,8 @@ def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_clip_becomes_a_scene(tmp_path: Path) -> None:
-    """Rendered, compressed and processed: nine tenths of the frames kept are registered."""
-    from nexwarp.data.demo import TARGET, _look_at
-    from nexwarp.data.demo_room import LAMP, build_room
-    from nexwarp.data.raytrace import render
-
-    width, height, focal = 320, 240, 320.0
-    room, K = build_room(width), np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    with video_writer(tmp_path / "walk.mp4", width, height, 24.0) as append:
-        for azimuth in np.radians(np.linspace(-120.0, -60.0, 24)):
-            outward = np.array([np.cos(azimuth) * 0.95, np.sin(azimuth) * 0.95, 0.3 + 0.1 * np.sin(5.0 * azimuth)])
-            pixels = render(room, _look_at(TARGET + 3.15 * outward, TARGET), K, (width, height), LAMP)
-            append(torch.from_numpy(pixels))
-    report = process(tmp_path / "walk.mp4", tmp_path / "scene", 12)
+    """Nine tenths of the frames kept are registered."""
+    report = process(Path(__file__).parent / "photos" / "walk.mp4", tmp_path / "scene", 12)
     assert report.choice is not None
     assert len(report.sfm.registered) >= 0.9 * len(report.choice.chosen) >= 0.9 * 12
     scene = load_scene(tmp_path / "scene")

@@ -16,10 +16,7 @@ from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from nexwarp.data.capture import Capture
 from nexwarp.data.colmap import read_model
-from nexwarp.data.demo import TARGET, _look_at
-from nexwarp.data.demo_room import LAMP, build_room
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.raytrace import render
 from nexwarp.data.sfm import SfmOptions, reconstruct
 from nexwarp.data.sfm.pairs import components, exhaustive_pairs, sequential_pairs
 from nexwarp.data.sfm.photos import list_photos
@@ -27,6 +24,8 @@ from nexwarp.data.sfm.report import Overlaps, advise, left_out
 from tests.cli.support import refused, snapshot
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
+PHOTOS = Path(__file__).parent / "photos"
+TARGET = np.array([0.0, 0.0, 0.62])
 DISTANCE = 3.15  # of the cameras from what they look at
 K1 = -0.12
 PINHOLE = SfmOptions(camera_model="simple_pinhole")
@@ -40,18 +39,27 @@ class Arc:
     viewmats: dict[str, np.ndarray]
 
 
+def look_at(position: np.ndarray) -> np.ndarray:
+    """(4, 4) world to camera, x right, y down, z forward to `TARGET`, with the world's z up."""
+    forward = (TARGET - position) / np.linalg.norm(TARGET - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = right, np.cross(forward, right), forward
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return viewmat
+
+
 @pytest.fixture(scope="module")
 def arc() -> Arc:
     """Views 8 degrees apart, two heights in turn."""
-    room = build_room(WIDTH)
-    K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
     images, viewmats = {}, {}
-    for index in range(VIEWS):
+    for index, file in enumerate(sorted(PHOTOS.glob("view_*.jpg"))):
         azimuth, elevation = np.radians(-120 + 8 * index), np.radians(14 + 10 * (index % 2))
         outward = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
         name = f"view {index + 5}.png"  # up to "view 11": sorted as text, they would be in another order
-        viewmats[name] = _look_at(TARGET + DISTANCE * outward, TARGET)
-        images[name] = render(room, viewmats[name], K, (WIDTH, HEIGHT), LAMP)
+        viewmats[name] = look_at(TARGET + DISTANCE * outward)
+        images[name] = np.array(Image.open(file))
     return Arc(images, viewmats)
 
 

@@ -16,13 +16,13 @@ import nexwarp as nw
 from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.recipe import Config
 from nexwarp.train.settings import setting_names
 from tests.docs.test_docs import DOCS, ROOT
 from tests.exposed import expose_photos
+from tests.scene_writers import write_demo
 
 
 @pytest.fixture(scope="module")

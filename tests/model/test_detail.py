@@ -130,7 +130,7 @@ def test_models_without_an_order(
 
 
 def test_a_finished_training_is_ordered(tmp_path: Path) -> None:
-    from nexwarp.data import write_demo
+    from tests.scene_writers import write_demo
     from tests.trainer_support import small
 
     scene = nw.load_scene(write_demo(tmp_path / "tiny", width=48, height=36, views=10, points=200))

@@ -10,7 +10,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, View, write_demo
+from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import exposures
 from nexwarp.model.buffers import load_buffers, render_buffers, save_buffers
@@ -37,6 +37,7 @@ from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews, mean_color
 from tests.exposed import exposure_at, with_exposures
 from tests.narrowing import present
+from tests.scene_writers import write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

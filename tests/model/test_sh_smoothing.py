@@ -9,13 +9,14 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
-from nexwarp.data import Scene, View, write_demo
+from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
 from nexwarp.train.finish import sh_smoothing
 from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
 from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig, preset
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
+from tests.scene_writers import write_demo
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 

@@ -5,12 +5,12 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.data import write_demo
 from nexwarp.kernels import launch
 from nexwarp.train.losses import depth_loss
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import present, total
+from tests.scene_writers import write_demo
 from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

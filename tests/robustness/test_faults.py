@@ -14,13 +14,13 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.errors import NexwarpError
 from nexwarp.io.pictures import load_exr
 from nexwarp.run.folder import read_metrics, read_run
 from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.faults import Disk, failing
+from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.run.contents import CONFIG_FILE
@@ -22,6 +21,7 @@ from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.exposed import expose_photos
+from tests.scene_writers import write_demo
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]

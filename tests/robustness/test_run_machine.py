@@ -32,7 +32,6 @@ from hypothesis.stateful import (
 from rich.console import Console
 
 from nexwarp.cli.train import Train
-from nexwarp.data import write_demo
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import NexwarpError, RunError
 from nexwarp.io.files import is_temporary
@@ -46,6 +45,7 @@ from nexwarp.train import recipe
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Killed, kill_at
+from tests.scene_writers import write_demo
 from tests.subprocesses import python_path
 
 SMALL = Config(

@@ -14,12 +14,13 @@ import pytest
 import torch
 
 from nexwarp.cli import main as cli
-from nexwarp.data import Scene, load_scene, write_demo
+from nexwarp.data import Scene, load_scene
 from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines, peak_memory
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
+from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

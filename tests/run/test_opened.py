@@ -9,10 +9,10 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.paths import surrounding
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.opened import open_model
 from nexwarp.train.trainer import Trainer
+from tests.scene_writers import write_demo
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import small
 

@@ -32,7 +32,7 @@ USE = """
 import json, sys, torch
 from dataclasses import replace
 from nexwarp.cli import main as cli; from nexwarp.train import recipe; from nexwarp.run import warmup
-from nexwarp.data import write_demo
+from tests.scene_writers import write_demo
 scene, run, device = sys.argv[1:]
 write_demo(scene, width=48, height=36, views=10, points=200)
 base = recipe.PRESETS["default"]

@@ -12,7 +12,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.data import Scene, write_demo
+from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
 from nexwarp.machine import needed_memory
 from nexwarp.train import state, trainer
@@ -22,6 +22,7 @@ from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.schedules import make_optimizer
 from nexwarp.train.step_losses import step_losses
 from nexwarp.train.trainer import Trainer
+from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

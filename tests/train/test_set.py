@@ -11,11 +11,10 @@ from PIL import Image
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
-from nexwarp.data import write_demo
 from nexwarp.data.scene import SceneSource
 from nexwarp.train.recipe import PRESETS, Config, LearningRates, preset
 from nexwarp.train.settings import config_from_dict, parse_settings, setting, with_settings
-from tests.scene_writers import write_blender
+from tests.scene_writers import write_blender, write_demo
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
 FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]

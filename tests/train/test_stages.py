@@ -15,7 +15,6 @@ import nexwarp as nw
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.cli.session import Session
-from nexwarp.data import write_demo
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.contents import list_files
@@ -29,6 +28,7 @@ from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner, teacher_count
 from tests.exposed import expose_photos
+from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

@@ -6,9 +6,9 @@ import pytest
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.data import write_demo
 from nexwarp.train import recipe
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
+from tests.scene_writers import write_demo
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 

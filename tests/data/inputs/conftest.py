@@ -5,10 +5,9 @@ from functools import partial
 import pytest
 
 import nexwarp.data.scene
-from nexwarp.data import write_demo
 from nexwarp.data.random_points import random_points
 from tests.data.inputs.support import SIZE
-from tests.scene_writers import BARREL, FISHEYE, demo_lens, write_distorted
+from tests.scene_writers import BARREL, FISHEYE, demo_lens, write_demo, write_distorted
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +28,6 @@ def distorted(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("distorted")
     lenses = {"OPENCV": BARREL, "OPENCV_FISHEYE": FISHEYE}
     return {
-        model: write_distorted(demo, folder / model, demo_lens(demo, model, coefficients), samples=3)
+        model: write_distorted(demo, folder / model, demo_lens(demo, model, coefficients))
         for model, coefficients in lenses.items()
     }
