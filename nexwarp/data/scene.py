@@ -15,7 +15,6 @@ from tyro.conf import Positional, arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data.background import parse_color
-from nexwarp.data.cache import PhotoCache, cache_folder
 from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, scene_errors
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.demo import demo_folder
@@ -183,7 +182,7 @@ def load_scene(
 
     A COLMAP model lies in sparse/0, in sparse or in the folder itself, binary or text. Photos of another size than
     their cameras (images_2, images_4, ...) scale the intrinsics by the ratio of the sizes, an axis at a time.
-    Photos of distorted cameras, of every model that COLMAP knows, are undistorted and kept in the user's cache; a
+    Photos of distorted cameras, of every model that COLMAP knows, are undistorted; a
     panorama becomes six views. Every camera's near depth is 0.01 of the scene scale. The test views are those that
     the files name, else every eighth by name. More in docs/scenes.md.
 
@@ -306,12 +305,7 @@ def _read_views(
 ) -> tuple[list[View], list[View]]:
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
-    reader = ViewReader(
-        downscale=source.downscale,
-        background=background,
-        alpha_mask=alpha_mask,
-        cache=PhotoCache(cache_folder() / "undistorted"),
-    )
+    reader = ViewReader(source.downscale, background, alpha_mask)
     plans = _map(reader.plan, _with_masks(path, photos, source.masks), MAX_READERS)
     jobs = [job for plan in plans for job in plan]
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data.cache import PhotoCache
 from nexwarp.data.capture import Photo
 from nexwarp.data.images import (
     compose,
@@ -71,25 +70,16 @@ class PlannedView:
 
 
 class ViewReader:
-    """Reads views; thread-safe."""
+    """Reads views; thread-safe.
 
-    def __init__(
-        self,
-        *,
-        downscale: int,
-        background: tuple[float, float, float] | None,
-        alpha_mask: bool,
-        cache: PhotoCache,
-    ) -> None:
-        """Set the options of all views.
+    Args:
+        downscale: reduce images by this factor, averaging blocks of pixels.
+        background: colour behind transparent photos; None drops their alpha.
+        alpha_mask: use alpha >= 128 as the mask.
+    """
 
-        Args:
-            downscale: reduce images by this factor, averaging blocks of pixels.
-            background: colour behind transparent photos; None drops their alpha.
-            alpha_mask: use alpha >= 128 as the mask.
-            cache: cache of undistorted photos.
-        """
-        self.downscale, self.background, self.alpha_mask, self.cache = downscale, background, alpha_mask, cache
+    def __init__(self, downscale: int, background: tuple[float, float, float] | None, alpha_mask: bool) -> None:
+        self.downscale, self.background, self.alpha_mask = downscale, background, alpha_mask
         self.maps = Maps()
 
     def plan(self, photo: Photo) -> list[PlannedView]:
@@ -142,7 +132,7 @@ class ViewReader:
             ValueError: the photo or mask cannot be decoded, the mask is empty, or the camera is invalid.
         """
         photo = plan.photo
-        image, alpha, mask = self._undistorted(plan) if photo.lens.distorted else self._pixels(plan, None)
+        image, alpha, mask = self._pixels(plan)
         if mask is not None and mask.all():
             mask = None
         if mask is not None and not mask.any():
@@ -162,10 +152,8 @@ class ViewReader:
         points = None if photo.points is None else torch.from_numpy(photo.points)
         return View(camera, image, mask, photo.name, alpha, points)
 
-    def _pixels(
-        self, plan: PlannedView, maps: Maps | None
-    ) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Read image, alpha and mask, undistort them if `maps` is given, and reduce them."""
+    def _pixels(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        """Read image, alpha and mask, undistort and reduce them."""
         photo = plan.photo
         if self.background is None and not self.alpha_mask:
             image, alpha = read_image(photo.file), None
@@ -176,36 +164,13 @@ class ViewReader:
             alpha = None
         elif alpha is not None:
             image = compose(image, alpha, self.background)
-        if maps is not None:
-            undistort = maps.get(photo.lens, plan.target, photo.face)
+        if photo.lens.distorted:
+            undistort = self.maps.get(photo.lens, plan.target, photo.face)
             image, mask = undistort.colors(image), undistort.mask(mask)
             alpha = undistort.colors(alpha[:, :, None])[:, :, 0] if alpha is not None else None
         image = downscale_image(image, self.downscale)
         mask = downscale_mask(mask, self.downscale) if mask is not None else None
         alpha = downscale_image(alpha[:, :, None], self.downscale)[:, :, 0] if alpha is not None else None
-        return image, alpha, mask
-
-    def _undistorted(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Load image, alpha and mask from the cache, or compute them with `_pixels` and save them."""
-        photo, target = plan.photo, plan.target
-        settings = (
-            photo.lens,
-            photo.face,
-            target.width,
-            target.height,
-            self.downscale,
-            self.background,
-            self.alpha_mask,
-        )
-        mask_bytes = b"" if photo.mask is None or self.alpha_mask else photo.mask.read_bytes()
-        key = self.cache.key(repr(settings).encode(), target.K.tobytes(), photo.file.read_bytes(), mask_bytes)
-        kept = self.cache.load(key, target.height // self.downscale, target.width // self.downscale)
-        if kept is not None:
-            pixels, mask = kept
-            alpha = pixels[:, :, 3].contiguous() if pixels.shape[2] == 4 else None
-            return pixels[:, :, :3].contiguous(), alpha, mask
-        image, alpha, mask = self._pixels(plan, self.maps)
-        self.cache.save(key, image if alpha is None else torch.cat([image, alpha[:, :, None]], dim=2), mask)
         return image, alpha, mask
 
 

@@ -161,7 +161,6 @@ class Campaign:
 
     def _work(self, valid: list[Files], folder: Path, report: Connection, now: Any, indices: range, end: float) -> None:
         """Body of the forked process; its reports count only inputs that ended."""
-        os.environ["NEXWARP_CACHE"] = str(folder.parent / "cache")
         _silence()
         _limit_memory()
         for index in indices:

@@ -1,4 +1,4 @@
-"""The demo as a scene in other forms, and a cache of its own for every test."""
+"""The demo as a scene in other forms."""
 
 from functools import partial
 
@@ -11,11 +11,8 @@ from tests.scene_writers import BARREL, FISHEYE, demo_lens, write_demo, write_di
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    folder = tmp_path_factory.mktemp("cache")
-    monkeypatch.setenv("NEXWARP_CACHE", str(folder))
+def few_random_points(monkeypatch):
     monkeypatch.setattr(nexwarp.data.scene, "random_points", partial(random_points, count=4000))
-    return folder
 
 
 @pytest.fixture(scope="module")

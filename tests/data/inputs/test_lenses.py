@@ -1,6 +1,4 @@
-"""Photos of other lenses are undistorted once and kept."""
-
-import shutil
+"""Photos of other lenses are undistorted."""
 
 import numpy as np
 import pytest
@@ -8,9 +6,9 @@ import torch
 from PIL import Image
 
 from nexwarp.data import load_scene
-from nexwarp.data.lens import Lens, Map, pycolmap_module
-from tests.data.inputs.support import SIZE, assert_same_cameras, edit
-from tests.data.test_scene import make_scene, views_of
+from nexwarp.data.lens import Lens, pycolmap_module
+from tests.data.inputs.support import assert_same_cameras, edit
+from tests.data.test_scene import make_scene
 from tests.scene_writers import demo_lens, photograph, write_nerfstudio
 
 
@@ -54,56 +52,6 @@ def test_more_coefficients_and_older_words(distorted, tmp_path):
     expected = pycolmap_module().undistort_camera(pycolmap_module().UndistortCameraOptions(), full)
     assert (three.camera.width, three.camera.height) == (expected.width, expected.height)
     assert (three.camera.cx, three.camera.cy) == pytest.approx((expected.params[2], expected.params[3]))
-
-
-def test_undistorted_photos_are_kept(distorted, cache, monkeypatch):
-    first = load_scene(distorted["OPENCV"], downscale=2)
-    files = [file for file in cache.rglob("*") if file.is_file()]
-    assert len(files) == SIZE["views"] and not any(file.name.startswith(".") for file in files)
-    monkeypatch.setattr(Map, "colors", lambda *_: pytest.fail("undistorted again"))
-    again = load_scene(distorted["OPENCV"], downscale=2)
-    assert_same_cameras(again, first)
-    monkeypatch.undo()
-
-
-def test_a_damaged_cache_is_made_anew(distorted, cache):
-    first = load_scene(distorted["OPENCV"])
-    files = sorted(file for file in cache.rglob("*.png"))
-    files[0].write_bytes(files[0].read_bytes()[:100])
-    files[1].write_bytes(b"")
-    Image.new("RGB", (3, 3)).save(files[2])
-    assert_same_cameras(load_scene(distorted["OPENCV"]), first)
-    assert_same_cameras(load_scene(distorted["OPENCV"]), first)
-
-
-def test_other_pixels_are_other_entries_of_the_cache(distorted, tmp_path, cache):
-    path = tmp_path / "scene"
-    shutil.copytree(distorted["OPENCV"], path)
-    first = load_scene(path)
-    photo = path / "images" / "view_003.png"
-    Image.fromarray(255 - np.array(Image.open(photo))).save(photo)
-    changed = load_scene(path)
-    same = [torch.equal(a.image, b.image) for a, b in zip(views_of(first), views_of(changed), strict=True)]
-    assert same == [index != 3 for index in range(10)]
-
-
-def test_a_cache_that_cannot_be_written_costs_one_warning(distorted, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setenv("NEXWARP_CACHE", str(tmp_path / "file"))
-    with pytest.warns(UserWarning, match="undistorted photos cannot be kept here") as caught:
-        scene = load_scene(distorted["OPENCV"])
-    assert len(caught) == 1 and len(scene.train) == 8 and (tmp_path / "file").read_text() == "no folder"
-
-
-def test_a_full_disk_leaves_nothing(distorted, cache, monkeypatch):
-    def full(self, stream, *_, **__):
-        stream.write(b"half of it")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Image.Image, "save", full)
-    with pytest.warns(UserWarning, match="No space left on device"):
-        load_scene(distorted["OPENCV"])
-    assert not [file for file in cache.rglob("*") if file.is_file()]
 
 
 def test_a_panorama_becomes_six_views(tmp_path):
