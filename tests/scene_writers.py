@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,8 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from nexwarp.data.capture import Cloud
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.lens import Lens, pycolmap_module
-from nexwarp.data.ply import write_ply
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # As nerfstudio turns a COLMAP world: z up.
@@ -106,17 +103,10 @@ def write_text(demo: Path, folder: Path) -> Path:
     return folder
 
 
-def cloud_of(demo: Path) -> Cloud:
-    """Return the demo's points with COLMAP's tracks and errors."""
+def points_of(demo: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the demo's points (P, 3) and their colours (P, 3) uint8, by ascending id."""
     points = [point for _, point in sorted(reconstruction_of(demo).points3D.items())]
-    pairs = {(element.image_id, index) for index, point in enumerate(points) for element in point.track.elements}
-    return Cloud(
-        np.array([point.xyz for point in points]),
-        np.array([point.color for point in points]),
-        np.array([point.track.length() for point in points], np.int32),
-        np.array([point.error for point in points], np.float32),
-        np.array(sorted(pairs), np.int64),
-    )
+    return np.array([point.xyz for point in points]), np.array([point.color for point in points])
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray, form: str = "binary_little_endian") -> Path:
@@ -135,11 +125,8 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray, form: str =
     return path
 
 
-def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED, tracks: bool = True) -> Path:
-    """Write a COLMAP scene of one camera as nerfstudio does, its world moved by `applied` (3, 4).
-
-    With `tracks` the points have COLMAP's tracks and errors, which nerfstudio's own exports lack.
-    """
+def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED) -> Path:
+    """Write a COLMAP scene of one camera as nerfstudio does, its world moved by `applied` (3, 4)."""
     model = reconstruction_of(demo)
     camera = model.camera(1)
     params = dict(zip([p.strip() for p in camera.params_info.split(",")], camera.params, strict=True))
@@ -162,10 +149,8 @@ def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED, tr
         data["frames"].append(frame)
     folder.mkdir(parents=True)
     shutil.copytree(demo / "images", folder / "images")
-    cloud = cloud_of(demo)
-    positions = cloud.positions @ applied[:, :3].T + applied[:, 3]
-    cloud = replace(cloud, positions=positions) if tracks else Cloud.of(positions, cloud.colors)
-    write_ply(folder / "sparse_pc.ply", cloud)
+    points, colors = points_of(demo)
+    write_points(folder / "sparse_pc.ply", points @ applied[:, :3].T + applied[:, 3], colors)
     (folder / "transforms.json").write_text(json.dumps(data))
     return folder
 
@@ -174,7 +159,7 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
     """Write a COLMAP scene of one camera as Blender's NeRF exports are, every eighth photo in the test file.
 
     The format has one angle, for square pixels and a centred image; without `centred` the intrinsics go into fl_x,
-    fl_y, cx and cy. With `points` there is a points3d.ply with COLMAP's tracks and errors.
+    fl_y, cx and cy. With `points` there is a points3d.ply.
     """
     model = reconstruction_of(demo)
     camera = model.camera(1)
@@ -194,7 +179,7 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(demo / "images" / image.name, target)
     if points:
-        write_ply(folder / "points3d.ply", cloud_of(demo))
+        write_points(folder / "points3d.ply", *points_of(demo))
     for split, listed in frames.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps({**shared, "frames": listed}))
     return folder

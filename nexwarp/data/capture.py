@@ -48,15 +48,12 @@ class Cloud:
         colors: (P, 3) uint8 sRGB.
         track_lengths: (P,) int32, number of photos that see a point; 0 if unknown.
         reprojection_errors: (P,) float32, mean over the track, in pixels of the original photos; -1 if unknown.
-        observations: (M, 2) int64 distinct pairs of a photo's number and the index of a point that it sees, ascending;
-            None if unknown.
     """
 
     positions: np.ndarray
     colors: np.ndarray
     track_lengths: np.ndarray
     reprojection_errors: np.ndarray
-    observations: np.ndarray | None = None
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> "Cloud":

@@ -1,16 +1,14 @@
-"""Points in PLY files: positions, and optionally colours, track lengths, reprojection errors and observations."""
+"""Points in PLY files: positions, and optionally colours."""
 
 import io
 import itertools
-import os
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
-from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, check_points
+from nexwarp.data.capture import Cloud, check_points
 from nexwarp.io.files import one_line
-from nexwarp.io.ply import write_elements
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -26,9 +24,6 @@ COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_bl
 HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # coefficients of the harmonic Y_0 of Gaussian splats
 BAND_0 = 0.28209479177387814
 GREY = 128
-TRACK = "track_length"
-ERRORS = ("reprojection_error", "error")  # the second is COLMAP's name; it is used only beside a track length
-OBSERVATION, PAIR = "observation", ("image_id", "vertex_index")
 
 # Name, count, and properties as (name, numpy type); None for an element with lists.
 Element: TypeAlias = tuple[str, int, list[tuple[str, str]] | None]
@@ -38,98 +33,29 @@ def read_ply(path: Path) -> Cloud:
     """Read the points of a PLY file, ascii or binary.
 
     Args:
-        path: the file. Its vertices have x, y and z. Optional properties: colours red, green, blue (or diffuse_red,
-            ..., or r, g, b) as integers of full range or floats in [0, 1], or f_dc_0, ... of Gaussian splats;
-            `track_length`, the number of photos that see the point, unknown if 0 or less; `reprojection_error`, or
-            `error` beside a `track_length`, in pixels, unknown if negative. An optional element `observation` after
-            the vertices has the integers `image_id` and `vertex_index`: which photo sees which point. Other
-            properties and elements are ignored.
+        path: the file. Its vertices have x, y and z, and optionally colours: red, green, blue (or diffuse_red, ..., or
+            r, g, b) as integers of full range or floats in [0, 1], or f_dc_0, ... of Gaussian splats. Other properties
+            and elements are ignored.
 
     Returns:
         The points in the file's frame; grey if the file has no colours.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file is not PLY, is damaged or truncated, has no vertices, positions or errors that are not
-            finite, or observations of missing points.
+        ValueError: the file is not PLY, is damaged or truncated, has no vertices, or positions that are not finite.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected a PLY file of points")
-    size = path.stat().st_size
     with path.open("rb") as file:
-        order, elements = _header(path, file)
-        vertices, observations = _elements(path, file, order, elements, size)
-    names = _names(vertices)
-    lacking = [axis for axis in "xyz" if axis not in names]
+        form, elements = _header(path, file)
+        vertices = _vertices(path, file, form, elements)
+    lacking = [axis for axis in "xyz" if axis not in (vertices.dtype.names or ())]
     if lacking:
         raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs warn when they are converted
         positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    check_points(path, positions, "points", lambda index: f"vertex {index}")
-    with np.errstate(invalid="ignore", over="ignore"):
-        colors = _colors(vertices)
-    error = next((name for name in ERRORS if name in names and (name == ERRORS[0] or TRACK in names)), None)
-    lengths = _known(path, vertices, TRACK if TRACK in names else None, 0.0)
-    errors = _known(path, vertices, error, -1.0)
-    return Cloud(
-        positions,
-        colors,
-        np.minimum(lengths, np.iinfo(np.int32).max).astype(np.int32),
-        errors.astype(np.float32),
-        None if observations is None else _pairs(path, observations, len(vertices)),
-    )
-
-
-def write_ply(path: str | os.PathLike[str], cloud: Cloud) -> None:
-    """Write points for `read_ply`; other programs can read the positions and colours.
-
-    Args:
-        path: the file, written atomically.
-        cloud: the points, in the frame of the file. Unknown track lengths and errors are left out.
-
-    Raises:
-        OSError: `path` cannot be written.
-    """
-    vertices = {axis: cloud.positions[:, index].astype(np.float64) for index, axis in enumerate("xyz")}
-    vertices |= {name: cloud.colors[:, index] for index, name in enumerate(COLORS[0])}
-    if (cloud.track_lengths > 0).any():
-        vertices[TRACK] = cloud.track_lengths.astype(np.int32)
-    if (cloud.reprojection_errors >= 0).any():
-        vertices[ERRORS[0]] = cloud.reprojection_errors.astype(np.float32)
-    elements = {"vertex": vertices}
-    if cloud.observations is not None:
-        elements[OBSERVATION] = {name: cloud.observations[:, i].astype(np.int32) for i, name in enumerate(PAIR)}
-    write_elements(path, elements)
-
-
-def _names(rows: np.ndarray) -> tuple[str, ...]:
-    """Names of the fields of a structured array."""
-    return rows.dtype.names or ()
-
-
-def _known(path: Path, vertices: np.ndarray, name: str | None, unknown: float) -> np.ndarray:
-    """(P,) float64 values of a property; `unknown` where the value is negative or the property does not exist."""
-    if name is None:
-        return np.full(len(vertices), unknown)
-    with np.errstate(invalid="ignore"):  # signalling NaNs warn when they are converted
-        values = vertices[name].astype(np.float64)
-    bad = ~(np.abs(values) <= LARGEST_COORDINATE)
-    if bad.any():
-        index = int(np.flatnonzero(bad)[0])
-        raise ValueError(f"{path}: {name}: expected finite numbers, got {values[index]} (vertex {index})")
-    return np.where(values < 0, unknown, values)
-
-
-def _pairs(path: Path, observations: np.ndarray, count: int) -> np.ndarray:
-    """(M, 2) int64 distinct pairs of photo and point, ascending."""
-    with np.errstate(invalid="ignore"):
-        image, vertex = (observations[name].astype(np.int64) for name in PAIR)
-    if len(image) and (min(image.min(), vertex.min()) < 0 or vertex.max() >= count):
-        raise ValueError(
-            f"{path}: {OBSERVATION}: expected images from 0 and vertices from 0 to {count - 1}, "
-            f"got images {image.min()} to {image.max()} and vertices {vertex.min()} to {vertex.max()}"
-        )
-    return np.stack(np.divmod(np.unique(image * count + vertex), count), axis=1)
+        check_points(path, positions, "points", lambda index: f"vertex {index}")
+        return Cloud.of(positions, _colors(vertices))
 
 
 def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:
@@ -138,41 +64,44 @@ def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:
         raise ValueError(f"{path}: expected a PLY file, but it does not begin with 'ply'")
     form = None
     elements: list[Element] = []
-    while True:
-        if file.tell() > MAX_HEADER:
-            raise ValueError(f"{path}: expected a PLY header of at most {MAX_HEADER:,} bytes")
+    while file.tell() <= MAX_HEADER:
         line = file.readline(MAX_HEADER)
         words = line.decode("ascii", "replace").split()
         if not line:
             raise ValueError(f"{path}: truncated, the PLY header has no end_header")
         if words[:1] == ["end_header"]:
-            break
+            if form is None:
+                raise ValueError(f"{path}: expected a PLY header with a format, found none")
+            return form, elements
         if words[:1] == ["format"] and len(words) == 3 and words[1] in ORDERS:
             form = words[1]
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 18:
-            elements.append((words[1], int(words[2]), []))
-        elif words[:2] == ["property", "list"] and len(words) == 5 and elements:
-            elements[-1] = (*elements[-1][:2], None)
-        elif words[:1] == ["property"] and len(words) == 3 and elements and words[1] in TYPES:
-            properties = elements[-1][2]
-            if properties is not None:
-                properties.append((words[2], TYPES[words[1]]))
-        elif words and words[0] not in ("comment", "obj_info"):
+        elif not _read_element(words, elements) and words and words[0] not in ("comment", "obj_info"):
             raise ValueError(f"{path}: expected a PLY header, got the line {' '.join(words)[:60]!r}")
-    if form is None:
-        raise ValueError(f"{path}: expected a PLY header with a format, found none")
-    return form, elements
+    raise ValueError(f"{path}: expected a PLY header of at most {MAX_HEADER:,} bytes")
 
 
-def _elements(
-    path: Path, file: io.BufferedReader, form: str, elements: list[Element], size: int
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read structured arrays of the vertices and, if they follow, of the observations; skip earlier elements."""
-    names = [name for name, _, properties in elements if name != OBSERVATION or _is_observation(properties)]
-    vertices = None
+def _read_element(words: list[str], elements: list[Element]) -> bool:
+    """Add an element, or a property of the last one, to `elements`; return False for another line."""
+    if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 18:
+        elements.append((words[1], int(words[2]), []))
+        return True
+    if words[:1] != ["property"] or not elements:
+        return False
+    name, count, properties = elements[-1]
+    if words[1:2] == ["list"] and len(words) == 5:
+        elements[-1] = (name, count, None)
+        return True
+    if len(words) != 3 or words[1] not in TYPES:
+        return False
+    if properties is not None:
+        properties.append((words[2], TYPES[words[1]]))
+    return True
+
+
+def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list[Element]) -> np.ndarray:
+    """Read the vertices as a structured array; skip the elements before them."""
+    size = path.stat().st_size
     for name, count, properties in elements:
-        if vertices is not None and (OBSERVATION not in names or properties is None):
-            break
         left = size - file.tell()
         if properties is None:
             what = "its lists" if name == "vertex" else f"lists of {one_line(name, 60)} before them"
@@ -187,31 +116,16 @@ def _elements(
             raise ValueError(
                 f"{path}: truncated, expected {count:,} of element {one_line(name, 60)}, got {left:,} bytes for them"
             )
-        if name == "vertex" and vertices is None:
+        if name == "vertex":
             if not count or not fields:
                 raise ValueError(f"{path}: expected at least one vertex, got none")
-            vertices = _rows(path, file, form, dtype, count)
-        elif name == OBSERVATION and vertices is not None and _is_observation(properties):
-            return vertices, _rows(path, file, form, dtype, count)
-        elif form == "ascii":
+            return _ascii(path, file, dtype, count) if form == "ascii" else np.fromfile(file, dtype, count)
+        if form == "ascii":
             for _ in range(count):
                 file.readline()
         else:
             file.seek(count * dtype.itemsize, io.SEEK_CUR)
-    if vertices is None:
-        raise ValueError(f"{path}: expected an element vertex, found none")
-    return vertices, None
-
-
-def _is_observation(properties: list[tuple[str, str]] | None) -> bool:
-    kinds = dict(properties or ())
-    return all(kinds.get(name, "f4")[0] in "iu" for name in PAIR)
-
-
-def _rows(path: Path, file: io.BufferedReader, form: str, dtype: "np.dtype[np.void]", count: int) -> np.ndarray:
-    if form == "ascii":
-        return _ascii(path, file, dtype, count) if count else np.empty(0, dtype)
-    return np.fromfile(file, dtype, count)
+    raise ValueError(f"{path}: expected an element vertex, found none")
 
 
 def _ascii(path: Path, file: io.BufferedReader, dtype: "np.dtype[np.void]", count: int) -> np.ndarray:
@@ -234,16 +148,13 @@ def _ascii(path: Path, file: io.BufferedReader, dtype: "np.dtype[np.void]", coun
 
 def _colors(vertices: np.ndarray) -> np.ndarray:
     """(P, 3) uint8 colours; grey without any."""
-    names = _names(vertices)
-    for triple in COLORS:
-        if set(triple) <= set(names):
-            channels = [vertices[name] for name in triple]
-            scale = [255.0 / np.iinfo(c.dtype).max if c.dtype.kind in "iu" else 255.0 for c in channels]
-            return _bytes(np.stack([c * s for c, s in zip(channels, scale, strict=True)], axis=1))
-    if set(HARMONICS) <= set(names):
-        return _bytes(np.stack([255.0 * (0.5 + BAND_0 * vertices[name]) for name in HARMONICS], axis=1))
-    return np.full((len(vertices), 3), GREY, np.uint8)
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
+    names = set(vertices.dtype.names or ())
+    values = np.full((len(vertices), 3), GREY)
+    triple = next((triple for triple in COLORS if set(triple) <= names), None)
+    if triple is not None:
+        channels = [vertices[name] for name in triple]
+        scales = [255.0 / np.iinfo(c.dtype).max if c.dtype.kind in "iu" else 255.0 for c in channels]
+        values = np.stack([c * scale for c, scale in zip(channels, scales, strict=True)], axis=1)
+    elif set(HARMONICS) <= names:
+        values = np.stack([255.0 * (0.5 + BAND_0 * vertices[name]) for name in HARMONICS], axis=1)
     return np.floor(np.nan_to_num(values, nan=float(GREY)).clip(0, 255) + 0.5).astype(np.uint8)

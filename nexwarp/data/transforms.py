@@ -6,22 +6,13 @@ Both hold camera-to-world matrices with OpenGL's camera axes (x right, y up, z b
 
 import dataclasses
 import warnings
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from nexwarp.cameras.camera import MAX_CAMERAS
-from nexwarp.data.capture import (
-    Capture,
-    Cloud,
-    Photo,
-    check_points,
-    distinct_photos,
-    inside_folder,
-    report_missing,
-    safe_name,
-    short,
-)
+from nexwarp.data.capture import Capture, Cloud, Photo, check_points, inside_folder, report_missing, safe_name, short
 from nexwarp.data.frame_camera import frame_lens, frame_viewmat, inverse_applied
 from nexwarp.data.images import read_image
 from nexwarp.data.ply import read_ply
@@ -36,132 +27,109 @@ AGREEMENT = 2.0  # ratio of colour errors from which points count as being in th
 JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
 
 
+@dataclass(frozen=True)
+class _Frames:
+    """The content of a JSON file.
+
+    Attributes:
+        file: the file.
+        data: its keys.
+        photos: its photos that exist, sorted by name.
+        missing: names of the photos that do not exist.
+        to_original: (4, 4) float64 similarity from the file's world frame to the original one.
+        follow_links: whether files may lie behind links that leave the scene's folder.
+    """
+
+    file: Path
+    data: JsonObject
+    photos: list[Photo]
+    missing: list[str]
+    to_original: np.ndarray
+    follow_links: bool
+
+
 def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
     """Read `transforms.json` of a scene.
 
     Args:
         path: folder of the scene.
         images: folder of the photos that replaces "images" in the file.
-        follow_links: see `load_scene`.
-        skip_missing: see `load_scene`.
+        follow_links: see `SceneSource`.
+        skip_missing: see `SceneSource`.
 
     Raises:
         FileNotFoundError: a photo, a mask or the points that the file names do not exist.
         ValueError: the file has invalid content; the message names the place.
     """
-    file = path / NERFSTUDIO_FILE
-    data, missing = _read_data(file, images, skip_missing)
-    frames = _frames(file, data, images, follow_links)
-    cloud = _points(file, data, frames, follow_links)
-    photos, test = _split(file, data, _sorted(file, data, frames, cloud), missing)
-    return Capture(file, photos, cloud, test)
+    frames = _read_frames(path / NERFSTUDIO_FILE, images, follow_links, skip_missing)
+    photos, test = _split(frames)
+    return Capture(frames.file, photos, _points(frames), test)
 
 
 def read_blender(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
     """Read transforms_train.json and transforms_test.json of a Blender scene; without the latter, transforms_val.json.
 
-    Points are those of `ply_file_path`, or those of `points3d.ply` beside the JSON file if it exists.
-
-    Args:
-        path: folder of the scene.
-        images: folder of the photos that replaces "images" in the files.
-        follow_links: see `load_scene`.
-        skip_missing: see `load_scene`.
-
-    Raises:
-        FileNotFoundError: transforms_train.json or a photo that a file names does not exist.
-        ValueError: a file has invalid content; the message names the place.
+    Points are those of `ply_file_path`, or those of `points3d.ply` beside the JSON file if it exists. Arguments and
+    errors are those of `read_nerfstudio`.
     """
-    train = path / BLENDER_FILES["train"]
-    if not train.is_file():
-        raise FileNotFoundError(f"{path}: expected {train.name} of a Blender scene, found none")
-    data, _ = _read_data(train, images, skip_missing)
-    frames = _frames(train, data, images, follow_links)
-    cloud = _points(train, data, frames, follow_links, BLENDER_POINTS)
-    photos = _sorted(train, data, frames, cloud)
-    for split in ("test", "val"):
-        other = path / BLENDER_FILES[split]
-        if other.is_file():
-            other_data, _ = _read_data(other, images, skip_missing)
-            held_out = _frames(other, other_data, images, follow_links)
-            names = {photo.name for photo in photos}
-            again = [photo.name for photo in held_out if photo.name in names]
-            if again:
-                raise ValueError(f"{other}: {again[0]} is in {train.name} too, expected other photos to judge by")
-            merged = sorted(photos + held_out, key=lambda photo: photo.name)
-            test = frozenset(photo.name for photo in held_out)
-            return Capture(train, merged, cloud, test, WHITE)
-    return Capture(train, photos, cloud, None, WHITE)
+    train_file = path / BLENDER_FILES["train"]
+    if not train_file.is_file():
+        raise FileNotFoundError(f"{path}: expected {train_file.name} of a Blender scene, found none")
+    train = _read_frames(train_file, images, follow_links, skip_missing)
+    cloud = _points(train, BLENDER_POINTS)
+    file = next(
+        (path / BLENDER_FILES[part] for part in ("test", "val") if (path / BLENDER_FILES[part]).is_file()), None
+    )
+    if file is None:
+        return Capture(train_file, train.photos, cloud, None, WHITE)
+    held_out = _read_frames(file, images, follow_links, skip_missing).photos
+    test = frozenset(photo.name for photo in held_out)
+    again = [photo.name for photo in train.photos if photo.name in test]
+    if again:
+        raise ValueError(f"{file}: {again[0]} is in {train_file.name} too, expected other photos to judge by")
+    return Capture(train_file, sorted(train.photos + held_out, key=lambda photo: photo.name), cloud, test, WHITE)
 
 
-def _read_data(file: Path, images: str, skip_missing: bool) -> tuple[JsonObject, tuple[str, ...]]:
-    """Return the file's content with those frames only whose photos exist, and the names of the missing photos."""
+def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:
     data = read_object(file, finite=True)
-    frames: list[Json] = []
-    missing: list[str] = []
-    found: set[str] = set()
-    for index, frame in enumerate(_frame_list(file, data)):
+    entries = data.get("frames")
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {short(entries)}")
+    if len(entries) > MAX_CAMERAS:
+        raise ValueError(f"{file}: frames: expected at most {MAX_CAMERAS:,} frames, got {len(entries):,}")
+    frames = _Frames(file, data, [], [], inverse_applied(file, data), follow_links)
+    names: set[str] = set()
+    for index, entry in enumerate(entries):
         where = f"{file}: frame {index}"
-        if not isinstance(frame, dict):
-            raise ValueError(f"{where}: expected a JSON object, got {short(frame)}")
-        named = _file_name(where, "file_path", frame.get("file_path"))
-        if _find(f"{where} ({named})", file.parent, named, images) is None:
-            missing.append(named)
-        elif named in found:  # before the other frames are looked at, which are many in a file that repeats one
-            raise ValueError(f"{file}: expected each photo once, got {_view_name(named)} twice")
-        else:
-            frames.append(frame)
-            found.add(named)
-    report_missing(file, missing, len(missing) + len(frames), skip_missing)
-    return {**data, "frames": frames}, tuple(missing)
-
-
-def _frame_list(file: Path, data: JsonObject) -> list[Json]:
-    frames = data.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {short(frames)}")
-    if len(frames) > MAX_CAMERAS:
-        raise ValueError(f"{file}: frames: expected at most {MAX_CAMERAS:,} frames, got {len(frames):,}")
+        if not isinstance(entry, dict):
+            raise ValueError(f"{where}: expected a JSON object, got {short(entry)}")
+        named = _file_name(where, "file_path", entry.get("file_path"))
+        where = f"{where} ({named})"
+        photo_file = _find(where, file.parent, named, images)
+        if photo_file is None:
+            frames.missing.append(named)
+            continue
+        name = _view_name(str(PurePosixPath(named).with_name(photo_file.name)))
+        if name in names:
+            raise ValueError(f"{file}: expected each photo once, got {name} twice")
+        names.add(name)
+        folder = file.parent / images if PurePosixPath(named).is_relative_to("images") else file.parent
+        inside_folder(f"{where}: file_path", photo_file, folder, follow_links)
+        frames.photos.append(_photo(where, frames, entry, name, photo_file))
+    report_missing(file, frames.missing, len(entries), skip_missing)
+    frames.photos.sort(key=lambda photo: photo.name)
     return frames
 
 
-def _frames(file: Path, data: JsonObject, images: str, follow_links: bool) -> list[Photo]:
-    """The photos in the order of the file."""
-    to_original = inverse_applied(file, data)
-    frames: Json = data["frames"]
-    assert isinstance(frames, list)  # as `_read_data` returns it
-
-    def photo(index: int, frame: Json) -> Photo:
-        assert isinstance(frame, dict)
-        return _photo(f"{file}: frame {index}", file.parent, data, frame, images, to_original, follow_links)
-
-    return distinct_photos(file, (photo(index, frame) for index, frame in enumerate(frames)))
-
-
-def _photo(
-    where: str,
-    folder: Path,
-    data: JsonObject,
-    frame: JsonObject,
-    images: str,
-    to_original: np.ndarray,
-    follow_links: bool,
-) -> Photo:
-    named = _file_name(where, "file_path", frame.get("file_path"))
-    where = f"{where} ({named})"
-    file = _find(where, folder, named, images)
-    assert file is not None  # `_read_data` keeps no other frames
-    inside = folder / images if PurePosixPath(named).is_relative_to("images") else folder
-    inside_folder(f"{where}: file_path", file, inside, follow_links)
-    name = _view_name(str(PurePosixPath(named).with_name(file.name)))
+def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path) -> Photo:
     mask = None
-    if frame.get("mask_path") is not None:
-        mask = folder / _file_name(where, "mask_path", frame["mask_path"])
+    if entry.get("mask_path") is not None:
+        mask = frames.file.parent / _file_name(where, "mask_path", entry["mask_path"])
         if not mask.is_file():
             raise FileNotFoundError(f"{where}: mask not found: {mask}")
-        inside_folder(f"{where}: mask_path", mask, folder, follow_links)
-    lens = frame_lens(where, {**data, **frame}, file)
-    return Photo(name, file, frame_viewmat(where, frame.get("transform_matrix"), to_original), lens, mask)
+        inside_folder(f"{where}: mask_path", mask, frames.file.parent, frames.follow_links)
+    lens = frame_lens(where, {**frames.data, **entry}, file)
+    return Photo(name, file, frame_viewmat(where, entry.get("transform_matrix"), frames.to_original), lens, mask)
 
 
 def _file_name(where: str, key: str, value: Json) -> str:
@@ -188,88 +156,68 @@ def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _split(
-    file: Path, data: JsonObject, photos: list[Photo], absent: tuple[str, ...]
-) -> tuple[list[Photo], frozenset[str] | None]:
+def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
     """Return the photos in use and the names of the test photos; None if the file has no split."""
+    known = {photo.name for photo in frames.photos} | {_view_name(name) for name in frames.missing}
+    known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
     lists: dict[str, set[str]] = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
-        names = data.get(key)
+        names = frames.data.get(key)
         if names is None:
             continue
         if not isinstance(names, list):
-            raise ValueError(f"{file}: {key}: expected a list of file names, got {short(names)}")
-        lists[key] = {_view_name(_file_name(str(file), key, name)) for name in names}
-        known = {photo.name for photo in photos} | {_view_name(name) for name in absent}
-        known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
-        missing = sorted(lists[key] - known)
-        if missing:
-            raise ValueError(f"{file}: {key}: expected photos of the frames, got {missing[0]}")
+            raise ValueError(f"{frames.file}: {key}: expected a list of file names, got {short(names)}")
+        lists[key] = {_view_name(_file_name(str(frames.file), key, name)) for name in names}
+        unknown = sorted(lists[key] - known)
+        if unknown:
+            raise ValueError(f"{frames.file}: {key}: expected photos of the frames, got {unknown[0]}")
     if not lists:
-        return photos, None
+        return frames.photos, None
 
-    def listed(photo: Photo, names: set[str]) -> bool:
-        return photo.name in names or str(PurePosixPath(photo.name).with_suffix("")) in names
+    def listed(names: set[str]) -> list[Photo]:
+        return [p for p in frames.photos if p.name in names or str(PurePosixPath(p.name).with_suffix("")) in names]
 
-    held_out = lists.get("test_filenames") or lists.get("val_filenames") or set()
-    test = [photo for photo in photos if listed(photo, held_out)]
-    candidates = [
-        photo for photo in photos if "train_filenames" not in lists or listed(photo, lists["train_filenames"])
-    ]
-    both = [photo for photo in candidates if listed(photo, held_out)]
+    test = listed(lists.get("test_filenames") or lists.get("val_filenames") or set())
+    tests = frozenset(photo.name for photo in test)
+    candidates = listed(lists["train_filenames"]) if "train_filenames" in lists else frames.photos
+    train = [photo for photo in candidates if photo.name not in tests]
+    both = len(candidates) - len(train)
     if both and "train_filenames" in lists:
         warnings.warn(
-            f"{file}: {len(both)} photos are listed for training and testing; they are used for testing only",
+            f"{frames.file}: {both} photos are listed for training and testing; they are used for testing only",
             stacklevel=2,
         )
-    train = [photo for photo in candidates if not listed(photo, held_out)]
     if not train:
-        raise ValueError(f"{file}: train_filenames: expected at least one photo that is not for testing, got none")
-    return sorted(train + test, key=lambda photo: photo.name), frozenset(photo.name for photo in test)
+        raise ValueError(
+            f"{frames.file}: train_filenames: expected at least one photo that is not for testing, got none"
+        )
+    return sorted(train + test, key=lambda photo: photo.name), tests
 
 
-def _points(
-    file: Path, data: JsonObject, frames: list[Photo], follow_links: bool, beside: str | None = None
-) -> Cloud | None:
+def _points(frames: _Frames, beside: str | None = None) -> Cloud | None:
     """Read the points that the file names, or those of the file `beside` it if it exists, in the original world."""
-    key = "ply_file_path"
-    if data.get(key) is not None:
-        path = file.parent / _file_name(str(file), key, data[key])
+    folder = frames.file.parent
+    named = frames.data.get("ply_file_path")
+    if named is not None:
+        key, path = "ply_file_path", folder / _file_name(str(frames.file), "ply_file_path", named)
         if not path.is_file():
-            raise FileNotFoundError(f"{file}: {key}: points not found: {path}")
-    elif beside is not None and (file.parent / beside).is_file():
-        key, path = "points", file.parent / beside
+            raise FileNotFoundError(f"{frames.file}: {key}: points not found: {path}")
+    elif beside is not None and (folder / beside).is_file():
+        key, path = "points", folder / beside
     else:
         return None
-    cloud = read_ply(inside_folder(f"{file}: {key}", path, file.parent, follow_links))
-    to_original = inverse_applied(file, data)
-    moved = cloud.positions @ to_original[:3, :3].T + to_original[:3, 3]
+    cloud = read_ply(inside_folder(f"{frames.file}: {key}", path, folder, frames.follow_links))
+    moved = cloud.positions @ frames.to_original[:3, :3].T + frames.to_original[:3, 3]
     check_points(path, moved, "points in the original world", lambda index: f"vertex {index}")
     # Some releases of nerfstudio transformed only the cameras and left the points in the original world.
-    if not np.allclose(to_original, np.eye(4)):
-        error_moved, error_unmoved = (_color_error(x, cloud.colors, frames) for x in (moved, cloud.positions))
+    if not np.allclose(frames.to_original, np.eye(4)):
+        error_moved, error_unmoved = (_color_error(x, cloud.colors, frames.photos) for x in (moved, cloud.positions))
         if error_moved > AGREEMENT * error_unmoved:
             warnings.warn(
                 f"{path}: its points fit the photos only without applied_transform; left as they are", stacklevel=2
             )
-            moved = cloud.positions
+            return cloud
     return dataclasses.replace(cloud, positions=moved)
-
-
-def _sorted(file: Path, data: JsonObject, frames: list[Photo], cloud: Cloud | None) -> list[Photo]:
-    """Sort the photos by name, after adding the observed points to those with a `colmap_im_id`."""
-    if cloud is not None and cloud.observations is not None:
-        image, point = cloud.observations.T
-        positions = cloud.positions.astype(np.float32)
-        for index, (photo, frame) in enumerate(zip(frames, _frame_list(file, data), strict=True)):
-            number = frame.get("colmap_im_id") if isinstance(frame, dict) else None
-            if number is None:
-                continue
-            if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 2**32:
-                raise ValueError(f"{file}: frame {index}: colmap_im_id: expected an image's id, got {short(number)}")
-            first, last = np.searchsorted(image, [number, number + 1])
-            frames[index] = dataclasses.replace(photo, points=positions[point[first:last]])
-    return sorted(frames, key=lambda photo: photo.name)
 
 
 def _color_error(points: np.ndarray, colors: np.ndarray, photos: list[Photo]) -> float:

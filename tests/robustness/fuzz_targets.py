@@ -16,10 +16,9 @@ import torch
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
-from nexwarp.data.capture import Cloud
 from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.ply import read_ply, write_ply
+from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.export.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
@@ -140,9 +139,6 @@ def _ply(folder: Path) -> list[Files]:
             body = np.array([7], f"{order}i4").tobytes() + np.array(rows, dtype).tobytes()
         inputs.append({"points.ply": head + body})
     save_splats_ply(folder / "points.ply", some_surfels())
-    inputs.append(_files(folder))
-    known = np.ones(6, np.int32), np.ones(6, np.float32), np.array([[1, 0], [2, 5]])
-    write_ply(folder / "points.ply", Cloud(np.eye(6, 3), np.zeros((6, 3), np.uint8), *known))
     return [*inputs, _files(folder)]
 
 

@@ -109,7 +109,6 @@ BAD = {
     "no such ply": (spoilt(lambda d: d.update(ply_file_path="q.ply")), "ply_file_path: points not found: .*q.ply"),
     "ply elsewhere": (spoilt(lambda d: d.update(ply_file_path="../q.ply")), "ply_file_path: .* leaves the scene"),
     "ply that is none": (file("sparse_pc.ply", b"obj"), "expected a PLY file, but it does not begin with 'ply'"),
-    "id of an image": (frame(colmap_im_id="four"), "frame 3: colmap_im_id: expected an image's id, got 'four'"),
     "no such mask": (frame(mask_path="masks/q.png"), "frame 3 .*: mask not found: .*q.png"),
     "mask elsewhere": (frame(mask_path="../q.png"), "mask_path: '../q.png' leaves the scene's folder"),
     "mask that is none": (file("q.png", b"GIF", mask_path="q.png"), "q.png: expected a complete image file"),

@@ -1,7 +1,5 @@
 """One scene is the same in every format."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,8 +7,6 @@ from PIL import Image
 
 from nexwarp.data import initial_points, load_scene
 from nexwarp.data.scene import find_format
-from nexwarp.train.recipe import preset
-from nexwarp.train.trainer import Trainer
 from tests.data.inputs.support import assert_same_cameras, edit
 from tests.data.test_scene import make_scene, project, views_of
 from tests.scene_writers import reconstruction_of, write_blender, write_nerfstudio, write_points, write_text
@@ -29,44 +25,6 @@ def test_every_format_gives_the_same_scene(demo, tmp_path):
     assert [v.name for v in blender.test] == ["test/view_000.png", "test/view_008.png"]
     assert blender.background is None and blender.train[0].alpha is None, "its photos are opaque"
     assert load_scene(tmp_path / "blender", background="white").background == (1.0, 1.0, 1.0)
-
-
-def test_training_starts_from_the_same_surfels_in_every_format(demo, tmp_path):
-    """What a scene is saved as changes no PSNR: the points kept, the surfels on them and what depths follow agree."""
-    config = replace(preset("default"), max_surfels=200)
-    reference = load_scene(demo)
-    expected = Trainer(reference, config, "cpu")
-    dropped = len(reference.points) - len(starting_points(reference))
-    assert 0 < dropped < len(reference.points) / 2, "the demo has outliers"
-    for write in (write_text, write_nerfstudio, write_blender):
-        scene = load_scene(write(demo, tmp_path / write.__name__))
-        torch.testing.assert_close(starting_points(scene), starting_points(reference), rtol=0, atol=1e-6)
-        trainer = Trainer(scene, config, "cpu")
-        for name, raw in expected.surfels.state_dict().items():
-            torch.testing.assert_close(trainer.surfels.state_dict()[name], raw, rtol=1e-6, atol=1e-6, msg=name)
-        assert trainer.texture.resolutions == pytest.approx(expected.texture.resolutions, rel=1e-6)
-        for view, other in zip(scene.train, reference.train, strict=True):
-            torch.testing.assert_close(view.points, other.points, rtol=0, atol=1e-6)
-
-
-def starting_points(scene) -> torch.Tensor:
-    known = {"track_lengths": scene.track_lengths, "errors": scene.reprojection_errors}
-    return initial_points(scene.points, scene.colors, 10**6, **known).means
-
-
-def test_observations_go_with_the_frames_that_are_left(demo, tmp_path):
-    """A frame taken out of the JSON, or one without a number, gives no other the points that it saw."""
-    path = write_nerfstudio(demo, tmp_path / "scene")
-    before = {view.name: view.points for view in load_scene(path).train}
-
-    def change(data):
-        del data["frames"][2]
-        del data["frames"][4]["colmap_im_id"]
-
-    after = {view.name: view.points for view in load_scene(edit(path, change)).train}
-    assert [name for name, points in after.items() if points is None] == ["view_005.png"]
-    both = [(points, before[name]) for name, points in after.items() if name in before and points is not None]
-    assert len(both) == 5 and all(old is not None and torch.equal(new, old) for new, old in both)
 
 
 def test_points_beside_a_blender_scene(demo, tmp_path):
@@ -88,7 +46,7 @@ def test_points_beside_a_blender_scene(demo, tmp_path):
 
 
 def test_what_nerfstudio_does_not_say_about_points_is_unknown(demo, tmp_path):
-    scene = load_scene(write_nerfstudio(demo, tmp_path / "scene", tracks=False))
+    scene = load_scene(write_nerfstudio(demo, tmp_path / "scene"))
     assert all(view.points is None for view in scene.train)
     assert scene.track_lengths.eq(0).all() and scene.reprojection_errors.eq(-1).all()
     chosen = initial_points(
