@@ -179,6 +179,33 @@ def ray_functions(real: type) -> SimpleNamespace:
 
 
 @functools.cache
+def insert_function(real: type, max_hits: int) -> wp.Function:
+    """Make the function that inserts a hit into the K-buffer, as `collect` does."""
+    buffer = hit_buffer(real, max_hits)
+    reals, integers = buffer.reals, buffer.integers
+
+    @wp.func
+    def insert(ids: integers, weights: reals, i: wp.int32, weight: real):
+        """Insert a hit before the first lighter one; return (ids, weights, id and weight of the hit that falls out).
+
+        That and all behind it move down by one, so that of equal ones the nearer stays. Out of an empty slot comes the
+        weight 0.
+        """
+        displaced = bool(False)
+        for j in range(wp.static(max_hits)):
+            w_ = weights[j]
+            i_ = ids[j]
+            displaced = displaced or weight > w_
+            weights[j] = wp.where(displaced, weight, w_)
+            ids[j] = wp.where(displaced, i, i_)
+            weight = wp.where(displaced, w_, weight)
+            i = wp.where(displaced, i_, i)
+        return ids, weights, i, weight
+
+    return insert
+
+
+@functools.cache
 def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
     """Make the collection kernel `collect` and its struct of surfels: a thread is a pixel, and walks its tile's list.
 
@@ -187,7 +214,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
     """
     t = types(real)
     vec3 = t.vec3
-    buffer = hit_buffer(real, max_hits)
+    buffer, insert = hit_buffer(real, max_hits), insert_function(real, max_hits)
     r = ray_functions(real)
     ALPHA_MIN, TRANSMITTANCE_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ZERO, t.HALF, t.ONE
 
@@ -246,7 +273,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
                 total += weight
                 depths += weight * depth
                 transmittance = transmittance * (ONE - alpha)
-                ids, weights, i, weight = buffer.insert(ids, weights, i, weight)
+                ids, weights, i, weight = insert(ids, weights, i, weight)
                 c = record_row(surfels.records, wp.max(i, 0), 3)
                 color += vec3(c[0], c[1], c[2]) * weight
                 if transmittance < TRANSMITTANCE_MIN:
