@@ -58,7 +58,9 @@ def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
         lengths = quats.norm(dim=1)
         if lengths.min() < SHORTEST:
             where = int(lengths.argmin())
-            raise ValueError(f"surfels.raw_quats: expected a length of at least {SHORTEST:g}, got 0 at index {where}")
+            raise ValueError(
+                f"surfels.raw_quats: expected a length of at least {float(SHORTEST):g}, got 0 at index {where}"
+            )
     if (falloff := tensors.get("exposures.falloff")) is not None:
         _check_falloff(*falloff.tolist())
     _check_layers(tensors)

@@ -206,6 +206,8 @@ def render(
         raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
     if texture is not None and not isinstance(texture, NeuralTexture):
         raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
+    if background is None:
+        raise TypeError("background: expected numbers or a tensor, got None")
     options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)
     return draw(surfels, texture, camera, options, background=background)
 

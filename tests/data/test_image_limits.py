@@ -77,13 +77,14 @@ def test_more_hits_than_int32_counts(device):
             ValueError, match=r"^max_hits: expected at most 2,147,483,647 hits, .* 40000x40000 times 8; "
         ):
             call()
-    camera = parts(device, width=8192, height=8192)[2]
-    texture.half_precision = False
-    for call in renderings(surfels, texture, camera, 8):
-        with pytest.raises(
-            ValueError, match=r"^max_hits: expected at most 536,870,879 hits, .* got 8192x8192 times 8; "
-        ):
-            call()
+    if device.type == "cuda":  # a CPU evaluates the texture at a part of the points at a time
+        camera = parts(device, width=8192, height=8192)[2]
+        texture.half_precision = False
+        for call in renderings(surfels, texture, camera, 8):
+            with pytest.raises(
+                ValueError, match=r"^max_hits: expected at most 536,870,879 hits, .* got 8192x8192 times 8; "
+            ):
+                call()
 
 
 def test_rows_that_warp_cannot_address_are_refused():
@@ -224,12 +225,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--scale", "1e6"], "--scale: expected at most 16384 pixels a side, got 23000000x18000000 with 1e+06"),
         (
             ["--size", "16384x16384"],
-            "max_hits: expected at most 536,870,879 hits, pixels times max_hits, got 16384x16384 times 2; "
-            "render the image in parts (Camera.crop)",
-        ),
-        (
-            ["--size", "8192x8192"],
-            "out of memory: an image of 8192x8192 pixels with K = 2 needs at least 11.2 GiB, of which 8.0 GiB are "
+            "out of memory: an image of 16384x16384 pixels with K = 2 needs at least 17.0 GiB, of which 8.0 GiB are "
             "free; render a smaller image, with a lower K, or in parts (Camera.crop)",
         ),
     ],

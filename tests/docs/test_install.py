@@ -43,7 +43,7 @@ def test_an_editable_package_is_found_in_the_folder_above_the_clone(clone: Path,
         wheel.extractall(site)
     for folder in (tmp_path, clone, clone / "nexwarp", site):
         # Without the site-packages of this environment (-S), which hold another nexwarp.
-        code = f"import site; site.addsitedir({str(site)!r}); import nexwarp; print(nexwarp.model.render)"
+        code = f"import site; site.addsitedir({str(site)!r}); import nexwarp; print(nexwarp.render)"
         done = subprocess.run([sys.executable, "-S", "-c", code], cwd=folder, capture_output=True, text=True, env={})
         assert (done.stdout, done.stderr) == ("the function\n", ""), folder
 
@@ -75,7 +75,7 @@ def test_the_readme_on_pypi_links_to_files_that_exist() -> None:
     ours = re.findall(
         r"https://(?:github\.com|raw\.githubusercontent\.com)/nexwarp/nexwarp/(?:blob/)?main/([^)#\s]+)", text
     )
-    assert "docs/demo.png" in ours and all((ROOT / name).exists() for name in ours)
+    assert "docs/capture.jpg" in ours and all((ROOT / name).exists() for name in ours)
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda file: file.stem)
