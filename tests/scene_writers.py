@@ -29,8 +29,9 @@ def reconstruction_of(scene: Path):
     return pycolmap_module().Reconstruction(str(scene / "sparse" / "0"))
 
 
-def write_demo(folder: Path, width: int, height: int, views: int, points: int) -> Path:
+def write_demo(folder: str | Path, width: int, height: int, views: int, points: int) -> Path:
     """Write a smaller copy of the demo: `views` of its photos, reduced to PNG files, and at most `points` points."""
+    folder = Path(folder)
     pycolmap = pycolmap_module()
     whole = reconstruction_of(demo_folder())
     camera = whole.camera(1)

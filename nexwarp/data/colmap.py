@@ -94,9 +94,8 @@ def _photo(
     if image.camera not in cameras:
         raise ValueError(f"{where}: expected a camera of the model, got id {image.camera}")
     if image.camera not in lenses:
-        camera = cameras[image.camera]
         try:
-            lenses[image.camera] = Lens(camera.model, camera.params, camera.width, camera.height)
+            lenses[image.camera] = Lens(*cameras[image.camera])
         except ValueError as error:
             raise ValueError(f"{where}: the COLMAP camera of this image is not usable: {error}") from error
     return Photo(name, file, _viewmat(where, image.pose), lenses[image.camera], points=np.zeros((0, 3), np.float32))

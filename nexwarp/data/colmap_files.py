@@ -1,16 +1,17 @@
 """Readers of COLMAP's model files, binary and text, into numpy arrays.
 
 pycolmap is not used: it allocates memory for a count before it checks the file's size, reads past the end of a
-truncated file, aborts the process on some damaged files, and creates a Python object for each point. Only poses and
-points are used; rigs and frames, which repeat the poses of the images, are only checked for damage.
+truncated file, aborts the process on some damaged files, and creates a Python object for each point. Rigs and frames,
+which repeat the poses of the images, are not read.
 """
 
 import struct
 from array import array
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,25 +36,17 @@ POINT_RECORD = np.dtype(
 Record = TypeVar("Record")
 
 
-@dataclass(frozen=True)
-class CameraRecord:
-    """A camera: COLMAP's name of its model, size in pixels, parameters in COLMAP's order."""
+class CameraRecord(NamedTuple):
+    """A camera: COLMAP's name of its model, parameters in COLMAP's order, size in pixels; the arguments of `Lens`."""
 
     model: str
+    params: tuple[float, ...]
     width: int
     height: int
-    params: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class ImageRecord:
-    """A registered image.
-
-    Attributes:
-        pose: (7,) rotation wxyz, not normalised, and translation, world to camera.
-        camera: id of its camera.
-        name: the name in the file.
-    """
+class ImageRecord(NamedTuple):
+    """A registered image: rotation wxyz, not normalised, and translation (7,), world to camera; camera's id; name."""
 
     pose: tuple[float, ...]
     camera: int
@@ -93,26 +86,17 @@ class Records:
 
 
 def read_binary(folder: Path) -> Records:
-    """Read cameras.bin, images.bin and points3D.bin; check that rigs.bin and frames.bin are complete if they exist.
+    """Read cameras.bin, images.bin and points3D.bin.
 
     Raises:
         ValueError: a file is truncated or damaged, or exceeds the limits above; the message names it.
     """
-    for name, skip in (("rigs.bin", _skip_rig), ("frames.bin", _skip_frame)):
-        if (folder / name).is_file():
-            with _Reader(folder / name) as file:
-                for _ in range(file.count(MAX_IMAGES)):
-                    skip(file)
-                file.end()
-    with _Reader(folder / "cameras.bin") as file:
+    with _opened(folder / "cameras.bin") as file:
         cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
-        file.end()
-    with _Reader(folder / "images.bin") as file:
+    with _opened(folder / "images.bin") as file:
         images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
-        file.end()
-    with _Reader(folder / "points3D.bin") as file:
+    with _opened(folder / "points3D.bin") as file:
         points = _binary_points(file)
-        file.end()
     return Records(cameras, images, points)
 
 
@@ -127,27 +111,20 @@ def read_text(folder: Path) -> Records:
 class _Reader:
     """Reads a binary file with checks against its size: it never reads or allocates beyond it."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.position = path, 0
-        self.size = path.stat().st_size
-        self._file: BinaryIO = path.open("rb")
-
-    def __enter__(self) -> "_Reader":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file, self.size = path, file, path.stat().st_size
+        self.position = 0
 
     def read(self, size: int) -> bytes:
         self._advance(size)
-        data = self._file.read(size)
+        data = self.file.read(size)
         if len(data) < size:
             raise self._short()
         return data
 
     def skip(self, size: int) -> None:
         self._advance(size)
-        self._file.seek(self.position)
+        self.file.seek(self.position)
 
     def number(self, kind: str) -> int:
         return struct.unpack(f"<{kind}", self.read(struct.calcsize(f"<{kind}")))[0]
@@ -163,17 +140,11 @@ class _Reader:
     def text(self) -> bytes:
         """Read bytes up to a zero."""
         start = self.position
-        data, zero, _ = self._file.read(MAX_NAME + 1).partition(b"\0")
+        data, zero, _ = self.file.read(MAX_NAME + 1).partition(b"\0")
         if not zero and start + MAX_NAME < self.size:
             raise ValueError(f"{self.path}: damaged, expected image names of at most {MAX_NAME} bytes")
         self.skip(len(data) + 1)
         return data
-
-    def end(self) -> None:
-        if self.position != self.size:
-            raise ValueError(
-                f"{self.path}: damaged, expected {self.position:,} bytes as its counts say, got {self.size:,}"
-            )
 
     def _advance(self, size: int) -> None:
         self.position += size
@@ -182,6 +153,16 @@ class _Reader:
 
     def _short(self) -> ValueError:
         return ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Reader]:
+    """Open a binary file that is to be read to its end."""
+    with path.open("rb") as file:
+        reader = _Reader(path, file)
+        yield reader
+    if reader.position != reader.size:
+        raise ValueError(f"{path}: damaged, expected {reader.position:,} bytes as its counts say, got {reader.size:,}")
 
 
 def _unique(path: Path, records: Iterator[tuple[int, Record]], limit: int = MAX_CAMERAS) -> dict[int, Record]:
@@ -201,7 +182,7 @@ def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:
     if model not in camera_models():
         raise ValueError(f"{file.path}: camera {identity}: expected a camera model that COLMAP knows, got {model}")
     name, count = camera_models()[model]
-    return identity, CameraRecord(name, width, height, struct.unpack(f"<{count}d", file.read(8 * count)))
+    return identity, CameraRecord(name, struct.unpack(f"<{count}d", file.read(8 * count)), width, height)
 
 
 def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
@@ -223,24 +204,6 @@ def _binary_points(file: _Reader) -> PointRecords:
     seen_by = np.frombuffer(tracks, "<u4")[::2].copy()
     del tracks
     return _sorted(file.path, points["id"], points["xyz"], points["rgb"], points["error"], points["length"], seen_by)
-
-
-def _skip_rig(file: _Reader) -> None:
-    """Skip a rig: its id and sensors, each with type and id; all but the first have an optional pose (7 doubles)."""
-    file.skip(4)
-    sensors = file.number("I")
-    if sensors:
-        file.skip(8)
-    for _ in range(sensors - 1):
-        file.skip(8)
-        if file.number("B"):
-            file.skip(56)
-
-
-def _skip_frame(file: _Reader) -> None:
-    """Skip a frame: id, rig, pose (7 doubles), and 16 bytes for each sensor."""
-    file.skip(64)
-    file.skip(16 * file.number("I"))
 
 
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -268,7 +231,7 @@ def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
         known = {name.encode(): count for name, count in camera_models().values()}
         if known.get(model) != len(params):
             raise ValueError
-        return int(identity), CameraRecord(model.decode(), int(width), int(height), tuple(map(float, params)))
+        return int(identity), CameraRecord(model.decode(), tuple(map(float, params)), int(width), int(height))
     except ValueError:
         expected = "id, model, width, height and the model's parameters of a camera"
         raise _unreadable(where, expected, line) from None

@@ -1,7 +1,6 @@
 """Views and points from tensors in memory, checked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,31 +12,14 @@ from nexwarp.data.views import View
 Array = torch.Tensor | np.ndarray
 
 
-@dataclass(frozen=True)
-class Split:
-    """Views in memory, as a scene has them, sorted by name.
-
-    Attributes:
-        train: views to learn from.
-        test: views to judge by.
-    """
-
-    train: list[View]
-    test: list[View]
-
-
 def split_views(
     images: Sequence[Array],
     cameras: Sequence[Camera],
     masks: Sequence[Array | None] | None,
     names: Sequence[str] | None,
     test_every: int,
-) -> Split:
-    """Make views of the arguments of `Scene.from_tensors`, which documents them.
-
-    Raises:
-        TypeError, ValueError: naming the argument, its index, what was expected and what came.
-    """
+) -> tuple[list[View], list[View]]:
+    """Make the training and the test views of the arguments of `Scene.from_tensors`, sorted by name."""
     if isinstance(test_every, bool) or not isinstance(test_every, int):
         raise TypeError(f"test_every: expected an int, got {type(test_every).__name__}")
     if test_every < 0 or test_every == 1:
@@ -60,15 +42,11 @@ def split_views(
     train = [view for view, test in zip(views, tests, strict=True) if not test]
     if not train:
         raise ValueError(f"test_every: expected 0 for {len(views)} image, which else is a test view, got {test_every}")
-    return Split(train, [view for view, test in zip(views, tests, strict=True) if test])
+    return train, [view for view, test in zip(views, tests, strict=True) if test]
 
 
 def make_cloud(points: Array, colors: Array | None) -> Cloud:
-    """Make a point cloud of the arguments of `Scene.from_tensors`.
-
-    Raises:
-        TypeError, ValueError: naming the argument, what was expected and what came.
-    """
+    """Make a point cloud of the arguments of `Scene.from_tensors`."""
     positions = _tensor("points", points)
     if not positions.is_floating_point():
         raise TypeError(f"points: expected a floating dtype, got {positions.dtype}")

@@ -75,6 +75,8 @@ class SceneSource:
         """
         known = {field.name for field in dataclasses.fields(cls)}
         source = cls(**{name: value for name, value in data.items() if name in known})
+        if "downscale" not in data:  # of the first version, as all runs have it
+            raise ValueError("scene: expected the key downscale, found none")
         _check_types(source)
         return source
 
@@ -161,13 +163,13 @@ class Scene:
         Raises:
             TypeError, ValueError: naming the argument, its index, what was expected and what came.
         """
-        split = split_views(images, cameras, masks, names, test_every)
+        train, test = split_views(images, cameras, masks, names, test_every)
         if points is None and colors is not None:
             raise ValueError("colors: expected None without points, got colours")
         cloud = None if points is None else make_cloud(points, colors)
-        viewmats = [view.camera.viewmat.double().numpy() for view in split.train]
+        viewmats = [view.camera.viewmat.double().numpy() for view in train]
         scale = _scene_scale("cameras", viewmats, cloud)
-        return _make_scene(split.train, split.test, cloud, scale, Path("memory"), None)
+        return _make_scene(train, test, cloud, scale, Path("memory"), None)
 
 
 def load_scene(

@@ -177,7 +177,7 @@ def test_images_of_more_pixels_than_their_file_holds(tmp_path):
         read_mask(file)
 
 
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames", "rigs"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_counts_are_checked_before_they_are_believed(tmp_path, name):
     path = make_scene(tmp_path)
     file = path / f"sparse/0/{name}.bin"

@@ -257,7 +257,6 @@ BAD_SCENES = {
     ),
     "empty cameras": (damaged("sparse/0/cameras.bin", lambda data: b""), "cameras.bin: truncated or damaged"),
     "truncated images": (damaged("sparse/0/images.bin"), "images.bin: truncated or damaged"),
-    "truncated frames": (damaged("sparse/0/frames.bin"), "frames.bin: truncated or damaged"),
     # pycolmap would allocate for a count from nowhere: 95 seconds, and all the memory there is.
     "truncated points": (damaged("sparse/0/points3D.bin"), "points3D.bin: truncated or damaged"),
     "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),

@@ -422,7 +422,7 @@ def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
 
 def test_training_takes_exposures_out(tmp_path):
     """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
-    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400)))
+    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=56, height=42, views=24, points=1500)))
     expected = torch.tensor([exposure_at(view) for view in scene.train]).log()
     expected -= expected.mean()
     _, without = trained(scene, exposures=False)
