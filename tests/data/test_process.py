@@ -15,7 +15,6 @@ from nexwarp.cli.process import is_video
 from nexwarp.data import load_scene
 from nexwarp.data.sfm.frames import choose_frames, motion, sharpness, write_frames
 from nexwarp.data.sfm.process import judge_photos, process
-from nexwarp.data.sfm.report import Overlaps, moving_things
 from nexwarp.io.video import frame_pixels, read_frames, video_writer
 from tests.cli.support import refused
 
@@ -93,15 +92,6 @@ def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) 
         window = gaussian_filter(window, 5.0) if index == 2 else window
         Image.fromarray(window.astype(np.uint8)).convert("RGB").save(tmp_path / name)
     assert judge_photos(tmp_path, names, silent) == (["2.png"], ["5.png"])
-
-
-def test_things_that_move_refute_matches() -> None:
-    names = [f"{i}" for i in range(8)]
-    matches = {(f"{i}", f"{i + 1}"): 200 for i in range(7)}
-    inliers = {pair: 190 for pair in matches} | {("3", "4"): 60, ("4", "5"): 70}
-    assert moving_things(Overlaps({}, inliers, 7, True, matches), names).keys() == {"3", "4", "5"}
-    assert not moving_things(Overlaps({}, {pair: 190 for pair in matches}, 7, True, matches), names)
-    assert not moving_things(Overlaps({}, {}, 7, True, {}), names)
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

@@ -17,8 +17,9 @@ from nexwarp.data.sfm.colmap_scene import move_scene
 from nexwarp.data.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.data.sfm.pairs import exhaustive_pairs, sequential_pairs
 from nexwarp.data.sfm.photos import InputPhoto, camera_groups, camera_model, list_photos, read_photos
-from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out, moving_things
+from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out
 from nexwarp.data.sfm.work import Count, open_database, quiet, run_stage
+from nexwarp.io.files import make_folders, remove_empty
 from nexwarp.io.json_files import Json, write_json
 
 if TYPE_CHECKING:
@@ -137,7 +138,6 @@ class _Work:
             matching="sequential" if sequential else "exhaustive",
             seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
             advice=advise(overlaps, len(registered)),
-            moving=moving_things(overlaps, names),
         )
 
     @contextmanager
@@ -153,7 +153,7 @@ class _Work:
         with open_database(self.database):  # creates the file
             pass
         for group in groups:
-            self._import_group(group)
+            self._import_group([photo.name for photo in group], camera_model(group, self.options))
         by_name = {photo.name: group for group in groups for photo in group}
         with open_database(self.database) as database:
             camera_of = {image.camera_id: by_name[image.name] for image in database.read_all_images()}
@@ -165,14 +165,14 @@ class _Work:
                 camera.has_prior_focal_length = bool(focals)
                 database.update_camera(camera)
 
-    def _import_group(self, group: Sequence[InputPhoto]) -> None:
+    def _import_group(self, names: list[str], model: str) -> None:
         pycolmap = pycolmap_module()
         reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = camera_model(group, self.options)
-        names = [photo.name for photo in group]
+        reader.camera_model = model
+        single = pycolmap.CameraMode.SINGLE
         run_stage(
             "features",
-            lambda _: pycolmap.import_images(self.database, self.photos, pycolmap.CameraMode.SINGLE, names, reader),
+            lambda _: pycolmap.import_images(self.database, self.photos, single, names, reader),
             lambda: None,
         )
 
@@ -239,11 +239,7 @@ class _Work:
                 if count:
                     one, other = pycolmap.pair_id_to_image_pair(pair)
                     inliers[images[one], images[other]] = count
-            matches: dict[tuple[str, str], int] = {}
-            for pair, count in zip(*database.read_num_matches(), strict=True):
-                one, other = pycolmap.pair_id_to_image_pair(pair)
-                matches[images[one], images[other]] = count
-        return Overlaps(features, inliers, pairs, sequential, matches)
+        return Overlaps(features, inliers, pairs, sequential)
 
     def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list["pycolmap.Reconstruction"]:
         """Return all models, largest first."""
@@ -254,28 +250,29 @@ class _Work:
         options.min_model_size = MIN_MODEL
         registered = 0
 
-        def count(value: Callable[[], int]) -> Callable[[], None]:
-            def callback() -> None:
-                nonlocal registered
-                registered = value()
+        def first_pair() -> None:
+            nonlocal registered
+            registered = 2
 
-            return callback
+        def next_photo() -> None:
+            nonlocal registered
+            registered += 1
 
         (self.folder / "models").mkdir()
-        found = run_stage(
+        made = run_stage(
             "mapping",
             lambda token: pycolmap.incremental_mapping(
                 self.database,
                 self.photos,
                 self.folder / "models",
                 options,
-                initial_image_pair_callback=count(lambda: 2),
-                next_image_callback=count(lambda: registered + 1),
+                initial_image_pair_callback=first_pair,
+                next_image_callback=next_photo,
                 cancellation_token=token,
             ),
             lambda: done(registered),
         )
-        models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+        models = sorted(made.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
         if not models or models[0].num_reg_images() < MIN_MODEL or not models[0].num_points3D():
             best = models[0].num_reg_images() if models else 0
             advice = "; ".join(advise(overlaps, 0))
@@ -346,16 +343,11 @@ def check_target(photos: Path, scene: Path, overwrite: bool) -> None:
 @contextmanager
 def parents(scene: Path) -> Iterator[None]:
     """Create the folders above `scene`; after an error, remove those of them that are empty."""
-    missing = [folder for folder in scene.absolute().parents if not folder.exists()]
-    scene.absolute().parent.mkdir(parents=True, exist_ok=True)
+    created = make_folders(scene.absolute().parent)
     try:
         yield
     except BaseException:
-        for folder in missing:
-            try:
-                folder.rmdir()
-            except OSError:  # not empty
-                break
+        remove_empty(created)
         raise
 
 

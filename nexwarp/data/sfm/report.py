@@ -1,16 +1,12 @@
 """The report of a reconstruction: registered photos, reasons for the others, advice."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
-from statistics import median
+from dataclasses import dataclass
 
 from nexwarp.data.sfm.pairs import components
 
 FEW_FEATURES = 500  # a photo
 GOOD_SHARE = 0.9  # share of registered photos below which the report gives advice
-FEW_MATCHES = 50  # of a pair, below which it says nothing about motion
-MOVING_SHARE = 0.15  # of refuted matches, above the median, from which something seems to move
 LISTED = 8  # entries of a list in the report
 
 
@@ -23,14 +19,12 @@ class Overlaps:
         inliers: number of geometrically verified matches of a pair, by names; only pairs with at least one.
         pairs: number of compared pairs.
         sequential: whether only neighbours were compared.
-        matches: number of matches of each compared pair before their verification.
     """
 
     features: dict[str, int]
     inliers: dict[tuple[str, str], int]
     pairs: int
     sequential: bool
-    matches: dict[tuple[str, str], int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,8 +67,6 @@ class SfmReport:
         matching: "exhaustive" or "sequential".
         seconds: wall-clock time of each stage.
         advice: how to get more photos registered; empty if 90 % or more are registered.
-        moving: for photos in which things seem to move, the share of the matches with their neighbours in the list
-            that contradict one motion of the camera.
     """
 
     photos: int
@@ -91,7 +83,6 @@ class SfmReport:
     matching: str
     seconds: dict[str, float]
     advice: list[str]
-    moving: dict[str, float] = field(default_factory=dict)
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
@@ -111,7 +102,8 @@ class SfmReport:
             rows["more cameras"] = str(len(self.cameras) - LISTED)
         if len(self.models) > 1:
             rows["models"] = f"{', '.join(map(str, self.models))} photos; the largest is kept"
-        rows["time"] = f"{sum(self.seconds.values()):.0f} s ({_times(self.seconds)})"
+        times = ", ".join(f"{stage} {value:.0f}" for stage, value in self.seconds.items())
+        rows["time"] = f"{sum(self.seconds.values()):.0f} s ({times})"
         return rows
 
     def lines(self) -> list[str]:
@@ -120,26 +112,11 @@ class SfmReport:
         lines = [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
         if len(names) > LISTED:
             lines.append(f"left out: {len(names) - LISTED} more, all named in sfm.json")
-        moving = [
-            f"moving: {name}: {share:.0%} of its matches contradict the camera's motion; mask what moves"
-            for name, share in self.moving.items()
-        ]
-        if len(moving) > LISTED:
-            moving[LISTED:] = [f"moving: {len(moving) - LISTED} more, all named in sfm.json"]
-        return lines + moving + [f"advice: {text}" for text in self.advice]
+        return lines + [f"advice: {text}" for text in self.advice]
 
 
 def left_out(overlaps: Overlaps, registered: Sequence[str], models: Sequence[Sequence[str]]) -> dict[str, str]:
-    """Give the reason for each photo that is not registered.
-
-    Args:
-        overlaps: features and matches of all photos.
-        registered: names of the photos in the model that becomes the scene.
-        models: names of the photos in each model.
-
-    Returns:
-        Name -> reason.
-    """
+    """Return name -> reason for each photo that is not registered; `models` are the photos' names by model."""
     kept = set(registered)
     reasons: dict[str, str] = {}
     for name, count in overlaps.features.items():
@@ -161,44 +138,8 @@ def left_out(overlaps: Overlaps, registered: Sequence[str], models: Sequence[Seq
     return reasons
 
 
-def moving_things(overlaps: Overlaps, names: Sequence[str]) -> dict[str, float]:
-    """Find photos in which things seem to move: many matches with the next photos contradict the camera's motion.
-
-    A match that the pair's geometry refutes is a wrong one, or of a thing that moved. Wrong ones are as frequent in all
-    photos of a capture, so that a photo is suspicious if its share is well above the median.
-
-    Args:
-        overlaps: features and matches of all photos.
-        names: the photos in order.
-
-    Returns:
-        Name -> share of refuted matches.
-    """
-    matched, refuted = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
-    for one, other in pairwise(names):
-        pair = (one, other) if (one, other) in overlaps.matches else (other, one)
-        count, good = overlaps.matches.get(pair, 0), overlaps.inliers.get(pair, 0)
-        if count >= FEW_MATCHES and good:  # else the pair does not overlap
-            for name in pair:
-                matched[name] += count
-                refuted[name] += count - good
-    shares = {name: refuted[name] / matched[name] for name in names if matched[name]}
-    if not shares:
-        return {}
-    limit = median(shares.values()) + MOVING_SHARE
-    return {name: round(share, 3) for name, share in shares.items() if share > limit}
-
-
 def advise(overlaps: Overlaps, registered: int) -> list[str]:
-    """Advice on how to get more photos registered, most promising first.
-
-    Args:
-        overlaps: features and matches of all photos.
-        registered: number of registered photos.
-
-    Returns:
-        Sentences; none if 90 % or more of the photos are registered.
-    """
+    """Advise how to get more photos registered, most promising first; nothing if 90 % or more are registered."""
     count = len(overlaps.features)
     if registered >= GOOD_SHARE * count:
         return []
@@ -229,7 +170,3 @@ def advise(overlaps: Overlaps, registered: int) -> list[str]:
             "--cameras image if the zoom changed"
         )
     return advice
-
-
-def _times(seconds: dict[str, float]) -> str:
-    return ", ".join(f"{stage} {value:.0f}" for stage, value in seconds.items())
