@@ -171,16 +171,16 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
     if data.get("camera_type", "perspective") != "perspective":
         raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
-    fps = _number(path, data, "fps", above=0.0) if "fps" in data else None
+    fps = number_of(path, data, "fps", above=0.0) if "fps" in data else None
     entries = _list(path, data, "camera_path")
     cameras = []
     for i, entry in enumerate(entries):
         where = f"{path}: camera_path[{i}]"
-        pose = _pose(where, entry, "camera_to_world")
+        pose = matrix_of(where, entry, "camera_to_world")
         if all(key in entry for key in INTRINSICS):
-            fx, fy, cx, cy = (_number(where, entry, key) for key in INTRINSICS)
+            fx, fy, cx, cy = (number_of(where, entry, key) for key in INTRINSICS)
         else:
-            fov = _number(where, entry, "fov", above=0.0, below=180.0)
+            fov = number_of(where, entry, "fov", above=0.0, below=180.0)
             fx = fy = height / (2 * math.tan(math.radians(fov) / 2))
             cx, cy = width / 2, height / 2
         cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near))
@@ -193,16 +193,16 @@ def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
         raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
     undo = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in data:
-        undo = torch.linalg.inv(_pose(str(path), data, "applied_transform"))
-    scale = _number(path, data, "applied_scale", above=0.0) if "applied_scale" in data else 1.0
+        undo = torch.linalg.inv(matrix_of(str(path), data, "applied_transform"))
+    scale = number_of(path, data, "applied_scale", above=0.0) if "applied_scale" in data else 1.0
     cameras: dict[str, Camera] = {}
     for i, frame in enumerate(_list(path, data, "frames")):
         where = f"{path}: frames[{i}]"
-        pose = _pose(where, frame, "transform_matrix")
+        pose = matrix_of(where, frame, "transform_matrix")
         pose[:3, 3] /= scale
         values = {**data, **frame}
         width, height = (_size(where, values, key) for key in ("w", "h"))
-        intrinsics = _intrinsics_of(where, values, width, height)
+        intrinsics = intrinsics_of(where, values, width, height)
         name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
@@ -219,16 +219,34 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     return dict(zip(INTRINSICS, (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
 
 
-def _intrinsics_of(where: str, values: Mapping[str, Json], width: int, height: int) -> tuple[float, ...]:
-    if "fl_x" in values or "fl_y" in values:  # a single focal length holds for both axes
-        fx = _number(where, values, "fl_x" if "fl_x" in values else "fl_y")
-        fy = _number(where, values, "fl_y" if "fl_y" in values else "fl_x")
-    else:
-        fx = _focal(where, values, "camera_angle_x", width)
-        fy = _focal(where, values, "camera_angle_y", height) if "camera_angle_y" in values else fx
-    cx = _number(where, values, "cx") if "cx" in values else width / 2
-    cy = _number(where, values, "cy") if "cy" in values else height / 2
-    return fx, fy, cx, cy
+def intrinsics_of(where: str, values: Mapping[str, Json], width: int, height: int) -> tuple[float, ...]:
+    """Read the intrinsics of a frame.
+
+    Args:
+        where: place of the frame, for messages.
+        values: keys of the frame, and those of the file that the frame does not have.
+        width: of the image, pixels.
+        height: of the image, pixels.
+
+    Returns:
+        fx, fy, cx, cy in pixels. An axis without a focal length or field of view has the other's focal length; the
+        principal point is the image's centre by default.
+
+    Raises:
+        ValueError: no focal length, or a value that is no number or out of range.
+    """
+    focal = []
+    for axis, side in (("x", width), ("y", height)):
+        if f"fl_{axis}" in values:
+            focal.append(number_of(where, values, f"fl_{axis}"))
+        elif f"camera_angle_{axis}" in values:
+            angle = number_of(where, values, f"camera_angle_{axis}", above=0.0, below=math.pi)
+            focal.append(0.5 * side / math.tan(0.5 * angle))
+    if not focal:
+        raise ValueError(f"{where}: expected a focal length (fl_x or camera_angle_x), found none")
+    cx = number_of(where, values, "cx") if "cx" in values else width / 2
+    cy = number_of(where, values, "cy") if "cy" in values else height / 2
+    return focal[0], focal[-1], cx, cy
 
 
 def _camera(
@@ -240,10 +258,6 @@ def _camera(
         return Camera(torch.linalg.inv(pose @ FLIP).float(), K, *size, near)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-
-
-def _focal(where: str, values: Mapping[str, Json], key: str, size: int) -> float:
-    return size / (2 * math.tan(_number(where, values, key, above=0.0, below=math.pi) / 2))
 
 
 def _read(path: Path) -> JsonObject:
@@ -269,9 +283,10 @@ def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
     return cast(list[JsonObject], entries)
 
 
-def _number(
+def number_of(
     where: str | Path, values: Mapping[str, Json], key: str, above: float = -math.inf, below: float = math.inf
 ) -> float:
+    """Read a finite number; raise ValueError unless it lies between `above` and `below`, both excluded."""
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     value = values[key]
@@ -284,7 +299,7 @@ def _number(
 
 
 def _size(where: str | Path, values: Mapping[str, Json], key: str) -> int:
-    size = _number(where, values, key, above=0.0)
+    size = number_of(where, values, key, above=0.0)
     if size > MAX_SIDE:
         raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
     if size != int(size):
@@ -292,8 +307,13 @@ def _size(where: str | Path, values: Mapping[str, Json], key: str) -> int:
     return int(size)
 
 
-def _pose(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
-    """(4, 4) float64 from three or four rows of four numbers, nested or flat."""
+def matrix_of(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
+    """Read a matrix (4, 4) float64 of three or four rows of four numbers, nested or flat.
+
+    Raises:
+        ValueError: no such key, another value, numbers that are not finite, a last row other than 0, 0, 0, 1, or a
+            singular matrix.
+    """
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     try:
@@ -305,8 +325,8 @@ def _pose(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
     matrix = matrix.reshape(-1, 4)
     if len(matrix) == 3:
         matrix = torch.cat([matrix, matrix.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-    if not bool(torch.isfinite(matrix).all()):
-        raise ValueError(f"{where}: {key}: expected finite numbers, got {matrix.tolist()}")
+    if not bool((matrix.abs() <= LARGEST).all()):
+        raise ValueError(f"{where}: {key}: expected finite numbers of at most {LARGEST:g}, got {matrix.tolist()}")
     if (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() > LAST_ROW:
         raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {matrix[3].tolist()}")
     if torch.linalg.det(matrix[:3, :3]).abs() <= SINGULAR:

@@ -218,15 +218,15 @@ def load_scene(
 
 def _check_types(source: SceneSource) -> None:
     """Raise TypeError naming a field of another type."""
-    path: Any = (str, os.PathLike)
-    kinds: dict[str, tuple[Any, str]] = {
-        "path": (path, "a path"),
-        "images": (str, "the name of a folder"),
-        "masks": (str | None, "the name of a folder"),
-        "points": ((*path, type(None)), "the path of a PLY file"),
-        "format": (str | None, "text"),
-        "follow_links": (bool, "True or False"),
-        "skip_missing": (bool, "True or False"),
+    nothing = type(None)
+    kinds: dict[str, tuple[tuple[type, ...], str]] = {
+        "path": ((str, os.PathLike), "a path"),
+        "images": ((str,), "the name of a folder"),
+        "masks": ((str, nothing), "the name of a folder"),
+        "points": ((str, os.PathLike, nothing), "the path of a PLY file"),
+        "format": ((str, nothing), "text"),
+        "follow_links": ((bool,), "True or False"),
+        "skip_missing": ((bool,), "True or False"),
     }
     for name, (kind, expected) in kinds.items():
         value = getattr(source, name)

@@ -129,7 +129,7 @@ def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path
             raise FileNotFoundError(f"{where}: mask not found: {mask}")
         inside_folder(f"{where}: mask_path", mask, frames.file.parent, frames.follow_links)
     lens = frame_lens(where, {**frames.data, **entry}, file)
-    return Photo(name, file, frame_viewmat(where, entry.get("transform_matrix"), frames.to_original), lens, mask)
+    return Photo(name, file, frame_viewmat(where, entry, frames.to_original), lens, mask)
 
 
 def _file_name(where: str, key: str, value: Json) -> str:

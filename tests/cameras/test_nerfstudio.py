@@ -162,7 +162,7 @@ BAD = [
     (SCENE | {"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of PINHOLE"),
     (SCENE | {"applied_transform": [[0.0] * 4] * 3}, "applied_transform: expected an invertible pose"),
     (SCENE | {"frames": [FRAME, FRAME]}, r"frames\[1\]\.file_path: expected a name of its own, got 'a.png' again"),
-    ({"w": 64, "h": 48, "frames": [FRAME]}, r"frames\[0\]: expected the key camera_angle_x, found none"),
+    ({"w": 64, "h": 48, "frames": [FRAME]}, r"frames\[0\]: expected a focal length \(fl_x or camera_angle_x\)"),
     ({"fl_x": 50.0, "frames": [FRAME]}, r"frames\[0\]: expected the key w, found none"),
     (SCENE | {"fl_x": -50.0}, r"frames\[0\]: K: expected focal lengths > 0"),
 ]
