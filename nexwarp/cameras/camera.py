@@ -127,8 +127,8 @@ class StagedCamera(Camera):
     """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
 
     Attributes:
-        numbers: (30,) viewmat, K, `Camera.focal`, `Camera.pixel_focal` and a background colour of what was copied last:
-            one tensor, so that one copy brings them all. `fx` to `cy` are those of the first camera.
+        numbers: (30,) viewmat, K, `focal`, `pixel_focal` and a background colour of the camera that was copied last:
+            one copy brings them all. `fx` to `cy` are those of the first camera.
         falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
     """
 
@@ -191,8 +191,6 @@ def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
         raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
     if tensor.shape != (size, size):
         raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
-    if tensor.is_meta:
-        raise ValueError(f"{name}: expected a tensor with values, got one on the device meta")
     matrix = tensor.detach().double().cpu()
     if not bool(torch.isfinite(matrix).all()):
         raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
@@ -217,10 +215,8 @@ def _check_rigid(viewmat: torch.Tensor) -> None:
 
 def _check_intrinsics(intrinsics: torch.Tensor) -> None:
     (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
-    if fx <= 0 or fy <= 0:
-        raise ValueError(f"K: expected focal lengths > 0, got fx={fx:g}, fy={fy:g}")
-    if min(fx, fy) < SMALLEST_FOCAL:
-        raise ValueError(f"K: expected focal lengths of at least {SMALLEST_FOCAL:g}, got fx={fx:g}, fy={fy:g}")
+    if not min(fx, fy) >= SMALLEST_FOCAL:
+        raise ValueError(f"K: expected focal lengths > 0, at least {SMALLEST_FOCAL:g}, got fx={fx:g}, fy={fy:g}")
     if skew != 0 or shear != 0:
         raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
     if last != [0.0, 0.0, 1.0]:
@@ -228,7 +224,7 @@ def _check_intrinsics(intrinsics: torch.Tensor) -> None:
 
 
 def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Return (M,) bool: which points project into an image; the arguments are those of `visible_points`."""
+    """Return (M,) bool: which pixel coordinates (M, 2) with z-depths (M,) are in an image; NaN and <= 0 are not."""
     size = torch.tensor([width, height], device=pixels.device)
     return (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
 
@@ -236,17 +232,9 @@ def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int
 def visible_points(
     pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Select the points that project into an image.
+    """Select the points that project into an image, and where there is a mask (H, W), to True.
 
-    Args:
-        pixels: (M, 2) pixel coordinates of the points, x and y; may be infinite or NaN behind the camera.
-        depths: (M,) z-depths of the points; <= 0 is behind the camera.
-        width: image width in pixels.
-        height: image height in pixels.
-        mask: (H, W) bool, True for included pixels; None includes all.
-
-    Returns:
-        Indices (P,) int64 of the points' pixels, row-major, and z-depths (P,); None if there are no such points.
+    Return the row-major indices (P,) of their pixels, and their z-depths (P,); None if there are no such points.
     """
     inside = in_image(pixels, depths, width, height)
     column, row = pixels[inside].long().unbind(-1)

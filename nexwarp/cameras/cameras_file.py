@@ -24,35 +24,17 @@ def save_cameras(
 ) -> None:
     """Write cameras as JSON: set ("train", "test") -> name -> camera.
 
-    Args:
-        path: file to write.
-        cameras: the cameras.
-        before: the same cameras before their poses were refined; those that differ are written, too.
-
-    Raises:
-        OSError: `path` cannot be written.
+    `before` are the same cameras before their poses were refined; those that differ are written, too.
     """
-    data = {
-        group: {
-            name: {
-                "viewmat": camera.viewmat.tolist(),
-                "K": camera.K.tolist(),
-                "width": camera.width,
-                "height": camera.height,
-                "near": camera.near,
-                **_pose_before(camera, None if before is None else before[group][name]),
-            }
-            for name, camera in members.items()
-        }
-        for group, members in cameras.items()
-    }
+    data: dict[str, dict[str, dict[str, object]]] = {}
+    for group, members in cameras.items():
+        data[group] = {}
+        for name, camera in members.items():
+            entry = data[group][name] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
+            entry |= {"width": camera.width, "height": camera.height, "near": camera.near}
+            if before is not None and not torch.equal(before[group][name].viewmat.cpu(), camera.viewmat.cpu()):
+                entry["given_viewmat"] = before[group][name].viewmat.tolist()
     write_json(path, data)
-
-
-def _pose_before(camera: Camera, before: Camera | None) -> dict[str, list[list[float]]]:
-    if before is None or torch.equal(before.viewmat.cpu(), camera.viewmat.cpu()):
-        return {}
-    return {"given_viewmat": before.viewmat.tolist()}
 
 
 def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:

@@ -17,7 +17,7 @@ import torch
 
 from nexwarp.cameras.camera import MAX_CAMERAS, Camera
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, JsonObject, read_object
 
 # From OpenGL's camera axes to OpenCV's; its own inverse.
@@ -34,12 +34,7 @@ LARGEST = 1e15  # limit of numbers: their squares stay finite in single precisio
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras along a path.
-
-    Attributes:
-        cameras: float32 on the CPU, in order.
-        fps: frames a second; None where the file gives none.
-    """
+    """Cameras along a path, float32 on the CPU; frames a second, None where the file gives none."""
 
     cameras: list[Camera]
     fps: float | None
@@ -65,21 +60,15 @@ def save_transforms(
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
-    frames = [
-        {
-            "file_path": name,
-            "transform_matrix": _camera_to_world(camera).tolist(),
-            **_intrinsics(camera),
-            "w": camera.width,
-            "h": camera.height,
-        }
-        for name, camera in cameras.items()
-    ]
+    frames = []
+    for name, camera in cameras.items():
+        pose, size = _camera_to_world(camera).tolist(), {"w": camera.width, "h": camera.height}
+        frames.append({"file_path": name, "transform_matrix": pose, **_intrinsics(camera), **size})
     data: dict[str, object] = {"camera_model": "PINHOLE", "frames": frames}
     if train is not None or test is not None:
         held_out = list(test or [])
         data |= {"train_filenames": list(train or []), "val_filenames": held_out, "test_filenames": held_out}
-    _write(path, data)
+    write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 
 def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[str, Camera]:
@@ -125,7 +114,7 @@ def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fp
         raise ValueError(f"cameras: expected one size, got {' and '.join(f'{w}x{h}' for w, h in sizes[:2])}")
     if not 0 < fps < math.inf:
         raise ValueError(f"fps: expected more than 0 frames a second, got {fps}")
-    ((width, height),) = sizes
+    width, height = sizes[0]
     entries = []
     for camera in cameras:
         fov = math.degrees(2 * math.atan(height / (2 * camera.fy)))
@@ -147,7 +136,7 @@ def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fp
         "keyframes": [],
         "camera_path": entries,
     }
-    _write(path, data)
+    write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 
 def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> CameraPath:
@@ -172,9 +161,8 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
         raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
     fps = number_of(path, data, "fps", above=0.0) if "fps" in data else None
-    entries = _list(path, data, "camera_path")
     cameras = []
-    for i, entry in enumerate(entries):
+    for i, entry in enumerate(_list(path, data, "camera_path")):
         where = f"{path}: camera_path[{i}]"
         pose = matrix_of(where, entry, "camera_to_world")
         if all(key in entry for key in INTRINSICS):
@@ -220,20 +208,10 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def intrinsics_of(where: str, values: Mapping[str, Json], width: int, height: int) -> tuple[float, ...]:
-    """Read the intrinsics of a frame.
+    """Read fx, fy, cx and cy in pixels from the keys of a frame and its file; ValueError where one does not fit.
 
-    Args:
-        where: place of the frame, for messages.
-        values: keys of the frame, and those of the file that the frame does not have.
-        width: of the image, pixels.
-        height: of the image, pixels.
-
-    Returns:
-        fx, fy, cx, cy in pixels. An axis without a focal length or field of view has the other's focal length; the
-        principal point is the image's centre by default.
-
-    Raises:
-        ValueError: no focal length, or a value that is no number or out of range.
+    An axis without a focal length or field of view has the other's focal length; the principal point is the image's
+    centre by default.
     """
     focal = []
     for axis, side in (("x", width), ("y", height)):
@@ -266,17 +244,11 @@ def _read(path: Path) -> JsonObject:
     return read_object(path)
 
 
-def _write(path: str | os.PathLike[str], data: Mapping[str, object]) -> None:
-    with written_aside(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
 def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
     entries = data[key]
-    if not isinstance(entries, list) or not entries:
-        raise FormatError(f"{path}: {key}: expected a list of at least one camera, got {one_line(entries, 60)}")
-    if len(entries) > MAX_CAMERAS:
-        raise FormatError(f"{path}: {key}: expected at most {MAX_CAMERAS:,} cameras, got {len(entries):,}")
+    if not isinstance(entries, list) or not 0 < len(entries) <= MAX_CAMERAS:
+        expected = f"a list of at least one camera, at most {MAX_CAMERAS:,}"
+        raise FormatError(f"{path}: {key}: expected {expected}, got {one_line(entries, 60)}")
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{path}: {key}[{i}]: expected a JSON object, got {one_line(entry, 60)}")
@@ -308,12 +280,7 @@ def _size(where: str | Path, values: Mapping[str, Json], key: str) -> int:
 
 
 def matrix_of(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
-    """Read a matrix (4, 4) float64 of three or four rows of four numbers, nested or flat.
-
-    Raises:
-        ValueError: no such key, another value, numbers that are not finite, a last row other than 0, 0, 0, 1, or a
-            singular matrix.
-    """
+    """Read an invertible matrix (4, 4) float64 of three or four rows of four numbers, nested or flat."""
     if key not in values:
         raise ValueError(f"{where}: expected the key {key}, found none")
     try:

@@ -31,9 +31,8 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
 
     The ellipse lies in the plane of the two principal axes of the camera centres. Along each axis it spans the 5th to
     the 95th percentile of the centres. It starts at the angle of the first camera. All its cameras look at
-    `focus(cameras)` with the mean up direction; intrinsics, size, near, dtype and device are those of the first camera.
-    If the centres lie on a line, the path runs back and forth along it. The path is equivariant under rigid motions and
-    scaling of all cameras.
+    `focus(cameras)` with the mean up direction; all else is that of the first camera. If the centres lie on a line, the
+    path runs back and forth along it.
 
     Raises:
         ValueError: fewer than two distinct centres, parallel optical axes, no common up direction, a path that meets
@@ -58,8 +57,7 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     In the frame of the mean camera, the path winds `turns` times around the mean centre and moves forward and back
     once. Its radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
     `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras; up is the mean up
-    direction. Intrinsics, size, near, dtype and device are those of the first camera. The path is equivariant under
-    rigid motions and scaling of all cameras.
+    direction. All else is that of the first camera.
 
     Raises:
         ValueError: cameras that do not face one way or share one centre; `count` or `turns` < 1.
@@ -92,16 +90,9 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
 def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
     """Return `count` cameras on a smooth path from the first to the last of the given ones.
 
-    The path passes through key cameras: all of them, or, if there are more than `keys`, that many at even spacing in
-    the list, the first and last included. The time between two keys is proportional to their distance and rotation.
-    Centres follow a cubic spline; rotations follow a spline of continuous angular acceleration. Intrinsics, size, near,
-    dtype and device are those of the first camera. The path is equivariant under rigid motions and scaling of all
-    cameras.
-
-    Args:
-        cameras: cameras in the order of the path.
-        count: number of cameras to return; the first is at the first key, the last at the last key.
-        keys: largest number of keys, at least 2; None is one key for every 10 of `count`.
+    The path passes through key cameras: at most `keys` (None is one for every 10 of `count`), at even spacing in the
+    list, the first and last included. The time between two keys is proportional to their distance and rotation. Centres
+    follow a cubic spline, rotations one of continuous angular acceleration. All else is that of the first camera.
 
     Raises:
         ValueError: fewer than two distinct cameras, `count` < 1 or `keys` < 2.
@@ -137,18 +128,7 @@ def between(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camer
 
     The new camera lies between the two or beyond either by at most half their distance. The neighbour is drawn from the
     4 nearest cameras whose optical axes are within 60 degrees of the camera's; without any, the pose stays. Position
-    and rotation are interpolated linearly; intrinsics, size, near, dtype and device are the camera's. The result is
-    equivariant under rigid motions and scaling of all cameras.
-
-    Args:
-        cameras: at least one.
-        generator: CPU generator of all random numbers.
-
-    Returns:
-        One camera for each given one, in their order.
-
-    Raises:
-        ValueError: no cameras.
+    and rotation are interpolated linearly; all else is the camera's.
     """
     from scipy.spatial.transform import Rotation
 
@@ -193,11 +173,7 @@ def surrounding(points: torch.Tensor, near: float, count: int = 12) -> list[Came
 
 
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:
-    """(3,) float64, the world point with the least sum of squared distances to the optical axes.
-
-    Raises:
-        ValueError: no cameras, a single one, or parallel optical axes.
-    """
+    """(3,) float64, the world point closest to all optical axes; ValueError without cameras or with parallel axes."""
     viewmats, centres = camera_poses(cameras)
     axes = viewmats[:, 2, :3]
     # Each matrix projects a vector onto the plane orthogonal to its axis.
@@ -208,11 +184,7 @@ def focus(cameras: Sequence[Camera]) -> torch.Tensor:
 
 
 def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
-    """(4, 4) world-to-camera matrix at `position` looking at `target`, with `up` upwards in the image; (3,) each.
-
-    Raises:
-        ValueError: `target` equals `position`, or `up` is zero or parallel to the line between them.
-    """
+    """(4, 4) world-to-camera matrix at `position` looking at `target`, with `up` upwards in the image; (3,) each."""
     forward = target - position
     right = torch.linalg.cross(forward, up)
     if right.norm() <= DEGENERATE * forward.norm() or forward.norm() == 0:
@@ -232,11 +204,7 @@ def with_pose(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) ->
 
 
 def camera_poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-    """World-to-camera matrices (n, 4, 4) and centres (n, 3), float64 on the CPU.
-
-    Raises:
-        ValueError: no cameras.
-    """
+    """World-to-camera matrices (n, 4, 4) and centres (n, 3), float64 on the CPU; ValueError without cameras."""
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
     viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])

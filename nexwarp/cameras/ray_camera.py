@@ -13,8 +13,7 @@ from nexwarp.errors import check_finite, check_range, check_tensors
 MAX_SIDE = 32768  # pixels
 MAX_PARAMETER = 1e3  # of a fisheye lens
 BISECTIONS = 60
-# Radius, relative to the focal length, by which the inverse of a lens may miss.
-INVERSE_ERROR = 1e-6
+INVERSE_ERROR = 1e-6  # radius, relative to the focal length, by which the inverse of a lens may miss
 
 
 @dataclass(frozen=True)

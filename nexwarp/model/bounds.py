@@ -46,8 +46,7 @@ LARGEST_OUTPUT = 1e12  # of a layer of the texture's MLP
 def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
     """Raise ValueError that names the tensor, the value and its range, if a model with these tensors could not render.
 
-    Args:
-        tensors: by their names in a model file, with the shapes of the format; other names are passed over.
+    The tensors are by their names in a model file, with the shapes of the format; other names are passed over.
     """
     tensors = {name: x.float() if x.dtype == torch.float16 else x for name, x in tensors.items()}
     for name, tensor in tensors.items():
@@ -63,7 +62,9 @@ def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
             )
     if (falloff := tensors.get("exposures.falloff")) is not None:
         _check_falloff(*falloff.tolist())
-    _check_layers(tensors)
+    for name, largest in _largest_outputs(tensors):
+        if largest > LARGEST_OUTPUT:
+            raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
 
 
 def _check_falloff(a: float, b: float, largest: float) -> None:
@@ -77,13 +78,6 @@ def _check_falloff(a: float, b: float, largest: float) -> None:
         raise ValueError(
             f"exposures.falloff: expected a t + b t^2 of at most {LARGEST_LOG_LIGHT:g}, got a {a:g} and b {b:g}"
         )
-
-
-def _check_layers(tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise ValueError if the grid's largest feature could make a layer of the MLP overflow."""
-    for name, largest in _largest_outputs(tensors):
-        if largest > LARGEST_OUTPUT:
-            raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
 
 
 def fits_half(tensors: Mapping[str, torch.Tensor]) -> bool:

@@ -13,46 +13,17 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
 
 FORMAT = 2
-PASSES = (
-    "image",
-    "plain",
-    "textured",
-    "alpha",
-    "ids",
-    "depths",
-    "weights",
-    "colors",
-    "expected_depth",
-    "median_depth",
-    "top_depth",
-    "normals",
-)
+PASSES = ("image", "plain", "textured", "alpha", "ids", "depths", "weights", "colors")
+PASSES += ("expected_depth", "median_depth", "top_depth", "normals")
 SLOTS = ("ids", "depths", "weights", "colors")
 
 
 @dataclass(frozen=True)
 class Buffers:
-    """All buffers of one rendering, float32 unless stated otherwise; not differentiable.
+    """All buffers of one rendering: those of `Rendering`, float32 but for the ids (int32); not differentiable.
 
     Up to rounding, image = plain + textured + (1 - alpha) background, and textured = sum over k of weights * colors.
-
-    Attributes:
-        image: (H, W, 3) the final image, not clamped.
-        plain: (H, W, 3) blended colours of the hits that are not textured, without background.
-        textured: (H, W, 3) sum over the K textured hits of weight * colour.
-        alpha: (H, W) 1 - final transmittance.
-        ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
-        depths: (H, W, K) their z-depths, world units; 0 in empty slots.
-        weights: (H, W, K) their blending weights; 0 in empty slots.
-        colors: (H, W, K, 3) their textured colours; 0 in empty slots.
-        expected_depth: (H, W) mean z-depth of all hits, weighted by their blending weights; 0 where nothing is hit.
-        median_depth: (H, W) z-depth of the hit at which the transmittance falls to 1/2; of the last hit if it stays
-            above 1/2; 0 where nothing is hit.
-        top_depth: (H, W) z-depth of the heaviest hit; 0 where nothing is hit.
-        normals: (H, W, 3) unit, world frame: mean of all hits' normals, each facing the camera, weighted by their
-            blending weights; 0 where nothing is hit.
-        camera: the camera of the rendering.
-        background: (3,) background colour, with the exposure applied; (H, W, 3) if the lens has falloff.
+    `background` is (3,), with the exposure applied, or (H, W, 3) if the lens has falloff.
     """
 
     image: torch.Tensor
@@ -86,10 +57,8 @@ def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges
 def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
     """Write one multi-part OpenEXR file, with one part per buffer, or per slot of a buffer that has K slots.
 
-    Parts: `image`, `plain`, `textured`, `normals`, `colors.0` to `colors.K-1` (channels R, G, B); `alpha`,
-    `expected_depth`, `median_depth`, `top_depth`, `depths.k`, `weights.k` (Y); `ids.k` (Y, UINT, 4294967295 in empty
-    slots). The text attribute `nexwarp` holds camera, background and K as JSON. A background of shape (H, W, 3) is null
-    there, and a part `background` (R, G, B).
+    docs/outputs.md describes it. The text attribute `nexwarp` holds camera, background and K as JSON; a background of
+    shape (H, W, 3) is null there, and a part `background`.
 
     Raises:
         TypeError: a buffer is not float32.

@@ -21,23 +21,20 @@ DTYPES = {
     **dict.fromkeys((*LINEAR_BYTES, *SQUARED), torch.int8),
     **dict.fromkeys(ROUNDED, torch.bfloat16),
 }
+CODE_NAMES = {name + CODE for name in (*CURVED, *LINEAR, *LINEAR_BYTES, *SQUARED)}
 STORED = {torch.int16: "I16", torch.int8: "I8", torch.bfloat16: "BF16"}
 # What logarithms are clamped to. exp(-20) is invisible as an opacity, as its difference from 1 and as a share of the
 # median scale; a gamma of 1 + exp(20) is a hard edge, one of 1 + exp(-20) a Gaussian.
 REACH = 20.0
 
 
-def code_names() -> set[str]:
-    """Return the names of all tensors that decode others."""
-    return {name + CODE for name in (*CURVED, *LINEAR, *LINEAR_BYTES, *SQUARED)}
+def _rows(name: str) -> int:
+    """Return how many numbers decode a column."""
+    return 3 if name in CURVED else 1 if name in SQUARED else 2
 
 
 def encode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the tensors of a compact file.
-
-    Args:
-        tensors: those of a full file, on the CPU.
-    """
+    """Return the tensors of a compact file, from those of a full one on the CPU."""
     coded: dict[str, torch.Tensor] = {}
     for name, tensor in tensors.items():
         if name not in DTYPES:
@@ -60,8 +57,7 @@ def encode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 def _encoded(name: str, values: torch.Tensor, largest: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return whole numbers of at most `largest`, and the numbers (R, columns) that decode each column."""
     if len(values) == 0:
-        rows = 3 if name in CURVED else 1 if name in SQUARED else 2
-        return values, torch.zeros(rows, *_columns(name, values.shape))
+        return values, torch.zeros(_rows(name), *_columns(name, values.shape))
     if name in SQUARED:
         axes = tuple(range(1, values.ndim)) if name == "texture.grid" else (0,)
         scale = (values.abs().amax(axes, keepdim=True) / largest**2).float().double()
@@ -85,21 +81,16 @@ def _encoded(name: str, values: torch.Tensor, largest: int) -> tuple[torch.Tenso
 
 
 def decode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the tensors of a full file, from those of a compact one.
-
-    Raises:
-        ValueError: a tensor that decodes another is missing, or does not fit to it.
-    """
+    """Return the tensors of a full file, from those of a compact one; ValueError where a code does not fit."""
     full = {name: x for name, x in tensors.items() if not name.endswith(CODE)}
     for name, tensor in full.items():
         if name in ROUNDED or name == QUATS:
             full[name] = tensor.float()
         elif name in DTYPES:
-            rows = 3 if name in CURVED else 1 if name in SQUARED else 2
             if name + CODE not in tensors:
                 raise ValueError(f"expected the tensor {name + CODE}, found none")
             code = tensors[name + CODE]
-            check_tensors({name + CODE: (code, (rows, *_columns(name, tensor.shape)))}, dtype=torch.float32)
+            check_tensors({name + CODE: (code, (_rows(name), *_columns(name, tensor.shape)))}, dtype=torch.float32)
             full[name] = _decoded(name, tensor.double(), code.double()).float()
     return full
 

@@ -41,14 +41,7 @@ class DetailLimits(nn.Module):
 def limited_depths(
     ids: torch.Tensor, depths: torch.Tensor, limits: DetailLimits | None, focal: float | torch.Tensor
 ) -> torch.Tensor:
-    """Return depths for the texture's down-weighting: the hits' depths, clamped to the range of the training views.
-
-    Args:
-        ids: (H, W, K) surfels of the hits, -1 in empty slots.
-        depths: (H, W, K) z-depths of the hits.
-        limits: detail limits of the surfels; None clamps nothing.
-        focal: focal length in pixels.
-    """
+    """Return the depths (H, W, K) of hits, clamped to the range of the training views, for the down-weighting."""
     if limits is None or not len(limits):
         return depths
     return ops.limit_depths(ids, depths, limits.nearest, limits.farthest, focal)

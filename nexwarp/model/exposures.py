@@ -21,12 +21,8 @@ MOST_PHOTOS = 1000  # largest number of photos that are kept
 EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without vignetting
 
 LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # candidates of the kernel's length, relative to the spread of the cameras
-
-MOST_FALLOFFS = 16  # largest number of falloff images that are cached
 NOISES = (1e-3, 1e-2, 1e-1)  # candidates of the noise variance, relative to that of the process
-
-TINY = 1e-9  # added to the diagonal of matrices of squared errors, which may be singular
-
+MOST_FALLOFFS = 16  # largest number of falloff images that are cached
 BUFFERS = ("log_gains", "positions", "directions", "coefficients", "mean", "lengths", "falloff")
 
 
@@ -90,30 +86,17 @@ class Exposures(nn.Module):
         a, b, largest = self.falloff.tolist()
         if not largest > 0:
             raise ValueError(f"falloff: expected a largest squared tangent > 0, got {largest:g}")
-        self._lens: tuple[float, float, float] = (a, b, largest)
+        self.lens = (a, b, largest)
         self._falloffs: dict[tuple[object, ...], torch.Tensor] = {}
-
-    @property
-    def lens(self) -> tuple[float, float, float]:
-        """The falloff as numbers."""
-        return self._lens
 
     @classmethod
     def of(
         cls, log_gains: torch.Tensor, cameras: Sequence[Camera], falloff: Sequence[float] | None = None
     ) -> "Exposures":
-        """Fit exposures to V >= 1 photos.
+        """Fit exposures, float32 on the CPU, to the log gains (V, 3) of V >= 1 photos.
 
         The kernel's length and the noise are those that best predict each photo from the others. Of many photos,
-        every n-th is kept, at most 1,000.
-
-        Args:
-            log_gains: (V, 3) log gains of the photos.
-            cameras: the V cameras of the photos.
-            falloff: (3,) falloff of the lens; None is a lens without vignetting.
-
-        Returns:
-            The exposures, float32 on the CPU.
+        every n-th is kept, at most 1,000. A falloff of None is a lens without vignetting.
         """
         viewmats = torch.stack([camera.viewmat.detach().cpu().double() for camera in cameras])
         stride = -(-len(cameras) // MOST_PHOTOS)
@@ -123,7 +106,7 @@ class Exposures(nn.Module):
             size, squares = pose_distances(positions, directions)
             kernels = [(matern_kernel(squares, length * size), length * size) for length in LENGTHS]
             fits = [(*fit_process(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
-            _, _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
+            _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
         return cls(
             gains.float(),
             positions.float(),
@@ -156,15 +139,13 @@ class Exposures(nn.Module):
     @torch.inference_mode(False)  # a later training may use what is cached
     @torch.no_grad()
     def falloff_of(self, camera: Camera | RayCamera) -> torch.Tensor | None:
-        """Return the fraction of light that the lens transmits to each pixel.
+        """Return the fraction of light (H, W, 1) that the lens transmits; cached: callers must not write to it.
 
-        Returns:
-            (H, W, 1), cached: callers must not write to it. None for a lens without vignetting, and for a `RayCamera`,
-            whose lens is not that of the photos.
+        None for a lens without vignetting, and for a `RayCamera`, whose lens is not that of the photos.
         """
         if isinstance(camera, StagedCamera):
             return camera.falloff
-        a, b, largest = self._lens
+        a, b, largest = self.lens
         if a == b == 0 or isinstance(camera, RayCamera):
             return None
         device = self.falloff.device
@@ -197,20 +178,16 @@ def pose_distances(positions: torch.Tensor, directions: torch.Tensor) -> tuple[t
     return size, torch.cdist(poses, poses).square()
 
 
-def fit_process(
-    kernel: torch.Tensor, values: torch.Tensor, noise: float
-) -> tuple[float, torch.Tensor, torch.Tensor, torch.Tensor]:
+def fit_process(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[float, torch.Tensor, torch.Tensor]:
     """Fit a process with a kernel matrix (V, V) to values (V, 3).
 
-    Returns:
-        Sum of the squared errors; errors (V, 3) of predicting each value from the others; coefficients (V, 3); mean
-        (3,).
+    Return the sum of the squared errors of predicting each value from the others, coefficients (V, 3) and mean (3,).
     """
     inverse = torch.linalg.inv(kernel + noise * torch.eye(len(values), dtype=values.dtype))
     mean = inverse.sum(0) @ values / inverse.sum()
     coefficients = inverse @ (values - mean)
     errors = coefficients / inverse.diagonal()[:, None]
-    return round(errors.square().sum().item(), 9), errors, coefficients, mean
+    return round(errors.square().sum().item(), 9), coefficients, mean
 
 
 def poses_of(viewmats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,8 +4,8 @@ Both launch hundreds of small kernels, which keeps the host busy for longer than
 the next (camera, background) or from one step to the next (target, learning rates) is copied into tensors that the
 graph reads. Parameters are read where they are, so that changes in place show at once. Whatever else changes needs
 another graph: the first frame or step after it is launched kernel by kernel, so that all kernels are loaded, and the
-next one is captured. Both do the same arithmetic on the same numbers. What cannot be captured is launched kernel by
-kernel, as is everything for which memory does not suffice.
+next one is captured. What cannot be captured is launched kernel by kernel, as is everything for which memory does not
+suffice.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import nn
@@ -38,8 +38,7 @@ log = logging.getLogger(__name__)
 
 CHANCES = 3  # how often to start again without any graph when memory does not suffice
 
-# Frames. Graphs of one model; each keeps its results in memory, and all share the rest. The least recently used makes
-# room. M models that share graphs have M times as many.
+# Frames. Graphs of one model: each keeps its results in memory, and all share the rest.
 MOST_GRAPHS = 4
 MOST_SEEN = 16  # kinds of frames of one model that are remembered to have been launched once
 MOST_POINTS = 2**23  # of one frame, pixels times max(K, 1): larger ones keep the GPU busy anyway
@@ -49,7 +48,7 @@ MOST_POINTS = 2**23  # of one frame, pixels times max(K, 1): larger ones keep th
 MOST_KINDS = 4
 FORGOTTEN = 1000
 
-_RELEASABLE = frozenset(field.name for field in dataclasses.fields(Rendering)) - {"image"}
+_COPIED = [field.name for field in dataclasses.fields(Rendering) if field.name != "image"]
 
 T = TypeVar("T")
 
@@ -84,7 +83,7 @@ def capturing(device: torch.device) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What a frame renders: the arguments of `draw`. A background of None is that of the options."""
+    """What a frame renders: the arguments of `draw`."""
 
     surfels: Surfels
     texture: NeuralTexture | None
@@ -92,14 +91,9 @@ class Frame:
     limits: DetailLimits | None
     camera: Camera | RayCamera
     options: RenderOptions
-    background: Color | None
+    background: Color
 
     @property
-    def color(self) -> Color:
-        """The background."""
-        return self.options.background if self.background is None else self.background
-
-    @functools.cached_property
     def draw(self) -> Callable[..., Rendering]:
         """`draw` for any camera and background."""
         parts = functools.partial(draw, self.surfels, self.texture, exposures=self.exposures, limits=self.limits)
@@ -172,73 +166,67 @@ def launched(frame: Frame) -> Rendering:
 class FrameGraphs:
     """The captured frames of a model, or of several that share memory, on one GPU. Threads take turns.
 
-    A graph keeps all buffers of its rendering, or only the image. All graphs use the same memory for temporary buffers,
-    so that a replay may overwrite the buffers of an earlier rendering. The buffers of a rendering that is still
-    referenced are therefore copied before the next replay.
+    A graph keeps all buffers of its rendering (whole), or only the image. All graphs use the same memory for temporary
+    buffers, so that a replay may overwrite the buffers of an earlier rendering. The buffers of a rendering that is
+    still referenced are therefore copied before the next replay.
     """
 
     def __init__(self, device: torch.device, models: int = 1) -> None:
-        self.most, self.most_seen = MOST_GRAPHS * models, MOST_SEEN * models
+        self.models = models
         self.lock = threading.RLock()
         self.stream = torch.cuda.Stream(device)
         self.pool: tuple[int, int] | None = None
-        self.frames: OrderedDict[Hashable, CapturedFrame] = OrderedDict()
-        self.seen: OrderedDict[Hashable, Hashable] = OrderedDict()
+        self.frames: OrderedDict[Hashable, CapturedFrame] = OrderedDict()  # the least recently used first
+        self.seen: dict[Hashable, Hashable] = {}  # states of the kinds that have been launched
         self.chances = CHANCES
         # When the memory that all graphs share was last used, and on which stream.
         self.used = torch.cuda.Event()
         self.user: torch.cuda.Stream | None = None
-        # The last rendering, whose buffers may still be in that memory. Any graph overwrites them: the results of one
-        # may lie where another one has its temporary buffers.
+        # The last rendering, whose buffers any graph may overwrite.
         self.latest: weakref.ref[CapturedRendering] | None = None
 
     def render(self, frame: Frame) -> Rendering | None:
         """Render by a graph; None if the frame is to be launched kernel by kernel."""
         with self.lock:
-            rendering = self._run(frame, whole=True, take=CapturedRendering.of)
-            if rendering is not None:
-                self.latest = weakref.ref(rendering)
+            captured = self._find(frame, whole=True)
+            if captured is None:
+                return None
+            stream = torch.cuda.current_stream(self.stream.device)
+            rendering = CapturedRendering.of(captured, self._replay(captured, frame), stream)
+            self.latest = weakref.ref(rendering)
             return rendering
 
     def render_image(self, frame: Frame) -> torch.Tensor | None:
-        """Render by a graph that keeps the image alone; None if the frame is to be launched kernel by kernel."""
+        """Render the image alone by a graph; None if the frame is to be launched kernel by kernel."""
         with self.lock:
-            return self._run(frame, whole=False, take=_image_of)
+            captured = self._find(frame, whole=False)
+            return None if captured is None else self._replay(captured, frame)
 
-    def _run(self, frame: Frame, whole: bool, take: "Callable[[CapturedFrame, torch.cuda.Stream], T]") -> T | None:
-        """Replay the frame's graph, captured first where needed; None if the frame is to be launched."""
+    def _find(self, frame: Frame, whole: bool) -> "CapturedFrame | None":
+        """Return the frame's graph, captured first where needed; None if the frame is to be launched."""
         state, common = frame.state, frame.kind()
-        if not whole and (known := self.frames.get((True, *common))) is not None and known.state == state:
-            whole = True  # a graph that keeps all buffers is there: it has the image, too
-        kind = (whole, *common)
-        captured = self.frames.get(kind)
-        if captured is None or captured.state != state or not self.chances:
-            self.frames.pop(kind, None)
-            if self.seen.get(kind) != state or not self.chances:
-                self.seen[kind] = state
-                self.seen.move_to_end(kind)
-                while len(self.seen) > self.most_seen:
-                    self.seen.popitem(last=False)
-                return None
-            while len(self.frames) >= self.most:
-                self.frames.popitem(last=False)
-            captured = self._capture(frame, whole)
-            if captured is None:
-                return None
-            self.frames[kind] = captured
-        self.frames.move_to_end(kind)
-        taken, held = captured.replay(frame, take)
-        if not held:
-            # What was taken is right, but slow, as the next frame by this graph would be.
-            del self.frames[kind]
-        return taken
+        for kind in ((True, *common), (whole, *common)):  # one that keeps all buffers has the image, too
+            captured = self.frames.get(kind)
+            if captured is not None and captured.state == state and self.chances:
+                self.frames.move_to_end(kind)
+                return captured
+        self.frames.pop(kind, None)
+        if self.seen.get(kind) != state or not self.chances:
+            if len(self.seen) >= MOST_SEEN * self.models:
+                self.seen.clear()
+            self.seen[kind] = state
+            return None
+        while len(self.frames) >= MOST_GRAPHS * self.models:
+            self.frames.popitem(last=False)
+        return self._capture(frame, kind)
 
-    def _capture(self, frame: Frame, whole: bool) -> "CapturedFrame | None":
-        """Return the captured frame; None if that is not possible."""
+    def _capture(self, frame: Frame, kind: tuple[Hashable, ...]) -> "CapturedFrame | None":
+        """Capture a frame; return None if that is not possible."""
         if not self.frames:
             self.pool = None  # it has gone with its last graph
         try:
-            return CapturedFrame(self, frame, whole)
+            captured = self.frames[kind] = CapturedFrame(self, frame, kind)
+            return captured
         except Exception as error:
             memory = getattr(error, "memory", False)
             log.debug("frames are launched kernel by kernel: %s", error)
@@ -246,6 +234,17 @@ class FrameGraphs:
         self.clear()
         self.chances = self.chances - 1 if memory else 0
         return None
+
+    def _replay(self, captured: "CapturedFrame", frame: Frame) -> torch.Tensor:
+        """Return a copy of the image; what the rendering before still holds is copied for it first."""
+        if self.latest is not None and (latest := self.latest()) is not None:
+            latest.take_buffers()
+        self.latest = None
+        image = captured.replay(frame)
+        if not ops.held(captured.room):
+            # What was rendered is right, but slow, as the next frame by this graph would be.
+            del self.frames[captured.kind]
+        return image
 
     def clear(self) -> bool:
         """Drop all graphs and free their memory; return whether there were any."""
@@ -258,7 +257,7 @@ class FrameGraphs:
             return had
 
     @contextmanager
-    def using(self, stream: torch.cuda.Stream | None = None) -> Iterator[torch.cuda.Stream]:
+    def using(self, stream: torch.cuda.Stream | None = None) -> Iterator[None]:
         """Use the graphs' memory on a stream, by default the current one, after all earlier uses."""
         switched = nullcontext() if stream is None else torch.cuda.stream(stream)
         stream = torch.cuda.current_stream(self.stream.device) if stream is None else stream
@@ -269,7 +268,7 @@ class FrameGraphs:
                 for x in frame.staged:
                     x.record_stream(stream)
         with switched:
-            yield stream
+            yield
         self.user = stream
         self.used.record(stream)
 
@@ -279,9 +278,9 @@ class CapturedFrame:
 
     @torch.inference_mode(False)  # later frames write to its tensors in any mode
     @torch.no_grad()
-    def __init__(self, graphs: FrameGraphs, frame: Frame, whole: bool) -> None:
+    def __init__(self, graphs: FrameGraphs, frame: Frame, kind: tuple[Hashable, ...]) -> None:
         assert isinstance(frame.camera, Camera)
-        self.graphs, self.state = graphs, frame.state
+        self.graphs, self.state, self.kind = graphs, frame.state, kind
         device = graphs.stream.device
         exposures = frame.exposures if frame.options.exposure == "photos" else None
         falloff = None if exposures is None else exposures.falloff_of(frame.camera)
@@ -295,44 +294,26 @@ class CapturedFrame:
             result = frame.draw(self.camera, background=self.camera.color)
         self.image, self.room = result.image, result.intermediates.tiles.room
         # Memory of what is not kept here serves other graphs.
-        self.result = result if whole else None
+        self.result = result if kind[0] else None
 
-    def replay(self, frame: Frame, take: "Callable[[CapturedFrame, torch.cuda.Stream], T]") -> tuple[T, bool]:
-        """Render another camera; what the rendering before still holds is copied for it first.
-
-        Args:
-            frame: of the same kind and state.
-            take: copies the wanted result, on the stream of the replay.
-
-        Returns:
-            What was taken, and whether the lists of surfels have held all entries, as far as is known.
-        """
-        if self.graphs.latest is not None and (latest := self.graphs.latest()) is not None:
-            latest.take_buffers()
-        self.graphs.latest = None
-        with self.graphs.using() as stream:
-            assert isinstance(frame.camera, Camera)
-            self._stage(frame.camera, frame.color, frame.exposures)
+    def replay(self, frame: Frame) -> torch.Tensor:
+        """Render another camera, and return a copy of its image."""
+        camera, background = frame.camera, frame.background
+        assert isinstance(camera, Camera)
+        with self.graphs.using():
+            if isinstance(background, torch.Tensor):
+                self.camera.copy_(camera)
+                self.camera.color.copy_(background.detach().expand(3))
+            else:
+                self.camera.copy_(camera, color_numbers(background))
+            lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+            if self.camera.falloff is not None and self.lens != lens:
+                falloff = None if frame.exposures is None else frame.exposures.falloff_of(camera)
+                assert falloff is not None
+                self.camera.falloff.copy_(falloff)
+                self.lens = lens
             self.graph.replay()
-            return take(self, stream), ops.held(self.room)
-
-    def _stage(self, camera: Camera, background: Color, exposures: Exposures | None) -> None:
-        """Copy what differs from one frame to the next into the tensors that the graph reads."""
-        if isinstance(background, torch.Tensor):
-            self.camera.copy_(camera)
-            self.camera.color.copy_(background.detach().expand(3))
-        else:
-            self.camera.copy_(camera, color_numbers(background))
-        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        if self.camera.falloff is not None and self.lens != lens:
-            falloff = None if exposures is None else exposures.falloff_of(camera)
-            assert falloff is not None
-            self.camera.falloff.copy_(falloff)
-            self.lens = lens
-
-
-def _image_of(frame: CapturedFrame, _: torch.cuda.Stream) -> torch.Tensor:
-    return frame.image.clone()
+            return self.image.clone()
 
 
 class CapturedRendering(Rendering):
@@ -344,14 +325,14 @@ class CapturedRendering(Rendering):
     frame: CapturedFrame | None
 
     @classmethod
-    def of(cls, frame: CapturedFrame, stream: torch.cuda.Stream) -> "CapturedRendering":
+    def of(cls, frame: CapturedFrame, image: torch.Tensor, stream: torch.cuda.Stream) -> "CapturedRendering":
         """Return the rendering that the graph was last replayed for, on a stream."""
         rendering = cls.__new__(cls)
-        rendering.__dict__.update(image=_image_of(frame, stream), frame=frame, stream=stream)
+        rendering.__dict__.update(image=image, frame=frame, stream=stream)
         return rendering
 
     def __getattr__(self, name: str) -> object:
-        if name not in _RELEASABLE:
+        if name not in _COPIED:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         self.take_buffers()
         return self.__dict__[name]
@@ -367,7 +348,7 @@ class CapturedRendering(Rendering):
             # On the stream of its image, whichever thread it is that needs the graph's memory.
             with frame.graphs.using(self.__dict__["stream"]), torch.inference_mode(False), torch.no_grad():
                 copies: dict[int, torch.Tensor] = {}
-                for name in _RELEASABLE:
+                for name in _COPIED:
                     self.__dict__[name] = _copied(getattr(frame.result, name), copies)
             self.__dict__["frame"] = None
 
@@ -405,12 +386,9 @@ def without_graphs() -> Iterator[None]:
 
 
 def share_graphs(surfels: Sequence[Surfels]) -> None:
-    """Let the graphs of several models share memory from now on, and drop the graphs that the models have.
+    """Let the graphs of several models on one GPU share memory from now on; those that they have are dropped.
 
     The graphs are freed with the last of the models. If a frame of one model cannot be captured, all are dropped.
-
-    Args:
-        surfels: those of the models, at least one, all on one GPU.
     """
     with _graphs_lock:
         before = {id(graphs): graphs for each in surfels if (graphs := _graphs.get(each)) is not None}
@@ -465,43 +443,26 @@ def _can_capture(device: torch.device, frame: Frame) -> bool:
 
 
 class GraphKey(NamedTuple):
-    """Key that decides whether a captured step can be reused, beside its target's kind.
+    """Key that decides whether a captured step can be reused, beside its target's kind."""
 
-    Attributes:
-        kernels: what decides which kernels a step launches.
-        tensors: what they read and write.
-    """
-
-    kernels: Hashable
-    tensors: Hashable
+    kernels: Hashable  # what decides which kernels a step launches
+    tensors: Hashable  # what they read and write
 
 
 class Gradients(NamedTuple):
-    """What the ranks of a training sum after a graph, where the graph cannot.
+    """What the ranks of a training sum after a graph, where the graph cannot."""
 
-    Attributes:
-        of_parameters: their gradients, in the order of the optimizer's groups.
-        errors: (N,) sums of the surfels' errors; None outside of density control.
-    """
-
-    of_parameters: list[torch.Tensor | None]
-    errors: torch.Tensor | None
+    of_parameters: list[torch.Tensor | None]  # in the order of the optimizer's groups
+    errors: torch.Tensor | None  # (N,) sums of the surfels' errors; None outside of density control
 
 
 class StepResult(NamedTuple):
-    """What a step leaves behind, without a gradient.
+    """What a step leaves behind, without a gradient."""
 
-    Attributes:
-        losses: terms of the loss, scalars.
-        image: (H, W, 3) the rendering.
-        room: capacity of its lists of surfels and tiles.
-        gradients: what is left to sum over the ranks; None where the step has updated the parameters.
-    """
-
-    losses: dict[str, torch.Tensor]
-    image: torch.Tensor
+    losses: dict[str, torch.Tensor]  # terms of the loss, scalars
+    image: torch.Tensor  # (H, W, 3)
     room: ops.ListCapacity
-    gradients: Gradients | None = None
+    gradients: Gradients | None = None  # left to sum over the ranks; None where the step has updated the parameters
 
 
 class UpdateError(OutOfMemoryError):
@@ -519,45 +480,25 @@ def updating() -> Iterator[None]:
         raise UpdateError(f"out of memory while the parameters were updated: needed {needed}", needed) from None
 
 
-class StepTarget(Protocol):
-    """What a step compares with: a dataclass of a camera, tensors, and values on which the launches depend."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-    @property
-    def camera(self) -> Camera:
-        """The camera that the step renders."""
-
-
-S = TypeVar("S", bound=StepTarget)
-
-
-class StepGraphs(Generic[S]):
+class StepGraphs:
     """Runs the GPU's part of training steps, as graphs where that pays.
 
-    Where only tensors have been replaced, as by a round of density control, the first step after it is captured. Where
-    memory does not suffice for graphs, or a step cannot be captured, all later steps are launched kernel by kernel.
+    A step's target, what it compares with, is a dataclass of a `camera`, tensors, and values on which the launches
+    depend. Where only tensors have been replaced, as by a round of density control, the first step after it is
+    captured. Where memory does not suffice for graphs, or a step cannot be captured, all later steps are launched
+    kernel by kernel.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
         self.pool: tuple[int, int] | None = None
         self.keeper: torch.cuda.CUDAGraph | None = None
-        self.stages: dict[Hashable, _Stage[S]] = {}
+        self.stages: dict[Hashable, _Stage] = {}
         self.steps = 0
         self.chances = CHANCES
 
-    def run(self, target: S, work: Callable[[S], StepResult], state: GraphKey) -> StepResult:
-        """Do a step.
-
-        Args:
-            target: of the step.
-            work: does the step for a target; its launches may depend on nothing but the target's kind and `state`.
-            state: whatever else the launches depend on; see `graph_key`.
-
-        Returns:
-            What `work` returns.
-        """
+    def run(self, target: Any, work: Callable[[Any], StepResult], state: GraphKey) -> StepResult:
+        """Do a step: `work(target)`, whose launches depend on nothing but the target's kind and `state`."""
         if self.chances > 0:
             try:
                 return self._run(target, work, state)
@@ -567,24 +508,13 @@ class StepGraphs(Generic[S]):
                     message = f"training steps are launched kernel by kernel, not as CUDA graphs: {error}"
                     warnings.warn(message, stacklevel=2)
             except (MemoryError, RuntimeError) as error:
-                if not self._can_repeat(error):
+                if not self.can_repeat(error):
                     raise
                 self.chances -= 1
             self.clear()
         return work(target)
 
-    def beside(self, work: Callable[[], T]) -> T:
-        """Do work that is not part of a step; where it lacks memory, drop all graphs and do it again."""
-        try:
-            return work()
-        except (MemoryError, RuntimeError) as error:
-            if not self._can_repeat(error):
-                raise
-            self.chances -= 1
-        self.clear()
-        return work()
-
-    def _can_repeat(self, error: Exception) -> bool:
+    def can_repeat(self, error: Exception) -> bool:
         """Whether failed work can be repeated: it lacked memory, of which graphs keep some, and it updated nothing."""
         held = self.keeper is not None or any(graphs.frames for graphs in list(_graphs.values()))
         return held and needed_memory(error) is not None and not isinstance(error, UpdateError)
@@ -596,7 +526,7 @@ class StepGraphs(Generic[S]):
         release_graphs()
         torch.cuda.empty_cache()
 
-    def _run(self, target: S, work: Callable[[S], StepResult], state: GraphKey) -> StepResult:
+    def _run(self, target: Any, work: Callable[[Any], StepResult], state: GraphKey) -> StepResult:
         self.steps += 1
         kind = _kind(target)
         stage = self.stages.get(kind)
@@ -613,7 +543,7 @@ class StepGraphs(Generic[S]):
         if stage.state != state:
             # Kernels that have been launched are loaded, which a capture must not do.
             known = stage.graph is not None and stage.state is not None and stage.state.kernels == state.kernels
-            stage.forget()
+            stage.graph = stage.result = stage.losses = None
             stage.state = state
             if not known:
                 return work(stage.target)
@@ -634,15 +564,22 @@ class StepGraphs(Generic[S]):
         self.keeper = keeper
 
 
-def beside(graphs: StepGraphs[S] | None, work: Callable[[], T]) -> T:
-    """Do work that is not part of a step; see `StepGraphs.beside`. Without graphs there is nothing to drop for it."""
-    return work() if graphs is None else graphs.beside(work)
+def beside(graphs: StepGraphs | None, work: Callable[[], T]) -> T:
+    """Do work that is not part of a step; where it lacks memory, drop all graphs and do it again."""
+    try:
+        return work()
+    except (MemoryError, RuntimeError) as error:
+        if graphs is None or not graphs.can_repeat(error):
+            raise
+        graphs.chances -= 1
+    graphs.clear()
+    return work()
 
 
-class _Stage(Generic[S]):
+class _Stage:
     """Tensors that targets of one kind are copied into, and the graph that reads them."""
 
-    def __init__(self, target: S) -> None:
+    def __init__(self, target: Any) -> None:
         tensors = {field.name: getattr(target, field.name) for field in dataclasses.fields(target)}
         self.tensors = {name: x.clone() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
         self.camera = StagedCamera.like(target.camera, target.camera.device)
@@ -654,13 +591,15 @@ class _Stage(Generic[S]):
         self.result: StepResult | None = None
         self.losses: torch.Tensor | None = None
 
-    def take(self, target: S) -> None:
+    def take(self, target: Any) -> None:
         """Overwrite the tensors with those of another target of the kind."""
         for name, place in self.tensors.items():
             place.copy_(getattr(target, name))
         self.camera.copy_(target.camera)
 
-    def capture(self, work: Callable[[S], StepResult], stream: torch.cuda.Stream, pool: tuple[int, int] | None) -> None:
+    def capture(
+        self, work: Callable[[Any], StepResult], stream: torch.cuda.Stream, pool: tuple[int, int] | None
+    ) -> None:
         """Capture the work."""
         graph = torch.cuda.CUDAGraph()
         with _captured(graph, stream, pool):
@@ -680,12 +619,8 @@ class _Stage(Generic[S]):
             losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
             return result._replace(losses=losses, image=result.image.clone())
 
-    def forget(self) -> None:
-        """Drop the graph."""
-        self.graph = self.result = self.losses = None
 
-
-def _kind(target: StepTarget) -> Hashable:
+def _kind(target: Any) -> Hashable:
     """Key of a target's kind: everything but its tensors' values."""
     camera = target.camera
     parts: list[Hashable] = [camera.width, camera.height, camera.near, camera.viewmat.dtype]
@@ -710,11 +645,8 @@ def graph_key(
 ) -> GraphKey:
     """Return the key of a step.
 
-    Args:
-        options: how the step renders.
-        optimizer: whose learning rates are tensors; a step reads and writes its moments.
-        tensors: what else a step reads and writes: the parameters and the densifier's sums.
-        densify: whether the step adds to these sums.
+    A step reads and writes the optimizer's moments and `tensors`, the parameters and the densifier's sums; `densify`
+    says whether it adds to these sums.
     """
     moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
     return GraphKey(

@@ -164,7 +164,8 @@ class Model(nn.Module):
     def _frame(self, camera: Camera | RayCamera, background: Color | None, changes: RenderChanges) -> graphs.Frame:
         options = self.options.changed(**changes)
         texture = self.texture if options.max_hits else None
-        return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, background)
+        color = options.background if background is None else background
+        return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, color)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.

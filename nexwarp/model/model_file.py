@@ -14,8 +14,8 @@ from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
+from nexwarp.model.compact import CODE_NAMES, STORED, decode, encode
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
-from nexwarp.model.compact import STORED, code_names, decode, encode
 from nexwarp.model.detail import ORDERED, check_detail
 from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.exposures import BUFFERS, Exposures
@@ -40,24 +40,13 @@ FIXED_NAMES = {
     *DETAIL_LIMITS.values(),
     *(f"exposures.{name}" for name in BUFFERS),
 }
-CODE_NAMES = code_names()
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits", "order")
 LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 
 def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = False) -> Path:
-    """Write a model: surfels, exposures and detail limits in float32, grid and MLP in half precision.
-
-    Args:
-        path: a file name that ends in `.safetensors`; otherwise a folder, created if it does not exist, in which
-            `model.safetensors` is written.
-        model: the model.
-        compact: write 8 and 16 bits a number instead, about a third of the size (`nexwarp.model.compact`).
-
-    Returns:
-        The file that was written.
-    """
+    """Write a model, see `Model.save`: surfels, exposures and limits in float32, grid and MLP in half precision."""
     from safetensors.torch import save
 
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}

@@ -18,14 +18,9 @@ LEAST_SINGULAR = 1e-6
 
 
 def rigid_motion(twist: torch.Tensor) -> torch.Tensor:
-    """Return exp(twist), the rigid motion of a twist; differentiable everywhere, at 0 too.
+    """Return exp(twist) (..., 4, 4), the rigid motion of a twist (..., 6); differentiable everywhere, at 0 too.
 
-    Args:
-        twist: (..., 6) rotation vector in radians, of at most pi in length, and velocity in world units. The motion
-            turns about the rotation vector while it moves with the velocity, for a unit of time.
-
-    Returns:
-        (..., 4, 4) matrices of determinant 1.
+    A twist is a rotation vector in radians, of at most pi in length, and a velocity in world units.
     """
     w, v = twist[..., :3], twist[..., 3:]
     square = (w * w).sum(-1)[..., None, None]
@@ -54,15 +49,10 @@ def _last_row(like: torch.Tensor) -> torch.Tensor:
 
 
 def corrected(viewmat: torch.Tensor, twist: torch.Tensor, pivot: torch.Tensor) -> torch.Tensor:
-    """Return a viewmat (4, 4) after a small motion (6,) about a point on its optical axis; differentiable.
+    """Return a viewmat (4, 4) after a small motion (6,) about the point at z-depth `pivot` on its optical axis.
 
-    About a point of the scene, a turn and a shift change an image in different ways. About the camera's own centre both
-    move the image sideways, which gradient descent cannot tell apart.
-
-    Args:
-        viewmat: (4, 4) world to camera.
-        twist: (6,) radians, and a shift in world units.
-        pivot: () z-depth of the point, world units.
+    Differentiable. About a point of the scene, a turn and a shift change an image in different ways. About the camera's
+    own centre both move the image sideways, which gradient descent cannot tell apart.
     """
     motion = rigid_motion(twist)
     ahead = torch.cat([torch.zeros_like(twist[:2]), pivot[None]])
@@ -90,13 +80,7 @@ class PoseCorrections(nn.Module):
     pivots: torch.Tensor
 
     def __init__(self, cameras: Sequence[Camera], scale: float, depths: Sequence[float] | None = None) -> None:
-        """Start with no correction.
-
-        Args:
-            cameras: the V given cameras.
-            scale: of the scene, world units > 0.
-            depths: V typical z-depths of what the cameras see, world units > 0; None is `scale`.
-        """
+        """Start with no correction; `depths` are V typical z-depths of what the cameras see, None is `scale`."""
         super().__init__()
         check_range("scale", scale, 1e-30, 1e30)
         self.scale = scale
@@ -107,12 +91,7 @@ class PoseCorrections(nn.Module):
         self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
-        """Return the corrected viewmat (4, 4) of a view; differentiable.
-
-        Args:
-            given: (4, 4) the given viewmat.
-            view: index of the camera, a number or a (1,) int64 tensor.
-        """
+        """Return the corrected viewmat (4, 4) of a view, a number or a (1,) int64 tensor; differentiable."""
         twist = _row(self.corrections, view)
         return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), _row(self.pivots, view))
 

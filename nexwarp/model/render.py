@@ -24,32 +24,18 @@ FAR_AWAY = 1e4  # parallel rays see plain colours from this many times the scene
 
 @dataclass(frozen=True)
 class RayIntermediates:
-    """Results of the stages for any camera, from which `Rendering` computes further buffers on request.
-
-    Attributes:
-        projection: projected surfels.
-        hits: result of the collection pass.
-        texels: (H, W, K, 3) textured colours of the hits; None without a texture.
-        residual: whether the texture's colours are added to the plain colours.
-        factors: (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure.
-    """
+    """Results of the stages for any camera, from which `Rendering` computes further buffers on request."""
 
     projection: ops.Projection
     hits: ops.Hits | RayHits
-    texels: torch.Tensor | None
-    residual: bool
-    factors: torch.Tensor | None
+    texels: torch.Tensor | None  # (H, W, K, 3) textured colours of the hits
+    residual: bool  # whether these are added to the plain colours
+    factors: torch.Tensor | None  # (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure
 
 
 @dataclass(frozen=True)
 class Intermediates(RayIntermediates):
-    """Results of the stages for a pinhole camera.
-
-    Attributes:
-        tiles: depth-sorted lists of the surfels in each tile.
-        pinhole: intrinsics of the image.
-        viewmat: (4, 4) world to camera.
-    """
+    """Results of the stages for a pinhole camera."""
 
     hits: ops.Hits
     tiles: ops.Tiles
@@ -136,11 +122,7 @@ class Rendering:
     def request_splat_error(self, errors: torch.Tensor) -> ops.SplatErrorRequest:
         """Request `splat_error(errors)` from the backward pass, which computes it at almost no cost.
 
-        Args:
-            errors: (H, W) error of each pixel, >= 0.
-
-        Returns:
-            A request; the backward pass writes its `sums_after_backward` (N,).
+        The backward pass writes the request's `sums_after_backward` (N,) for errors (H, W) >= 0.
         """
         request = self.intermediates.hits.error_request
         check_tensors({"errors": (errors, self.alpha.shape)}, dtype=self.alpha.dtype, device=self.alpha.device)
@@ -225,23 +207,9 @@ def draw(
 ) -> Rendering:
     """Draw surfels from a camera: the one path from the parts of a model to pixels.
 
-    Differentiable as `render`; a `RayCamera` is not.
-
-    Args:
-        surfels: the N surfels.
-        texture: the neural texture; None leaves all hits their plain colours.
-        camera: on the surfels' device.
-        options: of the rendering. Their order does not change that of panoramas and fisheye lenses, which is by
-            distance, or of parallel rays, which is by z-depth.
-        background: colour behind the surfels, as `render` takes it; None is that of the options.
-        exposures: multiply the image by the camera's gains and lens falloff, if the options say "photos". A `RayCamera`
-            has the gains only.
-        limits: detail limits of the N surfels, if the options take them.
-        jitter: (H, W, K) factors on the depths at which the texture is evaluated, see `jitter_factors`; for training.
-
-    Raises:
-        TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
-        OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
+    As `render`, for a `RayCamera` too, which is not differentiable. Panoramas and fisheye lenses blend by distance and
+    parallel rays by z-depth, whatever the options' order. A background of None is that of the options. `jitter`:
+    (H, W, K) factors on the depths at which the texture is evaluated, see `jitter_factors`; for training.
     """
     _check_device(surfels)
     exposures = exposures if options.exposure == "photos" else None
@@ -329,15 +297,7 @@ def _check(
 
 
 def antialiased(shape: Activated, camera: Camera | RayCamera, limits: DetailLimits | None) -> Activated:
-    """Return the geometry of N surfels, with those blurred that are farther away than in any training view.
-
-    Differentiable with respect to the geometry and `camera.viewmat`.
-
-    Args:
-        shape: the activated surfels.
-        camera: the camera.
-        limits: detail limits of the N surfels; None blurs nothing.
-    """
+    """Blur surfels that are farther away than in any training view; differentiable in the geometry and the viewmat."""
     if limits is None:
         return shape
     depths, focal = _depths(shape.means, camera), camera.pixel_focal
@@ -428,17 +388,9 @@ def jitter_factors(
     dtype: torch.dtype = torch.float32,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draw random factors on depths, which shift the texture's points along their rays.
+    """Draw factors (H, W, K) on depths, which shift the texture's points along their rays: N(1, jitter / focal).
 
-    Args:
-        camera: the camera of the rendering.
-        max_hits: K.
-        jitter: standard deviation in pixels at the hit's depth.
-        dtype: dtype of the surfels.
-        generator: random generator, on the camera's device; None is torch's default.
-
-    Returns:
-        (H, W, K), normally distributed with mean 1 and standard deviation jitter / focal.
+    `jitter` is a standard deviation in pixels at the hit's depth; the generator is on the camera's device.
     """
     shape = (camera.height, camera.width, max_hits)
     noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)

@@ -17,15 +17,7 @@ PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas
 
 
 class Activated(NamedTuple):
-    """Activated geometry of N surfels, as the kernels take it; differentiable.
-
-    Attributes:
-        means: (N, 3) centres, world units.
-        quats: (N, 4) unit rotations surfel to world, wxyz.
-        scales: (N, 2) along the surfel's x and y axes, world units.
-        opacities: (N,) in (0, 1).
-        gammas: (N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1.
-    """
+    """Activated geometry of N surfels, as the kernels take it: the properties of `Surfels`; differentiable."""
 
     means: torch.Tensor
     quats: torch.Tensor

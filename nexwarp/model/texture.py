@@ -186,8 +186,6 @@ class NeuralTexture(nn.Module):
         Returns:
             (..., (sh_degree + 1)^2, 3) coefficients, differentiable in positions, depths and the parameters.
         """
-        if not isinstance(depths, torch.Tensor):
-            raise TypeError(f"depths: expected a torch.Tensor, got {type(depths).__name__}")
         expected = {"depths": (depths, tuple(depths.shape)), "positions": (positions, (*depths.shape, 3))}
         check_tensors(expected, dtype=self.grid.dtype, device=self.grid.device)
         out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)

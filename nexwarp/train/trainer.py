@@ -84,7 +84,7 @@ class Trainer(TrainingState):
         super().__init__(scene, config, device, None if calibration is None else calibration.colors, optimizer)
         self.exposures = None if calibration is None else calibration.exposures
         capture = config.cuda_graphs and device.type == "cuda" and can_capture(self.optimizer)
-        self.graphs = StepGraphs[Target](device) if capture else None
+        self.graphs = StepGraphs(device) if capture else None
         self.targets = make_targets(self, calibration, models, partial(beside, self.graphs))
         self.views, self.background = self.targets.views, self.targets.background
         self.views_a_step = 1

@@ -264,12 +264,8 @@ def moved(camera: nw.Camera, K: torch.Tensor) -> nw.Camera:
 
 def test_tensors_on_the_meta_device_are_named():
     surfels, texture, camera = parts()
-    viewmat, K, width, height = camera.viewmat, camera.K, camera.width, camera.height
-    for given, name in (((viewmat, K.to("meta")), "K"), ((viewmat.detach().to("meta"), K), "viewmat")):
-        with pytest.raises(ValueError, match=f"^{name}: expected a tensor with values, got one on the device meta$"):
-            nw.Camera(*given, width, height)
     with pytest.raises(ValueError, match=r"^camera\.K: expected a tensor on cpu, got one on meta$"):
-        nw.render(surfels, texture, moved(camera, K.to("meta")))
+        nw.render(surfels, texture, moved(camera, camera.K.to("meta")))
     with pytest.raises(ValueError, match=r"^surfels: expected parameters on a CPU or a CUDA device, got meta$"):
         nw.render(surfels.to("meta"), texture, camera)
 

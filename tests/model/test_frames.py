@@ -110,8 +110,8 @@ def test_buffers_are_copied_when_they_are_asked_for() -> None:
 
     frame: Any = Frame()
     stream: Any = None
-    frame.result, frame.image = result, result.image
-    out, same, deep = (frames.CapturedRendering.of(frame, stream) for _ in range(3))
+    frame.result = result
+    out, same, deep = (frames.CapturedRendering.of(frame, result.image.clone(), stream) for _ in range(3))
     assert out.ids is not result.ids and "depths" in vars(out) and "depths" not in vars(same)
     assert out.ids is out.intermediates.hits.ids
     same.take_buffers()
@@ -228,12 +228,14 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     captured: list[tuple[bool, int]] = []
 
     class Captured:
-        def __init__(self, graphs: frames.FrameGraphs, frame: Frame, whole: bool) -> None:
-            self.state = frame.state
-            captured.append((whole, frame.camera.width))
+        room = None
 
-        def replay(self, frame: Frame, take: object) -> tuple[torch.Tensor, bool]:
-            return torch.zeros(3), True
+        def __init__(self, graphs: frames.FrameGraphs, frame: Frame, kind: tuple[Any, ...]) -> None:
+            self.state = frame.state
+            captured.append((kind[0], frame.camera.width))
+
+        def replay(self, frame: Frame) -> torch.Tensor:
+            return torch.zeros(3)
 
     class Stream:
         def __init__(self, device: torch.device) -> None:
@@ -242,6 +244,8 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     monkeypatch.setattr(frames, "CapturedFrame", Captured)
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "Event", object)
+    monkeypatch.setattr(torch.cuda, "current_stream", Stream)
+    monkeypatch.setattr(frames.ops, "held", lambda _: True)
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
     monkeypatch.setattr(frames, "_can_capture", lambda *_: True)
     monkeypatch.setattr(frames, "_graphs", weakref.WeakKeyDictionary())
