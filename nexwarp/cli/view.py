@@ -9,7 +9,6 @@ from rich.console import Console
 
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.options import Device_, Host_, Port_, Run_, option
-from nexwarp.export.web.export import web_page
 from nexwarp.model.detail import check_detail
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.opened import near_depth, open_model
@@ -40,13 +39,11 @@ class ViewCommand:
         check_detail("--detail", self.detail)
         opened = open_model(self.run)
         model = opened.model_at(self.detail, pick_device(self.device))
-        named = {name: camera for views in opened.cameras.values() for name, camera in views.items()}
         with Viewer(
             lambda: model,
             opened.cameras,
             ViewerOptions(near_depth(model), opened.title, self.host, self.port),
             save_path=partial(keep_camera_path, opened.folder, opened=self.run),
-            make_page=lambda: web_page(model, named, opened.title),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

@@ -28,10 +28,7 @@ def one_line(text: object, limit: int = 300) -> str:
 
 
 def temporary_name(path: Path) -> Path:
-    """Return an unpredictable name beside `path`, with the same suffix, that tells the process that uses it.
-
-    It is `.STEM.PROCESS-RANDOM.tmp.SUFFIX`. Nobody can create a link of that name in advance.
-    """
+    """Return `.STEM.PROCESS-RANDOM.tmp.SUFFIX` beside `path`: nobody can create a link of that name in advance."""
     return path.with_name(f".{path.stem[:MAX_STEM]}.{os.getpid()}-{secrets.token_hex(8)}.tmp{path.suffix}")
 
 
@@ -55,11 +52,7 @@ def is_abandoned(file: Path) -> bool:
 
 
 def make_folders(folder: Path) -> list[Path]:
-    """Create a folder and those above it, and wait until the disk has stored them; return the new ones, deepest first.
-
-    Raises:
-        OSError: a folder cannot be created; those created before it are removed.
-    """
+    """Create a folder and those above it, stored on disk; return the new ones, deepest first. Failing, remove them."""
     missing = [f for f in (folder, *folder.parents) if not f.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -80,14 +73,11 @@ def remove_empty(folders: list[Path]) -> None:
 
 @contextmanager
 def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary file beside `path`, with the same suffix; it is renamed to `path` when the block ends.
+    """Yield a new, empty file beside `path`, with the same suffix; it is renamed to `path` when the block ends.
 
-    The file is new, empty, and has an unpredictable name. Missing folders are created. If the block fails, an existing
-    file at `path` stays unchanged, and the temporary file and the folders created for it are removed.
-
-    Args:
-        path: the file to write.
-        durable: wait until the disk has stored the file. Otherwise a power failure can leave an empty file at `path`.
+    Missing folders are created. If the block fails, an existing file at `path` stays unchanged, and the temporary file
+    and the folders created for it are removed. Unless `durable`, it does not wait until the disk has stored the file: a
+    power failure can leave an empty one.
 
     Raises:
         OSError: the folder cannot be created or written to, or `path` is a folder. StorageError: the disk is full.
@@ -95,7 +85,7 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
-    temporary, done = temporary_name(path), False
+    temporary = temporary_name(path)
     created: list[Path] = []
     try:
         created = make_folders(path.parent)
@@ -104,7 +94,7 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
         if durable:
             sync(temporary)
         os.replace(temporary, path)
-        done = True
+        created = []
         if durable:
             sync(path.parent)
     except OSError as error:
@@ -113,11 +103,9 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
             raise
         raise StorageError.at(path, error) from error
     finally:
-        # unlink would raise NotADirectoryError if a parent of `path` were a file.
-        if not done and path.parent.is_dir():
+        with suppress(NotADirectoryError):  # a parent of `path` is a file
             temporary.unlink(missing_ok=True)
-        if not done:
-            remove_empty(created)
+        remove_empty(created)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

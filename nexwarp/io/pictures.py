@@ -1,4 +1,4 @@
-"""Pictures: atomically written PNG and OpenEXR files, error maps, strips with captions."""
+"""Pictures: atomically written PNG, JPEG and OpenEXR files, error maps, strips with captions."""
 
 import json
 import os
@@ -10,9 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from nexwarp.errors import FormatError, MissingError, StorageError, check_finite, check_range
+from nexwarp.errors import FormatError, MissingError, StorageError, check_finite
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import parse_json
+
+ERROR_SCALE = 0.25
+CAPTION_HEIGHT = 16
+METADATA = "nexwarp"
+MAX_SIDE = 2**16  # pixels
+MAX_RATIO = 1100  # of zlib: pixels to bytes
 
 
 def to_uint8(image: torch.Tensor) -> torch.Tensor:
@@ -30,42 +36,26 @@ def to_uint8(image: torch.Tensor) -> torch.Tensor:
     return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
-ERROR_SCALE = 0.25
-CAPTION_HEIGHT = 16
-METADATA = "nexwarp"
-MAX_SIDE = 2**16  # pixels
-MAX_RATIO = 1100  # of zlib: pixels to bytes
-
-
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
-    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file.
-
-    Missing folders are created. The file is written to a temporary name and renamed; if that fails, an existing file
-    at `path` stays unchanged.
+    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file, atomically; missing folders are created.
 
     Raises:
         TypeError, ValueError: `image` has another dtype or shape; OSError: `path` cannot be written.
     """
-    from PIL import Image
-
-    pixels = _to_uint8("image", image).numpy()
-    with written_aside(path, durable=False) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG")
+    _save(path, image, format="PNG")
 
 
 def save_jpeg(path: str | os.PathLike[str], image: torch.Tensor, quality: int) -> None:
-    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a JPEG file with full colour resolution; see `save_png`.
+    """Write an image as a JPEG file of quality 1 to 100 with full colour resolution; see `save_png`."""
+    _save(path, image, format="JPEG", quality=quality, subsampling=0)
 
-    Args:
-        path: the file.
-        image: the image.
-        quality: of the compression, 1 to 100.
-    """
+
+def _save(path: str | os.PathLike[str], image: torch.Tensor, **options: Any) -> None:
     from PIL import Image
 
-    pixels = _to_uint8("image", image).numpy()
+    pixels = _shown("image", image).numpy()
     with written_aside(path, durable=False) as temporary:
-        Image.fromarray(pixels).save(temporary, format="JPEG", quality=quality, subsampling=0)
+        Image.fromarray(pixels).save(temporary, **options)
 
 
 def save_exr(
@@ -81,27 +71,23 @@ def save_exr(
             the list `parts` of all part names.
 
     Raises:
-        TypeError, ValueError: no parts, or a part of another shape or dtype; OSError: `path` cannot be written.
+        TypeError, ValueError: a part of another shape or dtype; OSError: `path` cannot be written.
     """
     import OpenEXR
 
-    if not parts:
-        raise ValueError("parts: expected at least one, got none")
     files: list[OpenEXR.Part] = []
     for name, tensor in parts.items():
         if tensor.dtype not in (torch.float32, torch.int32):
             raise TypeError(f"parts[{name!r}]: expected float32 or int32, got {tensor.dtype}")
         if not (tensor.ndim == 2 or (tensor.ndim == 3 and tensor.shape[2] == 3)):
             raise ValueError(f"parts[{name!r}]: expected shape (H, W) or (H, W, 3), got {tuple(tensor.shape)}")
-        values = tensor.detach().cpu().numpy()
-        if values.dtype == np.int32:
-            values = np.ascontiguousarray(values).view(np.uint32)
-        planes = [values[..., i] for i in range(3)] if values.ndim == 3 else [values]
-        channels = {c: np.ascontiguousarray(x) for c, x in zip("RGB" if len(planes) == 3 else "Y", planes, strict=True)}
+        values = np.ascontiguousarray(tensor.detach().cpu().numpy())
+        values = values.view(np.uint32) if values.dtype == np.int32 else values
+        planes = {c: np.ascontiguousarray(values[..., i]) for i, c in enumerate("RGB")} if values.ndim == 3 else {}
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         if not files:
             header[METADATA] = json.dumps({"parts": list(parts), **(metadata or {})})
-        files.append(OpenEXR.Part(header, channels, name))
+        files.append(OpenEXR.Part(header, planes or {"Y": values}, name))
     with written_aside(path, durable=False) as temporary:
         try:
             OpenEXR.File(files).write(str(temporary))
@@ -125,39 +111,33 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
     path = Path(path)
     if not path.is_file():
         raise MissingError(f"{path}: no such file, expected an OpenEXR file")
-    parts: dict[str, tuple[set[str], list[np.ndarray]]] = {}
-    text = ""
+    tensors: dict[str, torch.Tensor] = {}
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
+            text = str(file.parts[0].header[METADATA])
             for part in file.parts:
-                text = str(part.header.get(METADATA, text))
-                found = {name: channel.pixels for name, channel in part.channels.items()}
-                parts[part.name()] = (set(found), [found[name] for name in "RGBY" if name in found])
+                tensors[part.name()] = _tensor({name: x.pixels for name, x in part.channels.items()})
+        metadata = dict(parse_json("metadata", text.encode("utf-8", "replace")))
+        # OpenEXR prints a message and omits the parts that it cannot read.
+        if list(metadata["parts"]) != list(tensors):
+            raise ValueError("parts of it cannot be read")
     except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
-    try:
-        metadata: dict[str, Any] = {"parts": list(parts)}
-        if text:
-            metadata = dict(parse_json("metadata", text.encode("utf-8", "replace")))
-        names = list(metadata["parts"])
-    except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path}: expected the metadata of nexwarp in the attribute {METADATA!r} ({one_line(error)})"
+            f"{path}: expected a whole OpenEXR file of nexwarp, but it cannot be read ({one_line(error)})"
         ) from None
-    # OpenEXR prints a message and omits the parts that it cannot read.
-    if not parts or names != list(parts):
-        raise FormatError(f"{path}: expected a whole OpenEXR file, but parts of it cannot be read")
-    tensors = {}
-    for name, (channels, planes) in parts.items():
-        if channels not in ({"R", "G", "B"}, {"Y"}) or any(x.dtype not in (np.float32, np.uint32) for x in planes):
-            kinds = ", ".join(sorted(channels))
-            raise FormatError(
-                f"{path}: expected FLOAT or UINT channels R, G, B or Y, got {one_line(kinds, 60)} in part {name!r}"
-            )
-        slices = [torch.from_numpy(x.view(np.int32) if x.dtype == np.uint32 else x) for x in planes]
-        tensors[name] = torch.stack(slices, dim=-1) if len(slices) == 3 else slices[0]
     return tensors, metadata
+
+
+def _tensor(channels: Mapping[str, np.ndarray]) -> torch.Tensor:
+    """Return (H, W, 3) values of the channels R, G, B, or (H, W) of Y."""
+    names = [name for name in "RGBY" if name in channels]
+    if len(names) != len(channels) or "".join(names) not in ("RGB", "Y"):
+        raise ValueError(f"expected channels R, G, B or Y, got {', '.join(sorted(channels))}")
+    if any(channels[name].dtype not in (np.float32, np.uint32) for name in names):
+        raise ValueError("expected channels of FLOAT or UINT")
+    planes = [channels[name].view(np.int32) if channels[name].dtype == np.uint32 else channels[name] for name in names]
+    return torch.from_numpy(np.stack(planes, axis=-1) if len(planes) == 3 else planes[0])
 
 
 def _check_size(path: Path) -> None:
@@ -180,42 +160,20 @@ def _check_size(path: Path) -> None:
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Colour-code the absolute error of two (H, W, 3) images, uint8 or float in [0, 1], averaged over channels.
 
-    Returns:
-        (H, W, 3) uint8: viridis from 0 (dark violet) to 0.25 and above (yellow), in 256 steps.
-
-    Raises:
-        TypeError, ValueError: another dtype or shape, or two shapes that differ.
+    Returns (H, W, 3) uint8: viridis from 0 (dark violet) to 0.25 and above (yellow), in 256 steps.
     """
-    a, b = _to_uint8("image", image), _to_uint8("target", target)
-    if a.shape != b.shape:
-        raise ValueError(f"target: expected shape {tuple(a.shape)}, got {tuple(b.shape)}")
-    error = (a.int() - b.int()).abs().float().mean(-1) / 255.0
-    return _viridis()[(error / ERROR_SCALE * 255.0).round().clamp(max=255.0).long()]
+    difference = _shown("image", image).int() - _shown("target", target).int()
+    error = difference.abs().float().mean(-1) / 255.0
+    return to_uint8(viridis())[(error / ERROR_SCALE * 255.0).round().clamp(max=255.0).long()]
 
 
 def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequence[str] | None = None) -> torch.Tensor:
-    """Join (H, W_i, 3) images of one height, uint8 or float in [0, 1], into one uint8 strip with white gaps.
+    """Join (H, W_i, 3) images of one height, uint8 or float in [0, 1], into one (H, W, 3) uint8 strip.
 
-    Args:
-        images: from left to right.
-        gap: white pixels between neighbouring images.
-        captions: one for each image, printed on a white band of 16 pixels above it.
-
-    Returns:
-        (H, sum of W_i + gaps, 3) uint8; (H + 16, ...) with captions.
-
-    Raises:
-        TypeError, ValueError: no images, another dtype or shape, heights or a number of captions that do not agree.
+    `gap` white pixels part neighbours; captions stand on a white band of 16 pixels above the images.
     """
-    check_range("gap", gap, 0)
-    if not images:
-        raise ValueError("images: expected at least one, got none")
-    panels = [_to_uint8(f"images[{i}]", image) for i, image in enumerate(images)]
-    if len({len(panel) for panel in panels}) > 1:
-        raise ValueError(f"images: expected images of one height, got heights {[len(panel) for panel in panels]}")
+    panels = [_shown(f"images[{i}]", image) for i, image in enumerate(images)]
     if captions is not None:
-        if len(captions) != len(panels):
-            raise ValueError(f"captions: expected {len(panels)}, one for each image, got {len(captions)}")
         panels = [
             torch.cat([_caption(text, panel.shape[1]), panel]) for text, panel in zip(captions, panels, strict=True)
         ]
@@ -233,20 +191,15 @@ def _caption(text: str, width: int) -> torch.Tensor:
 
 
 @lru_cache(maxsize=1)
-def _viridis() -> torch.Tensor:
-    """(256, 3) uint8."""
+def viridis() -> torch.Tensor:
+    """Return (256, 3) float32 colours in [0, 1]."""
     from kornia.color import ColorMap
 
-    return (ColorMap("viridis", 256).colors.T * 255.0).round().to(torch.uint8)
+    return ColorMap("viridis", 256).colors.T.float().contiguous()
 
 
-def _to_uint8(name: str, image: torch.Tensor) -> torch.Tensor:
+def _shown(name: str, image: torch.Tensor) -> torch.Tensor:
     """Check an (H, W, 3) image and return it as uint8 on the CPU; NaN becomes 0 (black)."""
-    if not isinstance(image, torch.Tensor) or not (image.dtype == torch.uint8 or image.is_floating_point()):
-        raise TypeError(
-            f"{name}: expected a uint8 or floating torch.Tensor, got {getattr(image, 'dtype', type(image))}"
-        )
     if image.ndim != 3 or image.shape[-1] != 3:
         raise ValueError(f"{name}: expected shape (H, W, 3), got {tuple(image.shape)}")
-    image = image.detach().cpu()
-    return image if image.dtype == torch.uint8 else (image.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    return to_uint8(image.detach().cpu().nan_to_num() if image.is_floating_point() else image.cpu())

@@ -8,7 +8,7 @@ import dataclasses
 import errno
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,9 +18,11 @@ from typing import Any
 
 from filelock import BaseFileLock, FileLock, Timeout
 
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.nerfstudio import save_camera_path
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
-from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, write_atomically, written_aside
+from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, parse_json, read_json, write_json
 from nexwarp.run.contents import (
     CAMERA_PATH,
@@ -303,8 +305,8 @@ def check_teachers_place(run: Path, count: int) -> None:
             )
 
 
-def keep_camera_path(folder: Path, content: bytes, opened: Path | None = None) -> str:
-    """Write a camera path (JSON) into a folder under the next free name; return the command that renders it.
+def keep_camera_path(folder: Path, cameras: Sequence[Camera], opened: Path | None = None) -> str:
+    """Write a camera path into a folder under the next free name; return the command that renders it.
 
     `opened` is the run or model that the command names; None is the folder.
     """
@@ -317,5 +319,5 @@ def keep_camera_path(folder: Path, content: bytes, opened: Path | None = None) -
         except FileExistsError:
             number += 1
             continue
-        write_atomically(path, content)
+        save_camera_path(path, cameras)
         return f"nexwarp render {opened or folder} --path {path}"

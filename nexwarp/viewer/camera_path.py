@@ -1,70 +1,77 @@
-"""Camera paths: keyframes, their interpolation, and nerfstudio's JSON for `nexwarp render --path`."""
+"""The editor of camera paths: views that a browser adds, to play and to keep for `nexwarp render --path`."""
 
-import json
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
+import torch
 
-# From OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward).
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-MAX_FRAMES = 20_000
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import interpolate
+from nexwarp.viewer.controls import on_click, within
+from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 
+if TYPE_CHECKING:
+    from nexwarp.viewer.session import Session
 
-@dataclass(frozen=True)
-class Keyframe:
-    """A camera that a path passes through: its (4, 4) camera-to-world pose and vertical field of view in radians."""
-
-    pose: np.ndarray
-    fov: float
-
-
-def interpolate(keyframes: Sequence[Keyframe], count: int, closed: bool = False) -> list[Keyframe]:
-    """Return `count` cameras on a smooth path through the keyframes, with equal time between neighbours.
-
-    A closed path returns to the first keyframe without repeating it at the end. ValueError for fewer than two.
-    """
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, RotationSpline
-
-    n = len(keyframes)
-    if min(n, count) < 2:
-        raise ValueError(f"keyframes: expected at least two, got {n} for {count} frames")
-    # A closed path repeats all keyframes at each end, so that the splines are smooth at the seam.
-    order = np.arange(-n, 2 * n + 1) if closed else np.arange(n)
-    times = np.linspace(0, n, count, endpoint=False) if closed else np.linspace(0, n - 1, count)
-    poses = np.stack([keyframes[i % n].pose for i in order])
-    # Interpolating log tan(fov / 2) keeps the focal length positive.
-    zooms = [math.log(math.tan(keyframes[i % n].fov / 2.0)) for i in order]
-    smooth = CubicSpline(order, np.column_stack([poses[:, :3, 3], zooms]))(times)
-    rotations = RotationSpline(order, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
-    path = []
-    for values, rotation in zip(smooth, rotations, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, values[:3]
-        path.append(Keyframe(pose, 2.0 * math.atan(math.exp(values[3]))))
-    return path
+FPS, PLAY_FPS = 30, 20
+SECONDS = (0.1, 600.0)
+MOST_VIEWS = 200
 
 
-def path_json(
-    keyframes: Sequence[Keyframe], width: int, height: int, fps: float, seconds: float, closed: bool = False
-) -> bytes:
-    """Return a path through keyframes as nerfstudio's camera-path JSON in UTF-8, one camera for each frame.
+class PathEditor:
+    """A path through views of one client, and its controls."""
 
-    Raises:
-        ValueError: fewer than two keyframes, a size or time that is not positive, or more than 20,000 frames.
-    """
-    for name, value in (("width", width), ("height", height), ("fps", fps), ("seconds", seconds)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: expected a number above 0, got {value}")
-    count = max(round(fps * seconds), 2)
-    if count > MAX_FRAMES:
-        raise ValueError(f"seconds: expected at most {MAX_FRAMES:,} frames, got {count:,} ({seconds:g} s at {fps:g})")
-    frames = []
-    for frame in interpolate(keyframes, count, closed):
-        pose = (frame.pose @ OPENGL).ravel().tolist()
-        frames.append({"camera_to_world": pose, "fov": math.degrees(frame.fov), "aspect": width / height})
-    size = {"render_width": width, "render_height": height}
-    data = {**size, "fps": fps, "seconds": seconds, "camera_path": frames}
-    return (json.dumps(data, indent=2) + "\n").encode()
+    def __init__(self, session: "Session", save: Callable[[Sequence[Camera]], str]) -> None:
+        from viser import Icon
+
+        self.session, self.save = session, save
+        self.views: tuple[Camera, ...] = ()  # replaced, never changed: two threads read it
+        self.playing = False
+        gui = session.client.gui
+        self.note = gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
+        on_click(gui.add_button("Add this view", icon=Icon.PLUS), self.add)
+        on_click(gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray"), self.remove)
+        self.seconds = gui.add_number("Seconds", 6.0, min=SECONDS[0], max=SECONDS[1], step=0.1)
+        on_click(gui.add_button("Play, stop", icon=Icon.PLAYER_PLAY, color="gray"), self.play)
+        gui.add_button("Save path", icon=Icon.DEVICE_FLOPPY).on_click(lambda _: self.keep())  # on a thread: it writes
+
+    def add(self) -> None:
+        """Append the current view, with the size of the home view; video codecs need even sizes."""
+        here, home = self.session.viewpoint, self.session.home
+        if here is not None and len(self.views) < MOST_VIEWS:
+            size = (max(home.width // 2 * 2, 2), max(home.height // 2 * 2, 2))
+            (view,) = Viewpoint(here.pose, here.fov, *size).bands(1.0, 0.01, torch.zeros(0))
+            self.views = (*self.views, view)
+            self.note.content = f"{len(self.views)} of at most {MOST_VIEWS} views"
+
+    def remove(self) -> None:
+        """Remove the last view."""
+        self.views = self.views[:-1]
+        self.note.content = f"{len(self.views)} of at most {MOST_VIEWS} views"
+
+    def path(self, fps: int) -> list[Camera]:
+        """Return the path at some frames a second; ValueError without two different views."""
+        return interpolate(self.views, max(round(within(self.seconds.value, SECONDS) * fps), 2), len(self.views) or 2)
+
+    async def play(self) -> None:
+        """Move along the path once; stop if that is in progress."""
+        self.playing = not self.playing
+        start = time.perf_counter()
+        try:
+            for number, camera in enumerate(self.path(PLAY_FPS) if self.playing else (), 1):
+                self.session.go(camera_to_world(camera), vertical_fov(camera))
+                await asyncio.sleep(max(start + number / PLAY_FPS - time.perf_counter(), 0.0))
+                if self.session.closed.is_set() or not self.playing:
+                    break
+        except ValueError:
+            self.note.content = "Add at least two different views first"
+        self.playing = False
+
+    def keep(self) -> None:
+        """Write the path into the run, and show the command that renders it."""
+        try:
+            self.note.content = f"`{self.save(self.path(FPS))}`"
+        except (OSError, ValueError) as error:
+            self.note.content = f"The path was not saved: {error}"

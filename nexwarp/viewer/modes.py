@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.io.pictures import viridis
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure
@@ -25,10 +25,8 @@ MODES = {
     "alpha": "1 - transmittance after the last surfel.",
     "hit count": f"Number of hits with a weight of at least 2 %, among the {MAX_HITS} heaviest of each pixel.",
 }
-TEXTURED = ("image", "textured")
-"""Modes that need the neural texture."""
-BY_SLOT = ("ids", "depth", "weights", "normal")
-"""Modes that show one of the K hits."""
+TEXTURED = ("image", "textured")  # modes that need the neural texture
+BY_SLOT = ("ids", "depth", "weights", "normal")  # modes that show one of the K hits
 COUNTED = 0.02  # smallest weight that "hit count" counts; nearly all pixels have more than 8 hits in total
 QUANTILE_SAMPLES = 100_000
 RANGES = {"max_hits": (0, MAX_HITS), "sh_degree": (0, MAX_SH_DEGREE), "slot": (1, MAX_HITS)}
@@ -43,8 +41,7 @@ class Settings:
         max_hits: K, 0 to 8.
         sh_degree: largest SH degree.
         slot: rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8.
-        as_trained: where the picture's resolution is finer than the photos', weight the texture's levels as at the
-            photos' resolution.
+        as_trained: weight the texture's levels as at the photos' resolution where the picture's is finer.
         photo_exposure: use the exposure of the nearby photos instead of the mean exposure.
     """
 
@@ -56,16 +53,9 @@ class Settings:
     photo_exposure: bool = True
 
     def changed(self, name: str, value: object) -> "Settings":
-        """Return these settings with another value, as a browser sent it; an integer out of range is clamped.
-
-        Raises:
-            ValueError: a value of the wrong type, or an unknown mode.
-        """
-        expected = type(getattr(self, name))
-        if type(value) is not expected:
-            raise ValueError(f"{name}: expected {expected.__name__}, got {value!r:.60}")
-        if name == "mode" and value not in MODES:
-            raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {value!r:.60}")
+        """Return these settings with a value that a browser sent, clamped to its range; ValueError for another type."""
+        if type(value) is not type(getattr(self, name)) or (name == "mode" and value not in MODES):
+            raise ValueError(f"{name}: expected a value that the panel offers, got {value!r:.60}")
         if isinstance(value, int) and name in RANGES:
             low, high = RANGES[name]
             value = min(max(value, low), high)
@@ -109,7 +99,7 @@ def draw(
     elif parts[0].ndim == 2:
         span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
     # Band by band: temporary tensors of a large picture would need several times its memory.
-    return Picture(np.concatenate([_eight_bit(_colours(part, span)) for part in parts]), span)
+    return Picture(np.concatenate([_pixels(part, span) for part in parts]), span)
 
 
 def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings) -> torch.Tensor:
@@ -130,17 +120,13 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
     return (normals * 0.5 + 0.5) * (ids >= 0)[..., None]
 
 
-def _colours(values: torch.Tensor, span: tuple[float, float] | None) -> torch.Tensor:
-    """Return (H, W, 3) colours: the values, or those of a scale from violet to yellow, black where they are NaN."""
-    if span is None:
-        return values
-    table = viridis().to(values.device)
-    steps = ((values - span[0]) / (span[1] - span[0]) * (len(table) - 1)).nan_to_num().round()
-    return table[steps.clamp(0, len(table) - 1).long()] * ~values.isnan()[..., None]
-
-
-def _eight_bit(colours: torch.Tensor) -> np.ndarray:
-    return (colours.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+def _pixels(values: torch.Tensor, span: tuple[float, float] | None) -> np.ndarray:
+    """Return (H, W, 3) uint8: colours, or those of numbers from violet to yellow, black where they are NaN."""
+    if span is not None:
+        table = viridis().to(values.device)
+        steps = ((values - span[0]) / (span[1] - span[0]) * (len(table) - 1)).nan_to_num().round()
+        values = table[steps.clamp(0, len(table) - 1).long()] * ~values.isnan()[..., None]
+    return (values.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
 
 
 def facing_normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
@@ -164,11 +150,3 @@ def id_colours(ids: torch.Tensor) -> torch.Tensor:
     factors = ids.new_tensor([2654435761, 2246822519, 3266489917])
     hashes = ((ids[..., None] + 1) * factors) % 2**32 // 2**16 % 256
     return 0.2 + 0.8 * hashes.float() / 255.0
-
-
-@lru_cache(maxsize=1)
-def viridis() -> torch.Tensor:
-    """Return (256, 3) float32 colours in [0, 1]."""
-    from kornia.color import ColorMap
-
-    return ColorMap("viridis", 256).colors.T.float().contiguous()

@@ -21,17 +21,13 @@ def limited(scale: float, width: int, height: int) -> float:
 
 
 class Pace:
-    """Estimates the time of a pixel for each kind of picture, and chooses the scale of the next picture from it.
-
-    A lower measurement replaces the estimate. A higher one moves it by a third of the difference, since the first
-    picture of a kind includes compilation.
-    """
+    """Estimates the time of a pixel for each kind of picture, and chooses the scale of the next picture from it."""
 
     def __init__(self) -> None:
         self.seconds_per_pixel: dict[object, float] = {}
 
     def observe(self, kind: object, pixels: int, seconds: float) -> None:
-        """Update the estimate with one picture."""
+        """Update the estimate: at once to a lower one, else by a third, as the first picture includes compilation."""
         new = seconds / max(pixels, 1)
         old = self.seconds_per_pixel.get(kind, new)
         self.seconds_per_pixel[kind] = min(new, old + (new - old) / 3.0)
@@ -47,8 +43,7 @@ class Pace:
     def scale(self, kind: object, width: int, height: int, limit: float) -> float:
         """Return the largest scale of 1, 0.71, 0.5, ... at which a picture of a window should take `limit` seconds.
 
-        The scale is at most 0.25, and the picture has at most `FIRST_PIXELS`, for a kind that was never drawn. The
-        shorter side has at least `SMALLEST` pixels.
+        The first picture of a kind is small. The shorter side has at least `SMALLEST` pixels.
         """
         floor = min(SMALLEST / max(min(width, height), 1), 1.0)
         if kind not in self.seconds_per_pixel:

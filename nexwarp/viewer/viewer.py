@@ -5,18 +5,18 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
-from nexwarp.viewer import pacing, thumbnails
+from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.panel import TrainingPanel
 from nexwarp.viewer.server import start_server
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SHARE = 0.2  # of a training's time for pictures, at the start
 DEFAULT_FOV = 0.9  # radians
-MOST_SENT = 2  # files on their way to clients, above which no screenshot is drawn: one may have 25 MB
+THUMBNAIL_SIDE = 96  # pixels along the longer side
 MOST_PATHS = 100  # written into the run
 log = logging.getLogger(__name__)
 
@@ -62,8 +62,7 @@ class Viewer:
         options: ViewerOptions,
         *,
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
-        save_path: Callable[[bytes], str] | None = None,
-        make_page: Callable[[], bytes] | None = None,
+        save_path: Callable[[Sequence[Camera]], str] | None = None,
     ) -> None:
         """Start the server.
 
@@ -71,34 +70,29 @@ class Viewer:
             model: returns the current model; called for each picture.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
             options: title, address and the like.
-            photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails; None renders the
-                thumbnails.
-            save_path: writes a camera path, JSON in UTF-8, into the run and returns the file's name.
-            make_page: returns the scene as a web page, one HTML file, which browsers may download; called once, on
-                another thread.
+            photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
+            save_path: writes a camera path into the run and returns the command that renders it; None offers none.
 
         Raises:
             ValueError: the package viser is missing, or the address cannot be used.
         """
-        self.model, self.options = model, options
+        self.model, self.options, self.save_path = model, options, save_path
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
-        self.photos, self.save_path, self.make_page = photos, save_path, make_page
+        self.photos = photos or {}
         self.world = World.around(list(self.cameras.values()), model().surfels.means)
         self.home = self._home()
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
         self.pace, self.share = pacing.Pace(), pacing.Share(SHARE)
         self.sessions: dict[int, Session] = {}
         self.thumbnails: dict[str, np.ndarray] = {}
-        self.step = 0
+        self.step = self.paths = 0
         self.training: TrainingPanel | None = None
-        self._paths, self._page = 0, b""
-        self._news = threading.Event()
-        self._lock, self._photos_lock, self._page_lock = threading.Lock(), threading.Lock(), threading.Lock()
+        self._news, self._lock = threading.Event(), threading.Lock()
         self.web = start_server(options.host, options.port)
         self.server, self.url = self.web.viser, self.web.url
         self._set_scene()
         if options.total is not None:
-            self.training = TrainingPanel(self.server.gui, options.total, self.share, self._news.set)
+            self.training = TrainingPanel(self.server.gui, options.total, self.share, self.wake)
         self.server.on_client_disconnect(self._goodbye)
         self.server.on_client_connect(self._welcome)
         self.web.gate.is_open = True
@@ -114,6 +108,10 @@ class Viewer:
         for session in list(self.sessions.values()):
             session.closed.set()
         self.web.stop()
+
+    def wake(self) -> None:
+        """Say that a new picture is needed."""
+        self._news.set()
 
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Draw pictures for the connected browsers until `stop()` returns True or Ctrl-C."""
@@ -140,7 +138,7 @@ class Viewer:
         try:
             self._serve(self.training, describe, stop)
         except Exception as error:  # for example out of memory
-            log.warning("the viewer failed: %s", _one_line(error))
+            log.warning("the viewer failed: %s", _reason(error))
             self.share.spend(time.perf_counter(), pacing.FIRST_SECONDS)
 
     def _serve(self, training: TrainingPanel, describe: Callable[[], str], stop: Callable[[], bool]) -> None:
@@ -156,16 +154,11 @@ class Viewer:
                 self._draw_or_wait()
 
     def finish(self, text: str, model: Callable[[], Model]) -> None:
-        """End the training's display and show another model from now on.
-
-        Args:
-            text: status line, such as a summary of the training.
-            model: returns the current model, as in the constructor.
-        """
+        """End the training's display with a status line, and show another model from now on."""
         self.model = model
         for session in list(self.sessions.values()):
             session.drawn_version = -1  # its picture shows the previous model
-        self._news.set()
+        self.wake()
         if self.training is not None:
             self.training.finish(text)
 
@@ -173,7 +166,7 @@ class Viewer:
 
     def _draw_or_wait(self) -> None:
         self._news.clear()
-        if self._draw_next(None) is None and not self._draw_thumbnail():
+        if self._draw_next(None) is None:
             self._news.wait(0.05 if self.sessions else 0.5)
 
     def _draw_next(self, longest: float | None) -> float | None:
@@ -185,19 +178,18 @@ class Viewer:
         for session in sorted(list(self.sessions.values()), key=lambda s: s.drawn_at):
             if session.waiting():
                 continue
-            session.has_download = False
             start = time.perf_counter()
             is_first = _kind(session.settings) not in self.pace.seconds_per_pixel
             try:
-                if session.screenshots and sum(s.has_download for s in self.sessions.values()) < MOST_SENT:
-                    self._screenshot(session, session.screenshots.pop(0))
+                if session.screenshot is not None:
+                    self._screenshot(session, session.screenshot)
                 elif scale := self._due(session, longest, start):
                     self._draw(session, scale)
                 else:
                     continue
             except Exception as error:  # for example out of memory; the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
-                session.tell("This picture could not be drawn", _one_line(error))
+                session.tell("This picture could not be drawn", _reason(error))
             seconds = time.perf_counter() - start
             return min(seconds, pacing.FIRST_SECONDS) if is_first else seconds
         return None
@@ -256,6 +248,7 @@ class Viewer:
     def _screenshot(self, session: Session, height: int) -> None:
         from PIL import Image
 
+        session.screenshot = None
         here, settings = session.viewpoint, session.settings
         if here is None:
             return
@@ -265,20 +258,7 @@ class Viewer:
         file = io.BytesIO()
         Image.fromarray(picture.pixels).save(file, format="PNG")
         name = f"{self.options.title}_{settings.mode}.png".replace(" ", "_")
-        session.has_download = True
         session.client.send_file_download(name, file.getvalue(), save_immediately=True)
-
-    def _draw_thumbnail(self) -> bool:
-        """Draw one thumbnail if a browser is connected; False if there is none left to draw."""
-        name = next((name for name in self.cameras if name not in self.thumbnails), None)
-        if self.photos is not None or not self.sessions or name is None:
-            return False
-        pixels = thumbnails.of_camera(self.model(), self.cameras[name], self.options.near)
-        with self._lock:
-            self.thumbnails[name] = pixels
-            for session in self.sessions.values():
-                session.show_thumbnail(name, pixels)
-        return True
 
     # The page
 
@@ -303,48 +283,29 @@ class Viewer:
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
         try:
-            self._add_session(client)
+            with self._lock:  # one of the first clients reads the photos
+                self._read_photos()
+            session = Session(self, client, self._settings())
+            with self._lock:
+                if client.client_id in self.server.get_clients():  # else it has disconnected
+                    self.sessions[client.client_id] = session
+            self.wake()
         except Exception as error:  # for example out of memory
-            log.warning("the viewer could not serve a browser tab: %s", _one_line(error))
-            client.add_notification("The viewer could not serve this tab: reload it", _one_line(error))
+            log.warning("the viewer could not serve a browser tab: %s", _reason(error))
+            client.add_notification("The viewer could not serve this tab: reload it", _reason(error))
 
-    def _add_session(self, client: "viser.ClientHandle") -> None:
-        with self._photos_lock:  # one of the first clients reads the photos
-            if self.photos and not self.thumbnails:
-                self.thumbnails = thumbnails.of_photos(self.photos)
-        session = Session(client, self.world, self.cameras, self._settings(), self.home, self._news.set)
-        session.start(
-            partial(self.web.waiting, client.client_id),
-            None if self.save_path is None else self._save_path,
-            None if self.make_page is None else self._web_page,
-        )
-        with self._lock:
-            if client.client_id not in self.server.get_clients():  # it has disconnected
-                return
-            self.sessions[client.client_id] = session
-            for name, pixels in self.thumbnails.items():
-                session.show_thumbnail(name, pixels)
-        self._news.set()
+    def _read_photos(self) -> None:
+        """Reduce the photos to thumbnails, once; unreadable ones have none."""
+        from PIL import Image
 
-    def _save_path(self, content: bytes) -> str:
-        """Write a camera path into the run; ValueError if too many are written."""
-        assert self.save_path is not None
-        with self._lock:
-            if self._paths >= MOST_PATHS:
-                raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
-            self._paths += 1
-        return self.save_path(content)
-
-    def _web_page(self) -> bytes:
-        """Return the web page, which the first request makes and others wait for."""
-        assert self.make_page is not None
-        with self._page_lock:
-            self._page = self._page or self.make_page()
-            return self._page
-
-    def _settings(self) -> Settings:
-        """Initial settings of a client: the model's own K."""
-        return Settings(max_hits=self.model().options.max_hits)
+        for name, photo in self.photos.items():
+            try:
+                image = Image.fromarray(photo().numpy())
+                image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+                self.thumbnails[name] = np.asarray(image)
+            except (OSError, ValueError, RuntimeError, MemoryError) as error:
+                log.warning("%s has no thumbnail: %s", name, error)
+        self.photos = {}
 
     def _goodbye(self, client: "viser.ClientHandle") -> None:
         with self._lock:
@@ -352,12 +313,25 @@ class Viewer:
         if session is not None:
             session.closed.set()
 
+    def keep_path(self, path: Sequence[Camera]) -> str:
+        """Write a camera path into the run; ValueError if too many are written."""
+        assert self.save_path is not None  # otherwise no panel offers it
+        with self._lock:
+            if self.paths >= MOST_PATHS:
+                raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
+            self.paths += 1
+        return self.save_path(path)
+
+    def _settings(self) -> Settings:
+        """Initial settings of a client: the model's own K."""
+        return Settings(max_hits=self.model().options.max_hits)
+
 
 def _kind(settings: Settings) -> tuple[bool, int]:
     """Kind of a picture for `Pace`: the settings that decide the cost of a pixel."""
     return settings.mode in TEXTURED, MAX_HITS if settings.mode == "hit count" else settings.max_hits
 
 
-def _one_line(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """The message of an error, or its type if it has none."""
-    return (" ".join(str(error).split()) or type(error).__name__)[:300]
+    return one_line(error) or type(error).__name__

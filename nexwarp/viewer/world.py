@@ -30,11 +30,8 @@ FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 class World:
     """The browser's frame: the scene's frame, translated and scaled so that all cameras lie within `RADIUS`.
 
-    Attributes:
-        centre: (3,) float64, scene position of the browser's origin.
-        unit: scene units of one browser unit.
-        up: (3,) float64 unit vector, up direction in the scene's frame.
-        focus: (3,) float64, scene position that the first camera orbits.
+    Its origin `centre`, unit upward direction `up`, and the `focus` that the first camera orbits are (3,) in the
+    scene's frame; `unit` is the length of a browser unit there.
     """
 
     centre: np.ndarray
@@ -53,7 +50,8 @@ class World:
         poses = np.stack([camera_to_world(camera) for camera in cameras])
         centres, axes = poses[:, :3, 3], poses[:, :3, 2]
         centre = centres.mean(axis=0)
-        radius, away = np.linalg.norm(centres - centre, axis=1).max(), np.linalg.norm(middle - centre)
+        radius = np.linalg.norm(centres - centre, axis=1).max()
+        away = np.linalg.norm(middle - centre)
         radius = radius if radius > 1e-6 * away else away
         up = -poses[:, :3, 1].mean(axis=0)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else UP
@@ -76,13 +74,9 @@ class World:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The camera of a browser's canvas.
+    """The camera of a browser's canvas, whose size is in pixels.
 
-    Attributes:
-        pose: (4, 4) float64 camera to world in the scene's frame, x right, y down, z forward.
-        fov: vertical field of view, radians.
-        width: width of the canvas, pixels.
-        height: height of the canvas, pixels.
+    `pose` is (4, 4) float64, camera to world in the scene's frame, x right, y down, z forward; `fov` is vertical, rad.
     """
 
     pose: np.ndarray
@@ -99,13 +93,11 @@ class Viewpoint:
     def of(wxyz: FloatVector, position: FloatVector, fov: float, width: int, height: int, world: World) -> "Viewpoint":
         """Convert a browser's camera: rotation (4,), position (3,) in browser units, fov in radians, size in pixels.
 
-        Raises:
-            ValueError: values that are not finite or do not describe a camera.
+        TypeError or ValueError: values that do not describe a camera.
         """
         values = np.array([*wxyz, *position, fov, width, height], dtype=np.float64)
-        if values.shape != (10,) or not np.isfinite(values).all():
-            raise ValueError(f"camera: expected 10 finite numbers, got {values.tolist()}")
-        if not 1e-3 < fov < math.pi - 1e-3 or np.abs(values[:4]).max() < 1e-6 or np.abs(values[4:7]).max() > 1e9:
+        is_camera = values.shape == (10,) and bool(np.isfinite(values).all()) and 1e-3 < fov < math.pi - 1e-3
+        if not (is_camera and 1e-6 <= np.abs(values[:4]).max() and np.abs(values[4:7]).max() <= 1e9):
             raise ValueError(f"camera: expected a rotation, a position and a field of view, got {values.tolist()}")
         if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
             raise ValueError(f"camera: expected a canvas of 1 to {MOST_SIDE} pixels a side, got {width}x{height}")
@@ -119,12 +111,8 @@ class Viewpoint:
     ) -> list[Camera]:
         """Return cameras of a picture with `scale` times the canvas's size, as bands of rows from top to bottom.
 
-        Args:
-            scale: of the picture, relative to the canvas.
-            near: near depth of the cameras, world units.
-            like: a tensor with the dtype and device of the cameras.
-            count: largest number of bands; the height of each but the last is a multiple of 16 rows.
-            focal_limit: upper limit of `Camera.focal`, pixels, which limits the detail of the texture.
+        There are at most `count`, whose heights but the last are multiples of 16 rows; dtype and device are those of
+        `like`. `focal_limit` is an upper limit of `Camera.focal`, pixels, which limits the detail of the texture.
         """
         width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
         focal = 0.5 * height / math.tan(0.5 * self.fov)
@@ -150,10 +138,7 @@ class LimitedCamera(Camera):
 
 
 def clearest(cameras: Sequence[Camera]) -> Camera:
-    """Return the camera in whose picture the frustums of the others cover the least; the first one of those.
-
-    A frustum covers about 1 / depth^2 of a picture, if its camera is inside of it. At most 300 cameras are compared.
-    """
+    """Return the first of up to 300 cameras in whose picture the frustums of the others, 1 / depth^2, cover least."""
     chosen = list(cameras[:: -(-len(cameras) // MOST_COMPARED)])
     centres = torch.stack([camera.position.detach().double().cpu() for camera in chosen])
     covered: list[float] = []

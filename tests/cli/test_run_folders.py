@@ -6,6 +6,7 @@ from contextlib import nullcontext
 
 import pytest
 
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cli import main as cli
 from nexwarp.cli import train
 from nexwarp.errors import RunError
@@ -156,7 +157,7 @@ def test_all_files_of_a_run_are_known(finished, scene, tmp_path):
         if str(paths) in command:
             shutil.copy(finished / "export" / "camera_path.json", paths)
         assert cli.main(command) == 0
-    keep_camera_path(finished, b"{}")
+    keep_camera_path(finished, load_camera_path(finished / "export" / "camera_path.json").cameras)
     (finished / "diverged.json").touch()
     own, foreign = list_files(finished)
     assert foreign == [] and set(own) == snapshot(finished).keys()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.viewer import Viewer, ViewerOptions, connections, pacing
+from nexwarp.viewer import Viewer, ViewerOptions, pacing, security
 from nexwarp.viewer.session import Session
 from tests.viewer.attack import attacked, resources
 from tests.viewer.support import Client, serving, wait_for
@@ -17,7 +17,7 @@ from tests.viewer.test_training import trainer_of
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
-FULL = {"iterations": 300, "pixels": pacing.MOST_PIXELS, "flood": connections.FLOOD_SECONDS}
+FULL = {"iterations": 300, "pixels": pacing.MOST_PIXELS, "flood": security.FLOOD_SECONDS}
 SMALL = {"iterations": 20, "pixels": 2**18, "flood": 1.0}
 
 
@@ -27,7 +27,7 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
     """Clients come and go, send garbage, flood, ask for huge screenshots, and read nothing."""
     pytest.importorskip("viser")
     monkeypatch.setattr(pacing, "MOST_PIXELS", size["pixels"])
-    monkeypatch.setattr(connections, "FLOOD_SECONDS", size["flood"])
+    monkeypatch.setattr(security, "FLOOD_SECONDS", size["flood"])
     run = tiny_folder.parent / "run"  # beside the scene; it is not there
     start = time.perf_counter()
     alone = trainer_of(run, iterations=size["iterations"])
@@ -83,7 +83,7 @@ def test_a_training_under_attack_gives_the_same_bits(tiny_folder, size, monkeypa
 def clients() -> list[object]:
     """All objects that stand for a client."""
     viser = pytest.importorskip("viser")
-    kinds = {Session, viser.ClientHandle, connections.Connection}
+    kinds = {Session, viser.ClientHandle, security.Connection}
     return [thing for thing in gc.get_objects() if type(thing) in kinds]
 
 
@@ -93,7 +93,7 @@ def test_sessions_leave_nothing_behind(model, count, record_property):
     """Files, threads and memory after many sessions: connect, one picture, disconnect."""
     warm = max(count // 10, 10)
     others = {id(thing): thing for thing in clients()}  # of other tests
-    with serving(model, photos={}) as viewer:
+    with serving(model) as viewer:
 
         def visit(number: int) -> None:
             with Client(viewer, close_timeout=1.0) as client:

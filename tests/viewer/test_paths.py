@@ -1,6 +1,6 @@
-"""The viewer's pace, its cameras and its camera paths."""
+"""The viewer's pace, its cameras, and the editor of camera paths."""
 
-import json
+import asyncio
 import math
 from typing import Any
 
@@ -9,8 +9,10 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.run.folder import keep_camera_path
-from nexwarp.viewer.camera_path import OPENGL, Keyframe, interpolate, path_json
+from nexwarp.viewer import camera_path
+from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer.pacing import SMALLEST, Pace, Share
 from nexwarp.viewer.world import (
     LARGEST_FRUSTUM,
@@ -22,7 +24,7 @@ from nexwarp.viewer.world import (
     frustum_size,
     vertical_fov,
 )
-from tests.viewer.support import ring
+from tests.viewer.support import Client, ring, serving, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -106,64 +108,38 @@ def test_what_is_no_camera_is_refused(wrong):
         Viewpoint.of(**(good | wrong), world=world)
 
 
-def keyframes(count: int = 4) -> list[Keyframe]:
-    cameras = ring(count)["train"].values()
-    return [Keyframe(camera_to_world(camera), 0.6 + 0.1 * i) for i, camera in enumerate(cameras)]
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_a_path_meets_its_keyframes_smoothly(closed):
-    keys = keyframes()
-    count = 40 * len(keys) if closed else 40 * (len(keys) - 1) + 1
-    path = interpolate(keys, count, closed)
-    assert len(path) == count
-    for key, frame in zip(keys, path[::40], strict=True):
-        np.testing.assert_allclose(frame.pose, key.pose, atol=1e-6)
-        assert frame.fov == pytest.approx(key.fov)
-    poses = np.stack([frame.pose for frame in path])
-    np.testing.assert_allclose(
-        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1),
-        np.broadcast_to(np.eye(3), (count, 3, 3)),
-        atol=1e-9,
-        rtol=0,
-    )
-    loop = np.concatenate([poses, poses[:3]]) if closed else poses
-    steps, turns = np.diff(loop, axis=0), np.diff(loop, n=2, axis=0)
-    # No jump in speed anywhere, the seam included: second differences are a frame's share of first ones.
-    assert np.abs(turns).max() < 0.25 * np.abs(steps).max()
-
-
-def test_path_files_hold_what_nerfstudio_reads():
-    keys = keyframes(3)
-    data = json.loads(path_json(keys, 640, 480, 24, 2.0))
-    assert {k: data[k] for k in data if k != "camera_path"} == {
-        "render_width": 640,
-        "render_height": 480,
-        "fps": 24,
-        "seconds": 2.0,
-    }
-    assert len(data["camera_path"]) == 48
-    for key, frame in ((keys[0], data["camera_path"][0]), (keys[-1], data["camera_path"][-1])):
-        pose = np.array(frame["camera_to_world"]).reshape(4, 4)
-        np.testing.assert_allclose(pose @ OPENGL, key.pose, atol=1e-6)
-        np.testing.assert_allclose(pose[:3, 1], -key.pose[:3, 1], atol=1e-6)  # up is up
-        assert frame["fov"] == pytest.approx(math.degrees(key.fov)) and frame["aspect"] == pytest.approx(4 / 3)
-
-
-def test_paths_that_cannot_be(tmp_path):
-    for arguments, word in (
-        ((keyframes(1), 64, 48, 30, 1.0), "two"),
-        ((keyframes(2), 0, 48, 30, 1.0), "width"),
-        ((keyframes(2), 64, 48, 30, math.nan), "seconds"),
-        ((keyframes(2), 64, 48, 120, 1e6), "20,000"),
-    ):
-        with pytest.raises(ValueError, match=word):
-            path_json(*arguments)
-    same = [keyframes(1)[0]] * 3
-    assert np.ptp([frame.pose for frame in interpolate(same, 9)], axis=0).max() < 1e-9
-    assert keep_camera_path(tmp_path, b"1").endswith("camera_path_1.json")
-    assert keep_camera_path(tmp_path, b"2").endswith("camera_path_2.json")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera_path_1.json", "camera_path_2.json"]
+def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch) -> None:
+    """Views are added and removed; what the run keeps passes through them; numbers of views and paths are bounded."""
+    monkeypatch.setattr(camera_path, "MOST_VIEWS", 3)
+    monkeypatch.setattr(viewer_module, "MOST_PATHS", 2)
+    with serving(model, save_path=lambda path: keep_camera_path(tmp_path, path)) as viewer, Client(viewer) as client:
+        client.look()
+        wait_for(lambda: bool(viewer.sessions))
+        (session,) = viewer.sessions.values()
+        editor = session.panel.path
+        editor.keep()
+        assert "not saved" in editor.note.content
+        for name in [*session.cameras, "train/0.png"]:
+            view = Viewpoint.of_camera(session.cameras[name])
+            session.viewpoint = view
+            editor.add()
+        editor.remove()
+        assert len(editor.views) == 2
+        editor.keep()
+        kept = load_camera_path(tmp_path / "camera_path_1.json")
+        assert f"--path {tmp_path / 'camera_path_1.json'}" in editor.note.content
+        assert len(kept.cameras) == 180 and kept.fps == 30
+        for camera, name in ((kept.cameras[0], "train/0.png"), (kept.cameras[-1], "train/1.png")):
+            expected = session.cameras[name]
+            torch.testing.assert_close(camera.viewmat, expected.viewmat, atol=1e-4, rtol=0)
+            torch.testing.assert_close(camera.K, expected.K, atol=1e-3, rtol=0)
+        editor.seconds.value = 0.1
+        asyncio.run(editor.play())
+        last = viewer.world.to_scene(np.asarray(session.client.camera.position))
+        np.testing.assert_allclose(last, camera_to_world(session.cameras["train/1.png"])[:3, 3], atol=1e-4)
+        editor.keep()
+        editor.keep()
+        assert "at most 2 paths" in editor.note.content and len(list(tmp_path.iterdir())) == 2
 
 
 # The first view: a camera that few frustums stand in front of, and frustums that stay apart

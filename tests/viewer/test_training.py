@@ -85,7 +85,7 @@ def test_looking_changes_nothing_about_a_training(run):
 
 def test_nobody_looking_costs_nothing_and_a_pause_ends_when_asked(run):
     pytest.importorskip("viser")
-    with Viewer(lambda: TINY, ring(), WATCHED, photos={}) as viewer:
+    with Viewer(lambda: TINY, ring(), WATCHED) as viewer:
         start = time.perf_counter()
         for i in range(1000):
             viewer.between_steps(i, lambda: pytest.fail("asked although nobody looks"))

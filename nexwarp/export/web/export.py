@@ -56,11 +56,6 @@ def export_web(
     return [out / name for name in content]
 
 
-def web_page(model: Model, cameras: Mapping[str, Camera], title: str = "nexwarp") -> bytes:
-    """Return the page of a scene as one HTML file."""
-    return one_file(page_files(model, cameras, title=title))
-
-
 def page_files(
     model: Model, cameras: Mapping[str, Camera], *, quality: str = "quantised", title: str = "nexwarp"
 ) -> dict[str, bytes]:

@@ -1,18 +1,37 @@
-"""Connections to the web server: who is admitted, how many, how fast they may send, and how long they may not read."""
+"""Who may open the viewer, how many may, and what they may send: all rules of its security.
+
+* The Origin, which browsers send with every WebSocket, must be the server's own: "http://" and the Host. Programs that
+  are not browsers send none; no page of another server can make them connect.
+* On a loopback address the Host must be "localhost" or a loopback address. A name that somebody lets lead to 127.0.0.1
+  (DNS rebinding) is its own Host and Origin, and is refused by this rule.
+* On any other address each request needs the token: in the URL, or in the cookie that the page's response sets.
+* Tabs, connections, the size and rate of messages, and the time to read one are bounded. Messages of other kinds than
+  the viewer's panels and canvas send are dropped: viser's client knows uploads and public tunnels, too.
+"""
 
 import asyncio
 import contextlib
+import hmac
 import http
+import ipaddress
+import logging
+import secrets
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
+from urllib.parse import parse_qs, urlsplit
 
 import websockets.asyncio.server as web
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from nexwarp.viewer.access import Access
+if TYPE_CHECKING:
+    import viser
+    import viser.infra
 
+TOKEN_BYTES = 24  # 192 bits
 MAX_CLIENTS = 32  # browser tabs
 MAX_CONNECTIONS = 128  # TCP connections: clients, pages in transfer, and what has not sent a request yet
 MAX_MESSAGE_BYTES = 2**16  # of one message of a browser; the largest that the panels send has a few hundred
@@ -21,14 +40,90 @@ BURST = 240  # messages of one client that may come at once
 FLOOD_SECONDS = 5.0  # of more messages than that, after which a client is closed
 SEND_SECONDS = 60.0  # in which a client must have read a message
 CLOSE_SECONDS = 2.0  # in which a client must answer a farewell
+ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"}
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "frame-ancestors 'self'",  # no page of another server shows the viewer in a frame
     "Referrer-Policy": "no-referrer",  # the token is in the URL
 }
+log = logging.getLogger(__name__)
 
 Process: TypeAlias = Callable[[ServerConnection, Request], Response | None]
 Handler: TypeAlias = Callable[[ServerConnection], Awaitable[None]]
+
+
+def is_loopback(address: str) -> bool:
+    """Whether a numeric address leads to this machine only; False for a name."""
+    try:
+        numeric = ipaddress.ip_address(address)
+    except ValueError:
+        return False
+    mapped = numeric.ipv4_mapped if isinstance(numeric, ipaddress.IPv6Address) else None
+    return (mapped or numeric).is_loopback
+
+
+def authority(text: str) -> tuple[str, int] | None:
+    """Split "host" or "host:port" into the host in lower case and the port, 80 by default; None for other text."""
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        return None
+    if not host or parts.netloc != text or "@" in text:
+        return None
+    return host, 80 if port is None else port
+
+
+@dataclass(frozen=True)
+class Access:
+    """Rules on the requests of a server: `local` on a loopback address; else each must hold the token."""
+
+    local: bool
+    token: str
+
+    @staticmethod
+    def to(address: str) -> "Access":
+        """Return the rules for a server that listens on this numeric address, with a random token if it needs one."""
+        local = is_loopback(address)
+        return Access(local, "" if local else secrets.token_urlsafe(TOKEN_BYTES))
+
+    def refusal(self, target: str, headers: Headers) -> str | None:
+        """Return why a request for `target`, such as "/?token=...", is refused, for its sender; None if it may pass."""
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        host = authority(hosts[0]) if len(hosts) == 1 else None
+        if host is None:
+            return "the request needs one header Host: expected the address of the viewer"
+        if self.local and host[0] != "localhost" and not is_loopback(host[0]):
+            return "the viewer serves this machine only: expected http://localhost or http://127.0.0.1 in the address"
+        for origin in origins:
+            scheme, _, own = origin.partition("://")
+            if len(origins) > 1 or scheme != "http" or authority(own) != host:
+                return "the request comes from a page of another server: expected the viewer's own page"
+        cookies = (pair.strip().partition("=") for line in headers.get_all("Cookie") for pair in line.split(";"))
+        tokens = [_query_token(target), *(value for name, _, value in cookies if name == _cookie_name(host[1]))]
+        if self.token and not any(self._is_token(token) for token in tokens):
+            return "the viewer needs its token: open the address with ?token=, as nexwarp has printed it"
+        return None
+
+    def cookie(self, target: str, headers: Headers) -> str | None:
+        """Return the cookie for the response to an admitted page request with the token in its URL; else None."""
+        host = authority(headers.get_all("Host")[0])
+        if not self.token or host is None or not self._is_token(_query_token(target)):
+            return None
+        return f"{_cookie_name(host[1])}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _is_token(self, text: str) -> bool:
+        """Compare in constant time."""
+        return hmac.compare_digest(text.encode("utf-8", "surrogateescape"), self.token.encode())
+
+
+def _cookie_name(port: int) -> str:
+    """Cookies of a host are shared by its ports; each viewer has one of its own."""
+    return f"nexwarp_{port}"
+
+
+def _query_token(target: str) -> str:
+    return parse_qs(target.partition("?")[2]).get("token", [""])[0]
 
 
 class Gate:
@@ -54,7 +149,7 @@ class Gate:
             options |= {"max_size": MAX_MESSAGE_BYTES, "close_timeout": CLOSE_SECONDS}
             options |= {"create_connection": partial(Connection, self)}
             answer = partial(self._answer, process_request)
-            return serve(partial(_handle, handler), host, port, process_request=answer, **options)  # type: ignore[arg-type]
+            return serve(handler, host, port, process_request=answer, **options)  # type: ignore[arg-type]
 
         web.serve = guarded  # type: ignore[assignment, misc]
         try:
@@ -82,16 +177,6 @@ class Gate:
         if (cookie := self.access.cookie(request.path, request.headers)) is not None:
             response.headers["Set-Cookie"] = cookie
         return response
-
-
-async def _handle(handler: Handler, connection: ServerConnection) -> None:
-    """Run viser's handler of a WebSocket; close it if it is of another version, of which viser would print a line."""
-    import viser
-
-    if connection.subprotocol != f"viser-v{viser.__version__}":
-        await connection.close(1002, f"expected a client of viser {viser.__version__}: reload the page")
-        return
-    await handler(connection)
 
 
 class Connection(ServerConnection):
@@ -138,3 +223,21 @@ class Connection(ServerConnection):
         finally:
             self.sending -= 1
             timer.cancel()
+
+
+def accept_only_known(server: "viser.ViserServer") -> None:
+    """Drop messages that the viewer does not use, and ignore invalid ones; viser has no public way to do so."""
+    server.get_event_loop().set_exception_handler(lambda _loop, context: log.debug("dropped: %s", context))
+
+    def watch(handler: "viser.infra.WebsockMessageHandler") -> None:
+        handle = handler._handle_incoming_message
+
+        async def accept(client_id: "viser.infra.ClientId", message: "viser.infra.Message") -> None:
+            name = type(message).__name__
+            if name in ACCEPTED and (name != "GuiUpdateMessage" or set(getattr(message, "updates", ())) == {"value"}):
+                await handle(client_id, message)
+
+        handler._handle_incoming_message = accept  # type: ignore[method-assign]
+
+    watch(server._websock_server)
+    server._websock_server.on_client_connect(watch)
